@@ -1,0 +1,106 @@
+"""Pinhole cameras: OpenCV axes (x right, y down, z forward), world-to-camera matrices, pixel centres at +0.5."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from neuprim.core.errors import DataError
+
+__all__ = ["Camera", "look_at", "opengl_to_viewmat", "orbit"]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole view.
+
+    Attributes:
+        viewmat: (4, 4) world-to-camera, OpenCV axes; float64 unless it carries gradients of another dtype.
+        fx, fy, cx, cy: focal lengths and principal point in pixels; the principal point may be off centre or outside.
+        width, height: image size in pixels.
+    """
+
+    viewmat: Tensor
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    @property
+    def position(self) -> Tensor:
+        """(3,) camera centre in scene units."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    @property
+    def K(self) -> Tensor:
+        """(3, 3) intrinsics, float64."""
+        return torch.tensor([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view sampled on another pixel grid."""
+        sx, sy = width / self.width, height / self.height
+        return replace(self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height)
+
+    def validate(self, where: str) -> Camera:
+        """Return self, or raise :class:`DataError` naming ``where`` for non-finite, singular, scaled or mirrored cameras."""
+        numbers = torch.tensor([self.fx, self.fy, self.cx, self.cy], dtype=torch.float64)
+        if not (torch.isfinite(numbers).all() and self.fx > 0 and self.fy > 0):
+            raise DataError(f"{where}: intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}; expected finite numbers, focal lengths > 0")
+        if self.width <= 0 or self.height <= 0:
+            raise DataError(f"{where}: image size {self.width}x{self.height}; expected positive")
+        view = self.viewmat.detach().double()
+        if view.shape != (4, 4) or not torch.isfinite(view).all():
+            raise DataError(f"{where}: camera matrix has shape {tuple(view.shape)} or non-finite entries; expected finite 4x4")
+        R = view[:3, :3]
+        error = (R @ R.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
+        if error > 1e-3:
+            raise DataError(f"{where}: camera rotation is singular or scaled (|R R^T - 1| = {error:.2g}); expected a rotation")
+        if torch.linalg.det(R).item() < 0:
+            raise DataError(f"{where}: camera rotation is mirrored (determinant -1); expected a rotation")
+        return self
+
+
+def opengl_to_viewmat(c2w: Tensor) -> Tensor:
+    """World-to-camera OpenCV matrix of an OpenGL/Blender camera-to-world one (x right, y up, z backward)."""
+    c2w = c2w.double()
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    c2w_cv = c2w @ flip
+    view = torch.eye(4, dtype=torch.float64)
+    view[:3, :3] = c2w_cv[:3, :3].T
+    view[:3, 3] = -c2w_cv[:3, :3].T @ c2w_cv[:3, 3]
+    return view
+
+
+def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
+    """(4, 4) world-to-camera OpenCV matrix of a camera at ``eye`` looking at ``target`` with ``up`` upwards in the image."""
+    eye, target, up = eye.double(), target.double(), up.double()
+    z = target - eye
+    z = z / z.norm()
+    x = torch.linalg.cross(z, up)
+    if x.norm() < 1e-9:  # looking along `up`: any horizontal axis will do
+        x = torch.linalg.cross(z, up.roll(1))
+    x = x / x.norm()
+    view = torch.eye(4, dtype=torch.float64)
+    view[:3, :3] = torch.stack([x, torch.linalg.cross(z, x), z])
+    view[:3, 3] = -view[:3, :3] @ eye
+    return view
+
+
+def orbit(template: Camera, center: Tensor, up: Tensor, radius: float, elevation: float, count: int) -> list[Camera]:
+    """``count`` cameras on a circle around ``center``, ``elevation`` radians above the plane normal to ``up``."""
+    up = (up / up.norm()).double()
+    helper = torch.tensor([1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0], dtype=torch.float64)
+    a = torch.linalg.cross(up, helper)
+    a = a / a.norm()
+    b = torch.linalg.cross(up, a)
+    views = []
+    for i in range(count):
+        t = 2 * math.pi * i / count
+        eye = center.double() + radius * (math.cos(elevation) * (math.cos(t) * a + math.sin(t) * b) + math.sin(elevation) * up)
+        views.append(replace(template, viewmat=look_at(eye, center, up)))
+    return views

@@ -1,0 +1,127 @@
+"""What a data set hands to the trainer: posed images that load lazily, and where matter may be at the start."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera, orbit
+from neuprim.core.fields import Conditions
+
+__all__ = ["DataSource", "Dataset", "Pixels", "PointCloud", "View", "ViewSet", "camera_extent"]
+
+DataSource = Literal["real", "generated", "simulated"]
+"""Photographs or captures ("real"), our own ray-cast scenes ("generated"), stand-ins for data not given ("simulated")."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One frame without its pixels.
+
+    Attributes:
+        name: unique within its split; used for file names and reports.
+        conditions: what the frame depends on besides its camera (time, light, ...); empty for static scenes.
+    """
+
+    name: str
+    camera: Camera
+    conditions: Conditions = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """One frame's pixels.
+
+    Attributes:
+        rgb: (H, W, C) float32. With ``alpha`` it is premultiplied.
+        alpha: (H, W) float32 coverage 0..1, or None for an opaque photograph.
+        mask: (H, W) bool of pixels that count, or None for all.
+    """
+
+    rgb: Tensor
+    alpha: Tensor | None = None
+    mask: Tensor | None = None
+
+    def over(self, background: Tensor) -> Tensor:
+        """(H, W, C) composited over a (C,) colour; opaque pixels are returned as they are."""
+        if self.alpha is None:
+            return self.rgb
+        return self.rgb + (1.0 - self.alpha)[..., None] * background.to(self.rgb)
+
+
+class ViewSet(ABC):
+    """Posed images of one split. ``pixels`` reads on demand and keeps at most compact (uint8 or half) copies."""
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def view(self, index: int) -> View: ...
+
+    @abstractmethod
+    def pixels(self, index: int) -> Pixels: ...
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points where matter probably is: means (N, 3) scene units, colors (N, C) in the data set's colour space."""
+
+    means: Tensor
+    colors: Tensor
+
+
+class Dataset(ABC):
+    """A scene to fit.
+
+    Attributes:
+        name: shown in reports.
+        train, test: the splits.
+        channels: colour channels C.
+        color_space: "srgb" (display-referred values as stored in PNG) or "linear".
+        data_source: see :data:`DataSource`; printed in every output.
+        extent: scene extent in scene units (see :func:`camera_extent`), the unit of position rates and size limits.
+        background: (C,) the colour that evaluation composites over.
+        random_background: whether training composites a random colour instead (needs alpha).
+        downsampling: text for reports, e.g. "none", "images_4" or "200x200 from 800x800 by area".
+        up: (3,) the scene's upward direction, for orbits.
+        center: (3,) what the cameras look at, for orbits.
+    """
+
+    name: str
+    train: ViewSet
+    test: ViewSet
+    channels: int
+    color_space: Literal["srgb", "linear"]
+    data_source: DataSource
+    extent: float
+    background: Tensor
+    random_background: bool
+    downsampling: str
+    up: Tensor
+    center: Tensor
+
+    @abstractmethod
+    def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
+        """At most ``count`` distinct starting points; the only randomness is ``generator``'s."""
+
+    def orbit(self, frames: int) -> list[View]:
+        """Views circling the scene at the training cameras' mean distance and elevation."""
+        cameras = [self.train.view(i).camera for i in range(len(self.train))]
+        offsets = torch.stack([c.position for c in cameras]) - self.center.double()
+        radius = offsets.norm(dim=-1).mean().item()
+        up = self.up.double() / self.up.double().norm()
+        sine = ((offsets @ up) / offsets.norm(dim=-1).clamp_min(1e-12)).mean().clamp(-0.9, 0.9)
+        views = orbit(cameras[0], self.center, self.up, radius, torch.asin(sine).item(), frames)
+        return [View(f"orbit_{i:03d}", c) for i, c in enumerate(views)]
+
+
+def camera_extent(cameras: Sequence[Camera]) -> float:
+    """Radius of the cameras' bounding sphere about their mean x 1.1 (the convention of 3D Gaussian splatting); 1.0 if zero."""
+    positions = torch.stack([c.position.detach().double() for c in cameras])
+    radius = (positions - positions.mean(0)).norm(dim=-1).max().item() * 1.1
+    return radius if radius > 0 else 1.0

@@ -1,0 +1,44 @@
+"""Errors a user can act on.
+
+The command line prints these as one line and exits with status 2; anything else is a bug and keeps its traceback.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+__all__ = ["BackendUnavailable", "CheckpointError", "ConfigError", "DataError", "NeuprimError", "NonFiniteError", "nearest"]
+
+
+class NeuprimError(Exception):
+    """Base of every error that is the input's fault; its text is the whole message."""
+
+
+class DataError(NeuprimError):
+    """A data set, image, camera or volume file is missing, damaged or inconsistent."""
+
+
+class ConfigError(NeuprimError):
+    """A setting, task, scene or preset does not exist or has an impossible value."""
+
+
+class CheckpointError(NeuprimError):
+    """A model or checkpoint file is damaged, foreign, or of another version or task."""
+
+
+class BackendUnavailable(NeuprimError):
+    """The requested renderer backend or optional package cannot run on this machine."""
+
+
+class NonFiniteError(NeuprimError):
+    """A parameter, gradient or loss became NaN or infinite; the message names parameter and primitive."""
+
+
+def nearest(name: str, choices: Iterable[str], limit: int = 3) -> str:
+    """``"; did you mean 'a' or 'b'?"`` for the valid names closest to ``name``, or the list of all when none is close."""
+    options = sorted(set(choices))
+    close = difflib.get_close_matches(name, options, n=limit, cutoff=0.5)
+    if close:
+        return "; did you mean " + " or ".join(repr(c) for c in close) + "?"
+    return "; valid: " + ", ".join(options) if options else ""

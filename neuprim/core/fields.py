@@ -1,0 +1,164 @@
+"""The two interfaces of the design: a density field and a colour field, and the closed forms they lower to.
+
+A *field* owns some per-primitive parameters. Before a frame is drawn it *lowers*: conditions such as time or light are
+folded into one of a few closed forms that the renderer knows. The renderer never sees a task.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.geometry import Geometry
+from neuprim.core.schema import ParameterSpec, Params
+
+__all__ = [
+    "ColourField",
+    "ConditionSpec",
+    "Conditions",
+    "Constant",
+    "Cosine",
+    "DensityField",
+    "Field",
+    "LoweredColour",
+    "LoweredDensity",
+    "Opaque",
+    "OpaqueColour",
+]
+
+Conditions = Mapping[str, Tensor]
+"""Condition name ("time", "light", a plugin's "wavelength") -> value for one frame."""
+
+
+@dataclass(frozen=True)
+class ConditionSpec:
+    """A quantity a frame depends on besides its camera; command-line flags derive from these.
+
+    ``parse`` turns the text of ``--NAME TEXT`` into one tensor per frame of an animation.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    unit: str
+    range: tuple[float, float]
+    parse: Callable[[str], list[Tensor]]
+
+
+# ---------------------------------------------------------------- closed forms of density
+
+
+@dataclass(frozen=True)
+class Cosine:
+    """f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2, world density f/m (method: equation 10 of the paper).
+
+    Attributes:
+        W1: (N, K, 3), b1: (N, K), w2: (N, K), b2: (N,) or (N, 1); K = 0 is a constant density.
+        omega0: multiplies the whole phase.
+    """
+
+    W1: Tensor
+    b1: Tensor
+    w2: Tensor
+    b2: Tensor
+    omega0: float = 30.0
+
+
+@dataclass(frozen=True)
+class Opaque:
+    """Any other density, as torch code per ray-primitive pair; the reference backend renders it.
+
+    ``line_integral(prim, origin, direction, t0, t1)`` takes (M,) primitive rows, (M, 3) ray origins and unit directions
+    in scene units and the (M,) chord ends in scene units, and returns the (M,) optical depths, the integral of sigma.
+    """
+
+    line_integral: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
+
+
+LoweredDensity = Cosine | Opaque
+
+
+# ---------------------------------------------------------------- closed forms of colour
+
+
+@dataclass(frozen=True)
+class Constant:
+    """One colour per primitive and view: rgb (N, C), any channel count."""
+
+    rgb: Tensor
+
+
+@dataclass(frozen=True)
+class OpaqueColour:
+    """Any other colour, as torch code per ray-primitive pair; the reference backend renders it.
+
+    ``radiance(prim, x, d)`` takes (M,) primitive rows, (M, 3) chord middles in scene units and (M, 3) unit directions,
+    and returns (M, C).
+    """
+
+    radiance: Callable[[Tensor, Tensor, Tensor], Tensor]
+    channels: int
+
+
+LoweredColour = Constant | OpaqueColour
+
+
+# ---------------------------------------------------------------- fields
+
+
+class Field(ABC):
+    """Per-primitive parameters with a meaning. Subclasses are final: no field inherits from another."""
+
+    @abstractmethod
+    def parameters(self) -> list[ParameterSpec]:
+        """The field's tensors, in storage order."""
+
+    @abstractmethod
+    def settings(self) -> dict[str, Any]:
+        """JSON-able constructor arguments; ``type(self)(**settings)`` rebuilds the field from a checkpoint header."""
+
+    def set_progress(self, progress: float) -> None:  # noqa: B027 - a hook most fields do not need
+        """Called before every training step with the used fraction of the budget, 0..1; e.g. to unlock SH bands."""
+
+    def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
+        """Rows for children created inside their parents.
+
+        Args:
+            params: this field's tensors, one row per child, gathered from the parents.
+            old: the parents' geometry, one row per child.
+            new: the children's geometry.
+
+        Returns:
+            tensors of the same shapes, such that each child continues its parent's field inside its own support.
+        """
+        return dict(params)
+
+
+class DensityField(Field):
+    """How much light a point absorbs."""
+
+    @abstractmethod
+    def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> LoweredDensity:
+        """The frame's closed form."""
+
+    @abstractmethod
+    def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
+        """World density sigma (M,), 1/scene unit, unclamped, of primitives ``prim`` (M,) at points ``x`` (M, 3) inside them."""
+
+    @abstractmethod
+    def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
+        """Rows whose density is ``factor`` (rows,) times as large everywhere (a clone in place halves both copies)."""
+
+
+class ColourField(Field):
+    """What colour a primitive sends towards the camera."""
+
+    channels: int
+
+    @abstractmethod
+    def lower(self, params: Params, geometry: Geometry, camera: Camera, conditions: Conditions) -> LoweredColour:
+        """The frame's closed form."""

@@ -1,0 +1,80 @@
+"""What a parameter is.
+
+One list of :class:`ParameterSpec` per model drives the optimiser, population control, checkpoints and export; there is
+no second list of tensors anywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+__all__ = ["InitContext", "ParameterSpec", "Params"]
+
+Params = Mapping[str, Tensor]
+"""Parameter name -> tensor of shape (N, *spec.shape)."""
+
+Activation = Literal["none", "exp", "normalize"]
+
+
+@dataclass
+class InitContext:
+    """Everything an initialiser may look at.
+
+    Attributes:
+        means: (N, 3) initial centres, scene units.
+        scales: (N,) isotropic initial semi-axes, scene units.
+        colors: (N, C) initial colours in the data set's own colour space.
+        generator: the only source of randomness initialisers may use.
+        settings: free settings of the preset (``model.init``), e.g. ``{"alpha": 0.8}``.
+    """
+
+    means: Tensor
+    scales: Tensor
+    colors: Tensor
+    generator: torch.Generator
+    settings: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def count(self) -> int:
+        return int(self.means.shape[0])
+
+    def uniform(self, *shape: int, bound: float = 1.0) -> Tensor:
+        """U(-bound, bound) of shape (N, *shape), float32."""
+        u = torch.rand((self.count, *shape), generator=self.generator, dtype=torch.float32)
+        return (2.0 * u - 1.0) * bound
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """One learnable tensor with one row per primitive.
+
+    Attributes:
+        name: unique within a model; the key in checkpoints, rates and exports.
+        shape: shape per primitive, ``()`` for a scalar.
+        lr: base learning rate; ``train.rates.NAME`` overrides it.
+        init: draws the (N, *shape) float32 start value.
+        activation: what the stored value goes through before use ("exp" for log-scales, "normalize" for quaternions).
+        group: "geometry", "density" or "colour"; population control watches the density group.
+        lr_unit: "absolute", or "extent" for a rate in units of the scene's extent (positions).
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    lr: float
+    init: Callable[[InitContext], Tensor]
+    activation: Activation = "none"
+    group: str = "density"
+    lr_unit: Literal["absolute", "extent"] = "absolute"
+
+    @property
+    def size(self) -> int:
+        """Numbers per primitive."""
+        n = 1
+        for s in self.shape:
+            n *= s
+        return n

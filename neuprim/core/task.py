@@ -1,0 +1,80 @@
+"""What a task hands over: its conditions, fields, scenes, loss and presets. The core runs any of them alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from neuprim.core.data import Dataset
+from neuprim.core.fields import ColourField, ConditionSpec, DensityField
+
+__all__ = ["API_VERSION", "Loss", "SceneContext", "SceneSpec", "TaskSpec"]
+
+API_VERSION = 1
+"""Version of the interfaces in ``neuprim.core``; a plugin names the one it was written for."""
+
+Loss = Callable[[Tensor, Tensor], tuple[Tensor, dict[str, float]]]
+"""(rendered (H, W, C), ground truth (H, W, C)) -> (scalar loss with gradient, named parts for the log)."""
+
+
+@dataclass(frozen=True)
+class SceneContext:
+    """What a scene's loader gets beside its own settings.
+
+    Attributes:
+        seed: for generated scenes.
+        cache_dir: where generated data may be kept between runs (keyed by everything that matters).
+        progress: called with (text, fraction 0..1) during long work.
+    """
+
+    seed: int
+    cache_dir: Path
+    progress: Callable[[str, float], None] = lambda text, fraction: None
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """One scene of a task.
+
+    Attributes:
+        name: what the user types after ``scene=``.
+        summary: one line for ``neuprim tasks``.
+        load: (scene settings, context) -> Dataset; raises :class:`~neuprim.core.errors.DataError` for bad input.
+    """
+
+    name: str
+    summary: str
+    load: Callable[[Mapping[str, Any], SceneContext], Dataset]
+
+
+@dataclass(frozen=True)
+class TaskSpec:
+    """A task, built in or third party, registered under the entry-point group ``neuprim.tasks``.
+
+    Attributes:
+        api: the :data:`API_VERSION` it was written for.
+        name: what the user types after ``task=``.
+        config_package: importable package holding its Hydra groups ``task/NAME.yaml``, ``scene/NAME/*.yaml`` and
+            ``preset/NAME/*.yaml``.
+        build: (model settings, dataset) -> the density and colour fields.
+        loss: loss settings -> the training loss.
+    """
+
+    api: int
+    name: str
+    summary: str
+    config_package: str
+    scenes: tuple[SceneSpec, ...]
+    build: Callable[[Mapping[str, Any], Dataset], tuple[DensityField, ColourField]]
+    loss: Callable[[Mapping[str, Any]], Loss]
+    conditions: tuple[ConditionSpec, ...] = ()
+    fields: Mapping[str, type] | None = None
+    """Class name -> field class, so that a saved model can be rebuilt from its header."""
+
+    def scene(self, name: str) -> SceneSpec:
+        """The scene of that name; KeyError if there is none."""
+        return {s.name: s for s in self.scenes}[name]

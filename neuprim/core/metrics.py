@@ -1,0 +1,111 @@
+"""Image quality of one rendered view against its truth: PSNR and SSIM.
+
+Both take float images (H, W, C) with any number of channels and compare them as they are: nothing is clipped, quantised or converted
+between linear and sRGB, so the caller decides what is compared and says so. Sums are accumulated in float64.
+
+A render equal to its truth has an infinite PSNR, for which JSON has no number. Files therefore hold ``null`` and a flag beside it:
+``{"psnr": null, "psnr_infinite": true}``. :func:`to_json` and :func:`from_json` convert; a ``null`` without the flag is a missing value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from kornia.metrics import ssim as ssim_map
+from torch import Tensor
+
+from neuprim.core.errors import DataError, NonFiniteError
+
+__all__ = ["SSIM_SIGMA", "SSIM_WINDOW", "from_json", "matched", "psnr", "ssim", "to_json"]
+
+SSIM_WINDOW = 11
+"""Taps of the Gaussian window per axis (Wang et al. 2004)."""
+
+SSIM_SIGMA = 1.5
+"""Standard deviation of that window in pixels; kornia fixes it."""
+
+
+def matched(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """Both images as detached float64 (H, W, C) on the CPU, after checking that they can be compared.
+
+    Raises:
+        DataError: not floating point, not (H, W, C), empty, or of different shapes.
+        NonFiniteError: a NaN or infinite value in either image.
+    """
+    images = {"rendered": rendered, "truth": truth}
+    for name, image in images.items():
+        if not image.is_floating_point():
+            raise DataError(f"{name} image: expected floating-point values, found {image.dtype}")
+        if image.ndim != 3 or image.numel() == 0:
+            raise DataError(f"{name} image: expected shape (H, W, C) with at least one pixel, found {tuple(image.shape)}")
+    if rendered.shape != truth.shape:
+        raise DataError(f"rendered image has shape {tuple(rendered.shape)} but its truth has {tuple(truth.shape)}")
+    for name, image in images.items():
+        bad = int((~torch.isfinite(image)).sum())
+        if bad:
+            raise NonFiniteError(f"{name} image: {bad} of {image.numel()} values are NaN or infinite")
+    first, second = (image.detach().cpu().double() for image in images.values())
+    return first, second
+
+
+def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: float = 1.0) -> float:
+    """Peak signal-to-noise ratio in dB, ``10 log10(peak^2 / MSE)``.
+
+    Args:
+        rendered, truth: (H, W, C) float images in the same colour space.
+        mask: (H, W) bool of pixels that count, None for all.
+        peak: the value that counts as full signal.
+
+    Returns:
+        The ratio, ``math.inf`` when the images are equal (see the module's text on JSON).
+    """
+    first, second = matched(rendered, truth)
+    if not (math.isfinite(peak) and peak > 0):
+        raise DataError(f"peak must be a positive number, found {peak}")
+    squares = (first - second).square()
+    if mask is not None:
+        if mask.dtype != torch.bool or mask.shape != first.shape[:2]:
+            raise DataError(f"mask: expected bool of shape {tuple(first.shape[:2])}, found {mask.dtype} of {tuple(mask.shape)}")
+        squares = squares[mask.cpu()]
+        if squares.numel() == 0:
+            raise DataError("mask leaves no pixel to compare")
+    error = squares.mean().item()
+    return math.inf if error == 0.0 else 20.0 * math.log10(peak) - 10.0 * math.log10(error)
+
+
+def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
+    """Structural similarity, the mean over pixels and channels of kornia's SSIM map, in -1..1 and 1 for equal images.
+
+    Fixed so that numbers compare across runs: an 11x11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, and only positions where
+    the window lies wholly inside the image ("valid", as in Wang et al. 2004, scikit-image and torchmetrics), so no padding takes part.
+    Where an image is lower or narrower than 11 pixels the window shrinks, on both axes, to the largest odd size that fits.
+
+    Args:
+        rendered, truth: (H, W, C) float images in the same colour space.
+        peak: the data range L of the constants (K1 L)^2 and (K2 L)^2.
+    """
+    first, second = matched(rendered, truth)
+    if not (math.isfinite(peak) and peak > 0):
+        raise DataError(f"peak must be a positive number, found {peak}")
+    fitting = min(first.shape[0], first.shape[1])
+    window = min(SSIM_WINDOW, fitting - 1 + fitting % 2)
+    first, second = (image.permute(2, 0, 1)[None].contiguous() for image in (first, second))
+    # kornia's eps would keep equal dark images below 1; the two constants already keep the denominator positive.
+    return ssim_map(first, second, window_size=window, max_val=float(peak), eps=0.0, padding="valid").mean().item()
+
+
+def to_json(key: str, value: float) -> dict[str, float | bool | None]:
+    """The entries that hold ``value`` under ``key`` in a JSON file: infinity becomes ``null`` and ``<key>_infinite: true``."""
+    return {key: None, f"{key}_infinite": True} if value == math.inf else {key: value}
+
+
+def from_json(entries: Mapping[str, object], key: str) -> float | None:
+    """The number that :func:`to_json` stored under ``key``; None where it is missing, not a number or NaN."""
+    if entries.get(f"{key}_infinite") is True:
+        return math.inf
+    value = entries.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
+        return None
+    return float(value)

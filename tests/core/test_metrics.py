@@ -1,0 +1,170 @@
+"""PSNR and SSIM against hand-computed values and a plain numpy implementation."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from neuprim.core.errors import DataError, NonFiniteError
+from neuprim.core.metrics import SSIM_SIGMA, SSIM_WINDOW, from_json, psnr, ssim, to_json
+
+
+def pair(height: int, width: int, channels: int, noise: float = 0.1, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """A smooth image with an edge, and the same with noise."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width]
+    base = 0.5 + 0.3 * np.sin(x / 3.0)[..., None] * np.cos(y[..., None] / 4.0 + np.arange(channels)) + 0.2 * (x > width // 2)[..., None]
+    return torch.from_numpy(base + noise * rng.standard_normal(base.shape)), torch.from_numpy(base)
+
+
+def plain_ssim(a: np.ndarray, b: np.ndarray, window: int, peak: float = 1.0) -> float:
+    """Loops over every window position; weighted moments straight from the definition."""
+    taps = np.exp(-((np.arange(window) - window // 2) ** 2) / (2 * SSIM_SIGMA**2))
+    weights = np.outer(taps, taps)[..., None] / taps.sum() ** 2
+    c1, c2 = (0.01 * peak) ** 2, (0.03 * peak) ** 2
+    values = []
+    for i in range(a.shape[0] - window + 1):
+        for j in range(a.shape[1] - window + 1):
+            p, q = a[i : i + window, j : j + window], b[i : i + window, j : j + window]
+            mp, mq = (weights * p).sum((0, 1)), (weights * q).sum((0, 1))
+            vp, vq = (weights * (p - mp) ** 2).sum((0, 1)), (weights * (q - mq) ** 2).sum((0, 1))
+            cov = (weights * (p - mp) * (q - mq)).sum((0, 1))
+            values.append((2 * mp * mq + c1) * (2 * cov + c2) / ((mp**2 + mq**2 + c1) * (vp + vq + c2)))
+    return float(np.mean(values))
+
+
+@pytest.mark.parametrize(("offset", "expected"), [(0.1, 20.0), (0.01, 40.0), (1.0, 0.0), (2.0, -6.020599913279624)])
+def test_psnr_of_a_constant_offset(offset: float, expected: float) -> None:
+    truth = torch.zeros(4, 5, 3, dtype=torch.float64)
+    assert psnr(truth + offset, truth) == pytest.approx(expected, abs=1e-9)
+
+
+def test_psnr_averages_squares_over_pixels_and_channels() -> None:
+    truth = torch.zeros(2, 2, 2)
+    rendered = truth.clone()
+    rendered[0, 1, 1] = 0.5  # MSE = 0.25 / 8
+    assert psnr(rendered, truth) == pytest.approx(10 * math.log10(8 / 0.25))
+
+
+def test_psnr_peak() -> None:
+    truth = torch.zeros(3, 3, 1)
+    assert psnr(truth + 2.55, truth, peak=255.0) == pytest.approx(40.0, abs=1e-5)
+
+
+def test_psnr_mask_selects_pixels() -> None:
+    truth = torch.zeros(2, 3, 3)
+    rendered = truth.clone()
+    rendered[0, 0] = 0.1
+    rendered[1, 2] = 100.0
+    mask = torch.zeros(2, 3, dtype=torch.bool)
+    mask[0, 0] = True
+    assert psnr(rendered, truth, mask) == pytest.approx(20.0, abs=1e-5)
+    mask[0, 1] = True
+    assert psnr(rendered, truth, mask) == pytest.approx(20.0 + 10 * math.log10(2), abs=1e-5)
+
+
+def test_psnr_accumulates_in_double() -> None:
+    rng = np.random.default_rng(1)
+    rendered, truth = (rng.random((300, 400, 3), dtype=np.float32) for _ in range(2))
+    expected = -10 * math.log10(np.mean((rendered.astype(np.float64) - truth.astype(np.float64)) ** 2))
+    assert psnr(torch.from_numpy(rendered), torch.from_numpy(truth)) == pytest.approx(expected, abs=1e-12)
+
+
+def test_nothing_is_clipped_or_quantised() -> None:
+    truth = torch.ones(3, 3, 3)
+    assert psnr(truth + 1e-4, truth) == pytest.approx(80.0, abs=0.01)
+    assert psnr(truth + 1.0, truth) == pytest.approx(0.0)
+
+
+def test_identical_images() -> None:
+    image, _ = pair(20, 17, 3)
+    assert psnr(image, image) == math.inf
+    assert ssim(image, image) == pytest.approx(1.0, abs=1e-12)
+    black = torch.zeros(16, 16, 3)
+    assert ssim(black, black) == 1.0
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 7])
+def test_ssim_equals_the_plain_implementation(channels: int) -> None:
+    rendered, truth = pair(23, 19, channels, seed=channels)
+    expected = plain_ssim(rendered.numpy(), truth.numpy(), SSIM_WINDOW)
+    assert 0.05 < expected < 0.95
+    assert ssim(rendered, truth) == pytest.approx(expected, abs=1e-12)
+    assert ssim(rendered.float(), truth.float()) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(("height", "width", "window"), [(11, 11, 11), (10, 30, 9), (9, 12, 9), (30, 4, 3), (2, 2, 1), (1, 1, 1)])
+def test_ssim_window_shrinks_to_fit(height: int, width: int, window: int) -> None:
+    rendered, truth = pair(height, width, 3)
+    assert ssim(rendered, truth) == pytest.approx(plain_ssim(rendered.numpy(), truth.numpy(), window), abs=1e-12)
+
+
+def test_ssim_peak_scales_with_the_images() -> None:
+    rendered, truth = pair(16, 16, 3)
+    assert ssim(rendered * 5, truth * 5, peak=5.0) == pytest.approx(ssim(rendered, truth), abs=1e-12)
+
+
+def test_ssim_of_inverted_structure_is_negative() -> None:
+    _, truth = pair(24, 24, 1)
+    assert ssim(1.0 - truth, truth) < 0
+
+
+def test_images_that_require_gradients_give_plain_floats() -> None:
+    rendered, truth = pair(12, 12, 3)
+    rendered.requires_grad_(True)
+    assert isinstance(psnr(rendered, truth), float)
+    assert isinstance(ssim(rendered, truth), float)
+
+
+@pytest.mark.parametrize(
+    ("rendered", "truth", "text"),
+    [
+        (torch.zeros(4, 4, 3), torch.zeros(4, 5, 3), r"\(4, 4, 3\).*\(4, 5, 3\)"),
+        (torch.zeros(4, 4), torch.zeros(4, 4), r"rendered image.*\(H, W, C\).*\(4, 4\)"),
+        (torch.zeros(0, 4, 3), torch.zeros(0, 4, 3), "at least one pixel"),
+        (torch.zeros(4, 4, 3), torch.zeros(4, 4, 3, dtype=torch.uint8), "truth image.*uint8"),
+    ],
+)
+def test_wrong_shapes_and_types_are_named(rendered: torch.Tensor, truth: torch.Tensor, text: str) -> None:
+    for metric in (psnr, ssim):
+        with pytest.raises(DataError, match=text):
+            metric(rendered, truth)
+
+
+def test_non_finite_values_are_an_error_not_a_number() -> None:
+    truth = torch.zeros(12, 12, 3)
+    rendered = truth.clone()
+    rendered[3, 4, 1] = float("nan")
+    for metric in (psnr, ssim):
+        with pytest.raises(NonFiniteError, match="rendered image: 1 of 432"):
+            metric(rendered, truth)
+        with pytest.raises(NonFiniteError, match="truth"):
+            metric(truth, rendered)
+
+
+def test_bad_masks_and_peaks() -> None:
+    image = torch.zeros(4, 4, 3)
+    with pytest.raises(DataError, match="no pixel"):
+        psnr(image, image, torch.zeros(4, 4, dtype=torch.bool))
+    with pytest.raises(DataError, match="expected bool"):
+        psnr(image, image, torch.ones(4, 4))
+    with pytest.raises(DataError, match=r"\(4, 4\)"):
+        psnr(image, image, torch.ones(4, 3, dtype=torch.bool))
+    for metric in (psnr, ssim):
+        with pytest.raises(DataError, match="peak"):
+            metric(image, image, peak=0.0)
+
+
+def test_infinite_values_survive_strict_json() -> None:
+    for value in (math.inf, 31.25):
+        text = json.dumps(to_json("psnr", value), allow_nan=False)
+        assert from_json(json.loads(text), "psnr") == value
+    assert json.loads(json.dumps(to_json("psnr", math.inf))) == {"psnr": None, "psnr_infinite": True}
+    assert from_json({"psnr": None}, "psnr") is None
+    assert from_json({}, "psnr") is None
+    assert from_json({"psnr": True}, "psnr") is None
+    assert from_json({"psnr": "12"}, "psnr") is None

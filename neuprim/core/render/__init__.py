@@ -1,0 +1,84 @@
+"""One renderer for every task: ``render(model, camera, conditions, settings) -> RenderOutput``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.errors import BackendUnavailable
+from neuprim.core.fields import Constant, Cosine
+from neuprim.core.primitives import Lowered, Primitives
+from neuprim.core.render.output import RenderOutput, RenderStats
+from neuprim.core.render.settings import RenderSettings
+
+__all__ = ["BACKENDS", "RenderOutput", "RenderSettings", "RenderStats", "choose_backend", "probe", "render", "render_lowered"]
+
+BACKENDS = ("reference", "cpu")
+
+
+def choose_backend(lowered: Lowered, settings: RenderSettings) -> str:
+    """The backend that will draw this model.
+
+    Raises:
+        BackendUnavailable: when the fast backend is asked for by name but does not know the model's forms.
+    """
+    known = isinstance(lowered.density, Cosine) and isinstance(lowered.colour, Constant)
+    if settings.backend == "auto":
+        return "cpu" if known else "reference"
+    if settings.backend == "cpu" and not known:
+        forms = f"{type(lowered.density).__name__} density, {type(lowered.colour).__name__} colour"
+        raise BackendUnavailable(f"renderer.backend=cpu cannot draw {forms}; it knows Cosine and Constant. Use renderer.backend=reference")
+    return settings.backend
+
+
+def render(
+    model: Primitives,
+    camera: Camera,
+    conditions: Mapping[str, Tensor] | None = None,
+    settings: RenderSettings | None = None,
+    background: Tensor | None = None,
+) -> RenderOutput:
+    """Draw one frame; differentiable in every parameter, in ``camera.viewmat`` and in ``background``.
+
+    Args:
+        model: the primitives; each field lowers under ``conditions`` first.
+        camera: the view; rgb is (camera.height, camera.width, C).
+        conditions: e.g. ``{"time": tensor(0.5)}``.
+        settings: every speed/accuracy knob.
+        background: (C,) colour behind everything; None is black.
+
+    Raises:
+        NonFiniteError: a parameter is NaN or infinite (named, with the primitive).
+        BackendUnavailable: the backend asked for cannot draw this model.
+    """
+    return render_lowered(model.lower(camera, conditions or {}), camera, settings or RenderSettings(), background)
+
+
+def render_lowered(lowered: Lowered, camera: Camera, settings: RenderSettings, background: Tensor | None = None) -> RenderOutput:
+    """Draw a model whose conditions are already folded in."""
+    if choose_backend(lowered, settings) == "cpu":
+        from neuprim.core.render.cpu.backend import render as draw
+    else:
+        from neuprim.core.render.reference import render as draw
+    return draw(lowered, camera, background, settings)
+
+
+def probe(name: str) -> str | None:
+    """None if backend ``name`` works here, else why not: draws one small sphere and looks at the middle pixel."""
+    from neuprim.core.geometry import Geometry
+
+    try:
+        view = torch.eye(4, dtype=torch.float64)
+        view[2, 3] = 3.0
+        camera = Camera(view, 16.0, 16.0, 8.0, 8.0, 16, 16)
+        geometry = Geometry(torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]))
+        density = Cosine(torch.zeros(1, 1, 3), torch.zeros(1, 1), torch.zeros(1, 1), torch.ones(1))
+        lowered = Lowered(geometry, density, Constant(torch.ones(1, 3)))
+        middle = render_lowered(lowered, camera, RenderSettings(backend=name)).rgb[8, 8, 0].item()  # type: ignore[arg-type]
+    except Exception as error:  # a broken installation may fail in any way; the reason is what the user wants to read
+        return f"{type(error).__name__}: {error}"
+    expected = 0.8646
+    return None if abs(middle - expected) < 2e-2 else f"drew {middle:.4f} where {expected} was expected"

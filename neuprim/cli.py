@@ -1,0 +1,274 @@
+"""The ``neuprim`` command: parse, call, print.
+
+Exit status: 0 done, 1 no backend works (``doctor``), 2 the input's fault (one line on standard error), 130 interrupted. A bug in
+neuprim keeps its traceback. Heavy modules are imported by the subcommands that need them, so that help stays fast.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from neuprim import __version__
+from neuprim.core.errors import ConfigError, NeuprimError, nearest
+
+if TYPE_CHECKING:
+    from neuprim.config import RunConfig
+
+__all__ = ["main"]
+
+COMMON_KEYS = """\
+commonest keys:
+  task=NAME scene=NAME preset=NAME     what to fit, and how (`neuprim tasks` lists them)
+  scene.path=DIR                       data of a scene that reads files
+  output_dir=DIR resume=true           where to write; continue an interrupted run
+  train.iterations=N train.max_seconds=S
+  model.primitives=N model.neurons=K model.sh_degree=D
+  train.rates.NAME=R                   learning rate of one parameter
+  renderer.backend=auto|reference|cpu  renderer.threads=N
+  seed=N
+`neuprim run task=NAME scene=NAME --cfg` shows every key with its value. A value that contains , = or brackets is quoted
+twice, for the shell and for the grammar: "scene.path='a=b, c'"."""
+
+EXAMPLES = """\
+examples:
+  neuprim run task=static scene=solids
+  neuprim run task=static scene=blender scene.path=DIR preset=paper
+  neuprim run -m model.primitives=200,1000 train.max_seconds=60"""
+
+
+class Parser(argparse.ArgumentParser):
+    """Reports a wrong command line as one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message} (see {self.prog} --help)")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command and returns its exit status."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _dispatch(words)
+    except NeuprimError as error:
+        print(f"neuprim: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("neuprim: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # `neuprim tasks | head`; the interpreter's own flush at exit must not fail either
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except SystemExit as stop:  # argparse, after --help and --version
+        return stop.code if isinstance(stop.code, int) else 0
+
+
+def _dispatch(words: list[str]) -> int:
+    parser, commands = _parsers(with_tasks=words[:1] == ["run"])
+    if not words:
+        parser.print_help()
+        return 0
+    if not words[0].startswith("-") and words[0] not in commands:
+        raise ConfigError(f"{words[0]}: no such command{nearest(words[0], commands)}")
+    args, rest = parser.parse_known_args(words)
+    if args.command == "run":
+        args.overrides += [word for word in rest if not word.startswith("-")]  # argparse gives up on words after a flag
+        rest = [word for word in rest if word.startswith("-")]
+    if args.command == "render":
+        args.conditions, rest = _conditions(args.run_dir, rest)
+    if rest:
+        known = [flag for flag in commands[args.command]._option_string_actions if flag.startswith("--")]
+        raise ConfigError(f"{rest[0]}: no such argument of `neuprim {args.command}`{nearest(rest[0], known)}")
+    call: Callable[[argparse.Namespace], int] = args.call
+    return call(args)
+
+
+def _parsers(with_tasks: bool) -> tuple[Parser, dict[str, argparse.ArgumentParser]]:
+    parser = Parser(prog="neuprim", description="Radiance fields made of splattable neural primitives.", allow_abbrev=False)
+    parser.add_argument("--version", action="version", version=f"neuprim {__version__}")
+    sub = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    def command(name: str, call: Callable[[argparse.Namespace], int], summary: str, epilog: str = "") -> argparse.ArgumentParser:
+        raw = argparse.RawDescriptionHelpFormatter
+        made = sub.add_parser(name, help=summary, description=summary, epilog=epilog, formatter_class=raw, allow_abbrev=False)
+        made.set_defaults(call=call)
+        return made
+
+    run = command("run", _run, "fit a scene", "\n\n".join([COMMON_KEYS, *([_task_names()] if with_tasks else []), EXAMPLES]))
+    run.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings, in Hydra's grammar")
+    run.add_argument("-m", "--multirun", action="store_true", help="run every combination of values separated by commas")
+    run.add_argument("--cfg", action="store_true", help="print the resolved configuration and stop")
+
+    evaluate = command("eval", _eval, "measure a run on its test views")
+    evaluate.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+
+    render = command(
+        "render", _render, "draw images of a run", "Each condition of the run's task (time, light, ...) is a flag: --NAME TEXT."
+    )
+    render.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    render.add_argument("--camera", required=True, metavar="orbit|test|FILE.json", help="which cameras")
+    render.add_argument("--size", type=_size, metavar="WxH", help="pixels (default: the data set's)")
+    render.add_argument("--format", choices=("png", "exr", "webp"), default="png", help="image format (default: png)")
+    render.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
+    render.add_argument("--frames", type=_count, default=60, metavar="N", help="frames of an orbit (default: 60)")
+
+    command("tasks", _tasks, "list tasks, scenes and presets, and the packages they come from")
+    command("doctor", _doctor, "show versions, devices and which renderer backends work here")
+    return parser, dict(sub.choices)
+
+
+# ---------------------------------------------------------------- commands
+
+
+def _run(args: argparse.Namespace) -> int:
+    from neuprim.config import compose, compose_all
+
+    check = not args.cfg
+    configs = compose_all(args.overrides, check) if args.multirun else [compose(args.overrides, check)]
+    if args.cfg:
+        print("---\n".join(config.to_yaml() for config in configs), end="")
+        return 0
+    if len(configs) == 1:
+        print(_fit(configs[0]))
+        return 0
+    failed = 0
+    for number, config in enumerate(configs, 1):
+        print(f"[{number}/{len(configs)}] {config.output_dir}", flush=True)
+        try:
+            print(_fit(config), flush=True)
+        except NeuprimError as error:  # the other combinations are still worth having
+            failed += 1
+            print(f"neuprim: error: {config.output_dir}: {' '.join(str(error).split())}", file=sys.stderr)
+    return 2 if failed else 0
+
+
+def _fit(config: RunConfig) -> Path:
+    from neuprim.run import run
+
+    return run(config)
+
+
+def _eval(args: argparse.Namespace) -> int:
+    from neuprim.evaluate import evaluate_run
+
+    _print_metrics(evaluate_run(_run_directory(args.run_dir)))
+    return 0
+
+
+def _render(args: argparse.Namespace) -> int:
+    run_dir = _run_directory(args.run_dir)
+    if args.camera not in ("orbit", "test"):
+        if not args.camera.lower().endswith(".json"):
+            raise ConfigError(f"--camera {args.camera}: expected orbit, test or a .json file")
+        if not Path(args.camera).is_file():
+            raise ConfigError(f"--camera {args.camera}: no such file")
+    from neuprim.evaluate import render_run
+
+    paths = render_run(run_dir, args.camera, args.size, args.format, args.out, args.frames, args.conditions)
+    for path in paths:
+        print(path)
+    return 0
+
+
+def _tasks(args: argparse.Namespace) -> int:
+    from neuprim.config import check_groups, presets
+    from neuprim.plugins.registry import survey
+
+    for report in survey():
+        spec, error = report.spec, report.error
+        try:
+            names = presets(spec) if spec else []
+            if spec:
+                check_groups(spec)
+        except ConfigError as broken:
+            spec, error = None, str(broken)
+        if spec is None:
+            print(f"{report.info.name}  ({report.info.origin})  BROKEN\n  {error}\n")
+            continue
+        width = max([len(s.name) for s in spec.scenes], default=0)
+        print(f"{spec.name}  ({report.info.origin})  {spec.summary}")
+        for i, scene in enumerate(spec.scenes):
+            print(f"  {'scenes' if i == 0 else '':10}{scene.name:{width}}  {scene.summary}")
+        print(f"  {'presets':10}{', '.join(names)}")
+        if spec.conditions:
+            print(f"  {'conditions':10} " + ", ".join(f"{c.name} [{c.unit}]" for c in spec.conditions))
+        print()
+    return 0
+
+
+def _doctor(args: argparse.Namespace) -> int:
+    from neuprim.doctor import doctor
+
+    return doctor()
+
+
+# ---------------------------------------------------------------- arguments
+
+
+def _conditions(run_dir: Path, words: list[str]) -> tuple[dict[str, str], list[str]]:
+    """Condition name -> text, from the flags that the run's task defines, and the words that are none of them."""
+    if not words:
+        return {}, []
+    from neuprim.config import RunConfig
+    from neuprim.plugins.registry import load_task
+
+    spec = load_task(RunConfig.from_yaml(_run_directory(run_dir)).task)
+    parser = Parser(prog="neuprim render", add_help=False, allow_abbrev=False)
+    for condition in spec.conditions:
+        parser.add_argument("--" + condition.name.replace("_", "-"), dest=condition.name)
+    args, rest = parser.parse_known_args(words)
+    if rest:
+        flags = ["--camera", "--size", "--format", "--out", "--frames", *parser._option_string_actions]
+        raise ConfigError(f"{rest[0]}: no such argument of `neuprim render` for task {spec.name!r}{nearest(rest[0], flags)}")
+    return {name: text for name, text in vars(args).items() if text is not None}, []
+
+
+def _run_directory(path: Path) -> Path:
+    if not path.is_dir():
+        raise ConfigError(f"{path}: no such run directory")
+    return path
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([1-9]\d{0,5})[xX]([1-9]\d{0,5})", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected WIDTHxHEIGHT, for example 640x480")
+    return int(match.group(1)), int(match.group(2))
+
+
+def _count(text: str) -> int:
+    if not re.fullmatch(r"[1-9]\d{0,6}", text):
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a positive count")
+    return int(text)
+
+
+def _task_names() -> str:
+    from neuprim.plugins.registry import list_tasks
+
+    lines = [f"  {info.name}  ({info.origin})" for info in list_tasks()]
+    return "\n".join(["tasks:", *(lines or ["  none is installed"])])
+
+
+# ---------------------------------------------------------------- output
+
+
+def _print_metrics(metrics: Mapping[str, Any]) -> None:
+    rows = list(_rows(metrics))
+    width = max((len(name) for name, _ in rows), default=0)
+    for name, value in rows:
+        print(f"{name:{width}}  {value}")
+
+
+def _rows(metrics: Mapping[str, Any], where: str = "") -> list[tuple[str, str]]:
+    rows: list[tuple[str, str]] = []
+    for key, value in metrics.items():
+        name = f"{where}{key}"
+        if isinstance(value, Mapping):
+            rows += _rows(value, name + ".")
+        else:
+            rows.append((name, f"{value:.4f}" if isinstance(value, float) else str(value)))
+    return rows

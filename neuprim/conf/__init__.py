@@ -1,0 +1,1 @@
+"""Hydra's primary configuration; a package, because Hydra looks for one."""

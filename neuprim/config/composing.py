@@ -1,0 +1,278 @@
+"""From the words after ``neuprim run`` to a :class:`RunConfig`.
+
+Values win in this order: what the user typed, the preset, the defaults of the settings dataclasses. Hydra finds and composes
+the YAML files (its ``compose``, so nothing changes directory or writes files); the settings dataclasses say which keys exist.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neuprim.config.groups import check_groups, presets
+from neuprim.config.outputs import output_directory
+from neuprim.config.overrides import Assignment, expand_sweep, parse, sweep_names, swept_keys
+from neuprim.config.record import RunConfig, RunSettings
+from neuprim.config.schema import REQUIRED, build, defaults, is_free, like, setting_names
+from neuprim.core.errors import ConfigError, nearest
+from neuprim.plugins.registry import load_task
+
+if TYPE_CHECKING:
+    from neuprim.core.task import TaskSpec
+
+__all__ = ["compose", "compose_all"]
+
+DEFAULT_TASK = "static"
+DEFAULT_PRESET = "quick"
+CHOICES = ("task", "scene", "preset")
+PRESET_KEYS = ("model", "train", "renderer")
+PATHS = "_paths_"
+"""Key of a scene's YAML that lists which of its settings are paths: ``~`` is expanded and they are made absolute."""
+
+
+def compose(overrides: Sequence[str], check_output: bool = True) -> RunConfig:
+    """The configuration of one run.
+
+    Args:
+        overrides: ``key=value`` words in Hydra's grammar.
+        check_output: refuse an ``output_dir`` that already holds files (unless ``resume=true``).
+
+    Raises:
+        ConfigError: one line that names the key, what was found and what was expected.
+    """
+    assignments = parse(overrides)
+    chosen = {key: _choice(assignments, key) for key in CHOICES}
+    values = [a for a in assignments if a.key not in CHOICES]
+    spec = load_task(chosen["task"] or DEFAULT_TASK)
+    check_groups(spec)
+    task_node = _task_node(spec)
+    scene_name = chosen["scene"] or task_node["scene"] or spec.scenes[0].name
+    default_preset = task_node["preset"] or DEFAULT_PRESET
+    preset = chosen["preset"] or default_preset
+    _check_name("scene", scene_name, [s.name for s in spec.scenes], spec)
+    _check_name("preset", preset, presets(spec), spec)
+
+    base, declared_paths = _base(spec, scene_name, preset, task_node["options"])
+    for assignment in values:
+        _check_key(assignment, base, scene_name)
+    plain, full = _merge(base, values)
+    settings = _settings(full)
+    scene = _scene(full["scene"], base["scene"], declared_paths)
+    directory = output_directory(settings.output_dir, f"{spec.name}-{scene_name}", settings.resume, check_output)
+    full["scene"] = scene
+    changed = {"preset": (default_preset, preset)} if preset != default_preset else {}
+    return RunConfig(
+        task=spec.name,
+        scene_name=scene_name,
+        scene=scene,
+        preset=preset,
+        model=settings.model,
+        train=settings.train,
+        renderer=settings.renderer,
+        output_dir=directory,
+        seed=settings.seed,
+        resume=settings.resume,
+        options=full["task"]["options"],
+        overrides=list(overrides),
+        non_default={**changed, **_differences(_typed(plain), _typed(full, settings))},
+    )
+
+
+def compose_all(overrides: Sequence[str], check_output: bool = True) -> list[RunConfig]:
+    """The configurations of a sweep, each in its own sub-directory of one output directory; all are valid before one runs."""
+    swept = set(swept_keys(overrides))
+    if not swept:
+        return [compose(overrides, check_output)]
+    combinations = expand_sweep(overrides)
+    configs = [compose([*c, "output_dir=null"], check_output=False) for c in combinations]
+    first = configs[0]
+    fixed = [word for key, word in (("task", first.task), ("scene", first.scene_name)) if not swept & {key, "task"}]
+    asked = [a.value for a in parse(combinations[0]) if a.key == "output_dir"]
+    explicit = str(compose(combinations[0], check_output=False).output_dir) if asked and asked[-1] is not None else None
+    base = output_directory(explicit, "-".join([*fixed, "sweep"]), first.resume, check_output)
+    names = sweep_names(overrides, combinations)
+    return [
+        dataclasses.replace(config, output_dir=base / name, overrides=list(combination))
+        for config, name, combination in zip(configs, names, combinations, strict=True)
+    ]
+
+
+# ---------------------------------------------------------------- choosing
+
+
+def _choice(assignments: Sequence[Assignment], key: str) -> str | None:
+    given = [a for a in assignments if a.key == key]
+    if not given or given[-1].value is None:
+        return None
+    value = given[-1].value
+    if not isinstance(value, (str, int)) or isinstance(value, bool) or not str(value):
+        raise ConfigError(f"{given[-1].text}: expected the name of a {key}")
+    return str(value)
+
+
+def _check_name(kind: str, name: str, names: Sequence[str], spec: TaskSpec) -> None:
+    if name not in names:
+        raise ConfigError(f"{kind}={name}: task {spec.name!r} has no such {kind}{nearest(name, names)}")
+
+
+# ---------------------------------------------------------------- Hydra
+
+
+def _hydra(spec: TaskSpec, groups: Sequence[str]) -> Any:
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_module
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        with initialize_config_module("neuprim.conf", version_base="1.3"):
+            return hydra_compose("config", [f"hydra.searchpath=[pkg://{spec.config_package}]", *groups])
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(f"task {spec.name!r}: its YAML files do not compose ({' '.join(str(error).split())})") from error
+
+
+def _task_node(spec: TaskSpec) -> dict[str, Any]:
+    node = _plain(_hydra(spec, [f"+task@from_task={spec.name}"]).get("from_task") or {}, resolve=False)
+    known = ("scene", "preset", "options")
+    for key in node:
+        if key not in known:
+            raise ConfigError(f"task/{spec.name}.yaml: {key}: no such setting" + nearest(str(key), known))
+    options = node.get("options") or {}
+    if not isinstance(options, dict):
+        raise ConfigError(f"task/{spec.name}.yaml: options: expected a mapping")
+    return {"scene": node.get("scene"), "preset": node.get("preset"), "options": options}
+
+
+def _base(spec: TaskSpec, scene: str, preset: str, options: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Everything but the user's words, unresolved, and the names of the scene's settings that are paths."""
+    from omegaconf import OmegaConf
+
+    composed = _hydra(spec, [f"+scene/{spec.name}@from_scene={scene}", f"+preset/{spec.name}@from_preset={preset}"])
+    scene_node = _plain(composed.get("from_scene") or {}, resolve=False)
+    preset_node = _plain(composed.get("from_preset") or {}, resolve=False)
+    place = f"preset/{spec.name}/{preset}.yaml"
+    for key in preset_node:
+        if key not in PRESET_KEYS:
+            raise ConfigError(f"{place}: {key}: a preset may only set {', '.join(PRESET_KEYS)}")
+    declared = scene_node.pop(PATHS, None) or []
+    if not isinstance(declared, list) or any(name not in scene_node for name in declared) or "name" in scene_node:
+        raise ConfigError(f"scene/{spec.name}/{scene}.yaml: {PATHS} must list keys of the file, and name is no setting")
+    common = {k: v for k, v in _plain(composed, resolve=False).items() if not k.startswith("from_")}
+    merged = OmegaConf.merge(defaults(RunSettings), common, preset_node)
+    base = {**_plain(merged, resolve=False), "scene": scene_node, "task": {"options": options}}
+    try:
+        _settings(_plain(OmegaConf.create(base)))
+    except ConfigError as error:
+        raise ConfigError(f"{place}: {error}") from error
+    return base, declared
+
+
+def _merge(base: Mapping[str, Any], values: Sequence[Assignment]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The resolved configuration without and with the user's values."""
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    tree = OmegaConf.create(copy.deepcopy(dict(base)))
+    for a in values:
+        try:
+            OmegaConf.update(tree, a.key, a.value, merge=True, force_add=True)
+        except (OmegaConfBaseException, ValueError, TypeError, AssertionError) as error:
+            raise ConfigError(f"{a.text}: {' '.join(str(error).split())}") from error
+    return _plain(OmegaConf.create(dict(base))), _plain(tree)
+
+
+def _plain(node: Any, resolve: bool = True) -> dict[str, Any]:
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    if isinstance(node, dict):
+        return node
+    try:
+        plain = OmegaConf.to_container(node, resolve=resolve)
+    except OmegaConfBaseException as error:
+        text = str(error).strip().splitlines()[0]
+        raise ConfigError(f"{getattr(error, 'full_key', None) or 'configuration'}: {text}") from error
+    if not isinstance(plain, dict):
+        raise ConfigError(f"expected a mapping of settings, found {type(plain).__name__}")
+    return {str(k): v for k, v in plain.items()}
+
+
+# ---------------------------------------------------------------- validating
+
+
+def _settings(full: Mapping[str, Any]) -> RunSettings:
+    return build(RunSettings, {k: v for k, v in full.items() if k not in ("scene", "task")})
+
+
+def _check_key(assignment: Assignment, base: Mapping[str, Any], scene_name: str) -> None:
+    """Refuses a key that names no setting, with the nearest that do."""
+    key, value = assignment.key, assignment.value
+    path = key.split(".")
+    head, rest = path[0], path[1:]
+    scene: Mapping[str, Any] = base["scene"]
+    if head == "scene" and rest and (rest[0] in scene) and (len(rest) == 1 or isinstance(scene[rest[0]], Mapping)):
+        return
+    if path[:2] == ["task", "options"]:
+        return
+    if head not in ("scene", "task") and all(path) and is_free(RunSettings, path):
+        whole = rest == [] and head in PRESET_KEYS
+        if whole and not isinstance(value, dict):
+            raise ConfigError(f"{assignment.text}: {head} is a group of settings; set one of them as {head}.KEY=VALUE")
+        return
+    names = [*CHOICES, *setting_names(RunSettings), *(f"scene.{k}" for k in scene)]
+    if head == "scene" and rest:
+        own = sorted(f"scene.{k}" for k in scene)
+        hint = nearest(key, own) if own else "; it has none"
+        raise ConfigError(f"{key}: no such setting of scene {scene_name!r}{hint}")
+    inside = [n for n in names if n.startswith(head + ".")]
+    raise ConfigError(f"{key}: no such setting" + nearest(key, inside or names))
+
+
+def _scene(node: Mapping[str, Any], declared: Mapping[str, Any], paths: Sequence[str]) -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for key, value in node.items():
+        where = f"scene.{key}"
+        if key in paths and value is not None and value != REQUIRED:
+            if not isinstance(value, (str, int)) or isinstance(value, bool) or not str(value).strip():
+                raise ConfigError(f"{where}={value!r}: expected a path (quote it: {where}='...')")
+            value = str(Path(str(value)).expanduser().absolute())
+        if declared[key] == REQUIRED and (value is None or value == REQUIRED):
+            expected = f"expected a directory or file, as {where}=PATH" if key in paths else f"expected {where}=VALUE"
+            raise ConfigError(f"{where}: required and not given; {expected}")
+        result[key] = like(value, declared[key], where)
+    return result
+
+
+# ---------------------------------------------------------------- comparing
+
+
+def _typed(full: Mapping[str, Any], settings: RunSettings | None = None) -> dict[str, Any]:
+    """Flat dotted values, with the settings in their own types (so that 1 and 1.0 are the same rate)."""
+    made = dataclasses.asdict(settings or _settings(full))
+    tree = {**made, "scene": full["scene"], "task": full["task"]}
+    del tree["output_dir"], tree["resume"]
+    return _flat(tree)
+
+
+def _flat(node: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in node.items():
+        name = f"{where}.{key}" if where else str(key)
+        if isinstance(value, Mapping) and value:
+            flat.update(_flat(value, name))
+        elif not isinstance(value, Mapping):
+            flat[name] = value
+    return flat
+
+
+def _differences(default: Mapping[str, Any], actual: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    found: dict[str, tuple[Any, Any]] = {}
+    for key in [*default, *(k for k in actual if k not in default)]:
+        before, after = default.get(key), actual.get(key)
+        before = None if before == REQUIRED else before
+        if before != after:
+            found[key] = (before, after)
+    return found

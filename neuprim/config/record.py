@@ -1,0 +1,173 @@
+"""The typed configuration of one run, and its form on disk."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from neuprim.config.schema import build
+from neuprim.core.errors import CheckpointError, ConfigError, nearest
+from neuprim.core.render.settings import RenderSettings
+from neuprim.core.train.settings import ModelSettings, TrainSettings
+
+__all__ = ["RunConfig", "RunSettings"]
+
+MAX_BYTES = 1_000_000
+"""A configuration has a few kilobytes; anything larger is another file."""
+
+
+@dataclass
+class RunSettings:
+    """The part of the configuration that is the same for every task; defaults are a run's defaults."""
+
+    model: ModelSettings = field(default_factory=ModelSettings)
+    train: TrainSettings = field(default_factory=TrainSettings)
+    renderer: RenderSettings = field(default_factory=RenderSettings)
+    output_dir: str | None = None
+    seed: int = 0
+    resume: bool = False
+
+    def check(self) -> None:
+        """Raises ConfigError for a value out of range."""
+        if not 0 <= self.seed < 2**63:
+            raise ConfigError(f"seed={self.seed}: expected a whole number from 0 to 2^63 - 1")
+
+
+@dataclass
+class RunConfig:
+    """Everything a run depends on, validated.
+
+    Attributes:
+        task, scene_name, preset: what was chosen.
+        scene: the scene's own settings, as its loader takes them.
+        options: the task's own settings (``task.options``).
+        output_dir: the run's directory; it need not exist yet.
+        seed: of every random number the run draws.
+        resume: continue from the checkpoint in ``output_dir``, if there is one.
+        overrides: what the user typed.
+        non_default: dotted key -> (value with the same task, scene and preset and nothing typed, value of this run).
+    """
+
+    task: str
+    scene_name: str
+    scene: dict[str, Any]
+    preset: str
+    model: ModelSettings
+    train: TrainSettings
+    renderer: RenderSettings
+    output_dir: Path
+    seed: int = 0
+    resume: bool = False
+    options: dict[str, Any] = field(default_factory=dict)
+    overrides: list[str] = field(default_factory=list)
+    non_default: dict[str, tuple[Any, Any]] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain nested values, in the layout of the command line's keys."""
+        return {
+            "task": {"name": self.task, "options": self.options},
+            "scene": {"name": self.scene_name, **self.scene},
+            "preset": self.preset,
+            "model": dataclasses.asdict(self.model),
+            "train": dataclasses.asdict(self.train),
+            "renderer": dataclasses.asdict(self.renderer),
+            "output_dir": str(self.output_dir),
+            "seed": self.seed,
+            "resume": self.resume,
+            "overrides": list(self.overrides),
+            "non_default": {key: list(pair) for key, pair in self.non_default.items()},
+        }
+
+    def to_yaml(self) -> str:
+        """The resolved configuration as YAML; :meth:`from_yaml` reads it back unchanged."""
+        return yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True, width=120)
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> RunConfig:
+        """Reads a run directory's ``config.yaml`` (``path`` is the file or the directory); no code in it is run.
+
+        Raises:
+            CheckpointError: there is no such file, or it is not a run's configuration.
+            ConfigError: a setting in it does not exist or has an impossible value.
+        """
+        file = Path(path)
+        if file.is_dir():
+            file = file / "config.yaml"
+        elif file.name != "config.yaml" and not file.exists():
+            raise CheckpointError(f"{path}: no such run directory")
+        data = _read(file)
+        try:
+            return cls._from_dict(data)
+        except ConfigError as error:
+            raise ConfigError(f"{file}: {error}") from error
+
+    @classmethod
+    def _from_dict(cls, data: Mapping[str, Any]) -> RunConfig:
+        known = ["task", "scene", "preset", *(f.name for f in dataclasses.fields(RunSettings)), "overrides", "non_default"]
+        for key in data:
+            if key not in known:
+                raise ConfigError(f"{key}: no such setting" + nearest(str(key), known))
+        task, scene = _node(data, "task"), _node(data, "scene")
+        common = build(RunSettings, {f.name: data[f.name] for f in dataclasses.fields(RunSettings) if f.name in data})
+        if common.output_dir is None:
+            raise ConfigError("output_dir: missing; expected a directory")
+        overrides, non_default = data.get("overrides", []), data.get("non_default", {})
+        if not isinstance(overrides, list) or not all(isinstance(o, str) for o in overrides):
+            raise ConfigError("overrides: expected a list of texts")
+        if not isinstance(non_default, dict) or not all(isinstance(p, list) and len(p) == 2 for p in non_default.values()):
+            raise ConfigError("non_default: expected KEY: [default, value] pairs")
+        options = task.get("options", {})
+        if not isinstance(options, dict):
+            raise ConfigError("task.options: expected a mapping")
+        return cls(
+            task=_text(task.get("name"), "task.name"),
+            scene_name=_text(scene.get("name"), "scene.name"),
+            scene={str(k): v for k, v in scene.items() if k != "name"},
+            preset=_text(data.get("preset"), "preset"),
+            model=common.model,
+            train=common.train,
+            renderer=common.renderer,
+            output_dir=Path(common.output_dir),
+            seed=common.seed,
+            resume=common.resume,
+            options=options,
+            overrides=overrides,
+            non_default={str(key): (pair[0], pair[1]) for key, pair in non_default.items()},
+        )
+
+
+def _read(file: Path) -> Mapping[str, Any]:
+    try:
+        if file.stat().st_size > MAX_BYTES:
+            raise CheckpointError(f"{file}: larger than {MAX_BYTES} bytes; not a run's configuration")
+        data = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{file}: missing; expected a directory written by `neuprim run`") from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f" line {mark.line + 1}" if mark is not None else ""
+        problem = getattr(error, "problem", None) or "not YAML"
+        raise CheckpointError(f"{file}{place}: damaged configuration ({problem})") from error
+    except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"{file}: cannot be read ({type(error).__name__}: {error})") from error
+    if not isinstance(data, Mapping):
+        raise CheckpointError(f"{file}: not a run's configuration (expected a mapping, found {type(data).__name__})")
+    return data
+
+
+def _node(data: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    node = data.get(key)
+    if not isinstance(node, Mapping):
+        raise ConfigError(f"{key}: missing or not a mapping")
+    return node
+
+
+def _text(value: object, key: str) -> str:
+    if not isinstance(value, str) or not value:
+        raise ConfigError(f"{key}: missing; expected a name")
+    return value

@@ -1,0 +1,95 @@
+"""A model: geometry and the tensors of its two fields, one row per primitive."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.errors import NonFiniteError
+from neuprim.core.fields import ColourField, Conditions, DensityField, LoweredColour, LoweredDensity
+from neuprim.core.geometry import GEOMETRY_SPECS, Geometry
+from neuprim.core.schema import InitContext, ParameterSpec
+
+__all__ = ["Lowered", "Primitives"]
+
+
+@dataclass(frozen=True)
+class Lowered:
+    """What one frame hands to the renderer, whatever the task."""
+
+    geometry: Geometry
+    density: LoweredDensity
+    colour: LoweredColour
+
+
+class Primitives:
+    """N primitives with a density and a colour field.
+
+    Attributes:
+        density, colour: the fields.
+        specs: every parameter, geometry first; the only list of tensors there is.
+        params: name -> (N, *shape) tensor, in the order of ``specs``.
+
+    Raises:
+        ValueError: when names clash or a tensor's shape differs from its spec.
+    """
+
+    def __init__(self, density: DensityField, colour: ColourField, params: Mapping[str, Tensor]) -> None:
+        self.density, self.colour = density, colour
+        self.specs: tuple[ParameterSpec, ...] = (*GEOMETRY_SPECS, *density.parameters(), *colour.parameters())
+        names = [s.name for s in self.specs]
+        if len(set(names)) != len(names) or set(names) != set(params):
+            raise ValueError(f"parameters {sorted(params)} do not match the specs {sorted(names)}")
+        self.params: dict[str, Tensor] = {n: params[n] for n in names}
+        for spec in self.specs:
+            found, expected = tuple(self.params[spec.name].shape), (self.count, *spec.shape)
+            if found != expected:
+                raise ValueError(f"parameter {spec.name} has shape {found}, expected {expected}")
+
+    @classmethod
+    def initialise(cls, density: DensityField, colour: ColourField, context: InitContext) -> Primitives:
+        """Fresh primitives from the specs' own initialisers."""
+        specs = (*GEOMETRY_SPECS, *density.parameters(), *colour.parameters())
+        return cls(density, colour, {s.name: s.init(context).float().contiguous() for s in specs})
+
+    @property
+    def count(self) -> int:
+        return int(self.params["means"].shape[0])
+
+    @property
+    def parameters_per_primitive(self) -> int:
+        return sum(s.size for s in self.specs)
+
+    @property
+    def geometry(self) -> Geometry:
+        return Geometry(self.params["means"], self.params["log_scales"], self.params["quats"])
+
+    def of(self, field: DensityField | ColourField) -> dict[str, Tensor]:
+        """The tensors one field owns."""
+        return {s.name: self.params[s.name] for s in field.parameters()}
+
+    def lower(self, camera: Camera, conditions: Conditions) -> Lowered:
+        """Fold a frame's conditions into closed forms; differentiable."""
+        geometry = self.geometry
+        return Lowered(
+            geometry,
+            self.density.lower(self.of(self.density), geometry, conditions),
+            self.colour.lower(self.of(self.colour), geometry, camera, conditions),
+        )
+
+    def rows(self, index: Tensor) -> dict[str, Tensor]:
+        """Detached copies of some rows of every parameter."""
+        return {name: value.detach()[index].clone() for name, value in self.params.items()}
+
+    def check_finite(self, what: str = "parameter") -> None:
+        """Raise :class:`NonFiniteError` naming the first parameter and primitive that is NaN or infinite."""
+        for name, value in self.params.items():
+            if value.numel() and not bool(torch.isfinite(value.detach().sum())):
+                bad = ~torch.isfinite(value.detach()).reshape(self.count, -1).all(dim=1)
+                if bool(bad.any()):
+                    row = int(bad.nonzero()[0])
+                    raise NonFiniteError(f"{what} {name} of primitive {row} is not finite: {value.detach()[row].flatten()[:8].tolist()}")

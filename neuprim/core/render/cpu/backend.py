@@ -1,0 +1,204 @@
+"""The numba backend as one differentiable operation: lowered tensors in, image out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.errors import NonFiniteError
+from neuprim.core.fields import Constant, Cosine
+from neuprim.core.primitives import Lowered
+from neuprim.core.render.cpu.backward import backward_tiles, sum_rows
+from neuprim.core.render.cpu.binning import TileLists, bin_primitives
+from neuprim.core.render.cpu.forward import composite_tiles
+from neuprim.core.render.cpu.layout import G_ERROR, G_WEIGHT, NEURONS, PER_NEURON, SPAN_WIDTH, TILE, row_width
+from neuprim.core.render.cpu.prepare import NON_FINITE, prepare, prepare_backward
+from neuprim.core.render.cpu.threads import parallel_for
+from neuprim.core.render.output import RenderOutput, RenderStats
+from neuprim.core.render.settings import RenderSettings
+
+__all__ = ["render"]
+
+_PRIMITIVES_PER_CHUNK = 512
+_TURN = 2.0 * np.pi
+Array = np.ndarray[Any, Any]
+
+
+@dataclass
+class _Frame:
+    """Everything the backward pass shares with the forward pass of one view."""
+
+    camera: Camera
+    settings: RenderSettings
+    omega0: float
+    background: Array
+    stats: RenderStats
+    R: Array
+    t: Array
+    neurons: int
+    rows: Array
+    spans: Array
+    simple: Array
+    boxes: Array
+    norms: Array
+    limits: Array
+    lists: TileLists
+
+    @property
+    def intrinsics(self) -> Array:
+        c = self.camera
+        return np.array([c.fx, c.fy, c.cx, c.cy], np.float64)
+
+    @property
+    def tiles(self) -> int:
+        return -(-self.camera.width // TILE) * -(-self.camera.height // TILE)
+
+    @property
+    def chunk(self) -> int:
+        return max(2, -(-self.camera.width // TILE) // 2)
+
+
+def _array(tensor: Tensor) -> Array:
+    return np.ascontiguousarray(tensor.detach().numpy())
+
+
+def _norms(camera: Camera) -> Array:
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    result: Array = np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2).astype(np.float32)
+    return result
+
+
+def _prepare(tensors: dict[str, Array], camera: Camera, view: Array, omega0: float, background: Array, settings: RenderSettings, stats: RenderStats) -> _Frame:
+    count, K = tensors["W1"].shape[:2]
+    neurons = K + K % 2  # the backward kernel takes neurons in pairs; a padded one has amplitude 0
+    rows = np.empty((count, row_width(neurons)), np.float32)
+    spans = np.zeros((count, SPAN_WIDTH), np.float32)
+    simple = np.empty((count, max(neurons, 1)), np.bool_)
+    boxes, depth, status = np.empty((count, 4), np.int32), np.empty(count, np.float64), np.empty(count, np.uint8)
+    R, t = np.ascontiguousarray(view[:3, :3]), np.ascontiguousarray(view[:3, 3])
+    cam = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
+    size = np.array([camera.width, camera.height], np.int64)
+    names = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
+    parallel_for(
+        prepare, count, _PRIMITIVES_PER_CHUNK, settings.threads, *(tensors[n] for n in names),
+        R, t, cam, size, settings.near, omega0 / _TURN, rows, spans, simple, boxes, depth, status,
+    )  # fmt: skip
+    if bool((status == NON_FINITE).any()):
+        raise _non_finite(tensors, int(np.flatnonzero(status == NON_FINITE)[0]))
+    lists = bin_primitives(rows, spans, boxes, depth, status, camera.width, camera.height, settings.threads)
+    stats.pairs = lists.pairs
+    limits = np.array([settings.alpha_min, settings.alpha_max, settings.transmittance_min, settings.depth_floor], np.float32)
+    return _Frame(camera, settings, omega0, background, stats, R, t, neurons, rows, spans, simple, boxes, _norms(camera), limits, lists)
+
+
+def _non_finite(tensors: dict[str, Array], row: int) -> NonFiniteError:
+    for name, value in tensors.items():
+        if not np.isfinite(value[row]).all():
+            return NonFiniteError(f"{name} of primitive {row} is not finite: {value[row].ravel()[:8].tolist()}")
+    if not tensors["quats"][row].any():
+        return NonFiniteError(f"quats of primitive {row} is zero; expected a non-zero quaternion")
+    scale = tensors["log_scales"][row].tolist()
+    return NonFiniteError(f"log_scales of primitive {row} is {scale}: the semi-axes or weights leave the range of float32")
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, means: Tensor, log_scales: Tensor, quats: Tensor, W1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor,
+        colors: Tensor, viewmat: Tensor, background: Tensor, camera: Camera, omega0: float, settings: RenderSettings, stats: RenderStats,
+    ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+        names = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
+        tensors = {n: _array(v) for n, v in zip(names, (means, log_scales, quats, W1, b1, w2, b2), strict=True)}
+        tensors["colors"] = _array(colors)
+        if not np.isfinite(tensors["colors"].sum(dtype=np.float64)):
+            bad = np.flatnonzero(~np.isfinite(tensors["colors"]).all(axis=1))
+            if bad.size:
+                raise _non_finite(tensors, int(bad[0]))
+        frame = _prepare(tensors, camera, viewmat.detach().double().numpy(), omega0, _array(background.float()), settings, stats)
+        h, w, C = camera.height, camera.width, colors.shape[1]
+        rgb, T = np.empty((h, w, C), np.float32), np.empty((h, w), np.float32)
+        z, last = np.zeros((h, w) if settings.depth else (1, 1), np.float32), np.empty((h, w), np.int32)
+        palette = np.ascontiguousarray(tensors["colors"], np.float32)
+        lanes = parallel_for(
+            composite_tiles, frame.tiles, frame.chunk, settings.threads, frame.rows, frame.spans, frame.simple, frame.boxes,
+            frame.lists.starts, frame.lists.ids, palette, frame.norms, frame.background, frame.limits, settings.depth, frame.neurons,
+            rgb, T, z, last,
+        )  # fmt: skip
+        stats.extra["forward_lanes"] = sum(lanes)
+        ctx.frame, ctx.tensors, ctx.palette, ctx.last, ctx.T = frame, tensors, palette, last, T
+        ctx.dtypes = [x.dtype for x in (means, log_scales, quats, W1, b1, w2, b2, colors)]
+        ctx.view_dtype, ctx.background_dtype = viewmat.dtype, background.dtype
+        return torch.from_numpy(rgb), torch.from_numpy(T), torch.from_numpy(z)
+
+    @staticmethod
+    def backward(ctx: Any, g_rgb: Tensor, g_T: Tensor, g_z: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+        frame: _Frame = ctx.frame
+        s, t = frame.settings, ctx.tensors
+        count, K = t["W1"].shape[:2]
+        h, w, C = g_rgb.shape
+        grad_rgb = np.ascontiguousarray(g_rgb.numpy(), np.float32)
+        gT = np.ascontiguousarray((g_T + g_rgb @ torch.from_numpy(frame.background)).numpy(), np.float32)
+        gz = np.ascontiguousarray(g_z.numpy(), np.float32)
+        wanted = frame.stats.pixel_error
+        error = np.zeros((h, w), np.float32) if wanted is None else np.ascontiguousarray(wanted.detach().numpy(), np.float32)
+        width = row_width(frame.neurons, C)
+        pair_rows = np.empty((frame.lists.pairs, width), np.float32)
+        lanes = parallel_for(
+            backward_tiles, frame.tiles, frame.chunk, s.threads, frame.rows, frame.spans, frame.simple, frame.boxes,
+            frame.lists.starts, frame.lists.ids, ctx.palette, frame.norms, frame.limits, s.depth, frame.neurons,
+            ctx.T, ctx.last, grad_rgb, gT, gz, error, pair_rows,
+        )  # fmt: skip
+        frame.stats.extra["backward_lanes"] = sum(lanes)
+        grads, touched = np.empty((count, width), np.float32), np.empty(count, np.bool_)
+        parallel_for(sum_rows, count, _PRIMITIVES_PER_CHUNK, s.threads, frame.lists.order, frame.lists.first, frame.lists.slots, pair_rows, grads, touched)
+        out = [np.zeros(t[n].shape, np.float32) for n in ("means", "log_scales", "quats", "W1", "b1", "w2")]
+        g_b2 = np.zeros(count, np.float32)
+        want_view = bool(ctx.needs_input_grad[8])
+        g_view = np.zeros((count if want_view else 1, 3, 4), np.float64)
+        parallel_for(
+            prepare_backward, count, _PRIMITIVES_PER_CHUNK, s.threads, t["means"], t["log_scales"], t["quats"], t["W1"],
+            frame.R, frame.t, frame.intrinsics, s.near, frame.omega0 / _TURN, frame.rows, grads, touched,
+            *out, g_b2, g_view, want_view,
+        )  # fmt: skip
+        base = NEURONS + PER_NEURON * frame.neurons
+        if wanted is not None:
+            frame.stats.weight = torch.from_numpy(grads[:, G_WEIGHT].copy())
+            frame.stats.error_weight = torch.from_numpy(grads[:, G_ERROR].copy())
+        results = [*out, g_b2, np.ascontiguousarray(grads[:, base : base + C])]
+        tensors = [torch.from_numpy(r).to(d) for r, d in zip(results, ctx.dtypes, strict=True)]
+        view = None
+        if want_view:
+            full = torch.zeros(4, 4, dtype=torch.float64)
+            full[:3] = torch.from_numpy(g_view.sum(0))
+            view = full.to(ctx.view_dtype)
+        g_background = None
+        if ctx.needs_input_grad[9]:
+            g_background = (g_rgb * torch.from_numpy(ctx.T)[..., None]).sum((0, 1)).to(ctx.background_dtype)
+        return (*tensors, view, g_background, None, None, None, None)
+
+
+def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
+    """Render a lowered model whose density is :class:`Cosine` and colour :class:`Constant`; see ``neuprim.core.render.render``."""
+    density, colour = lowered.density, lowered.colour
+    assert isinstance(density, Cosine) and isinstance(colour, Constant), "the caller chooses a backend that knows the forms"
+    stats = RenderStats("cpu")
+    g = lowered.geometry
+    if background is None:
+        background = torch.zeros(colour.rgb.shape[1])
+    rgb, T, zsum = _Rasterize.apply(
+        g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1), colour.rgb,
+        camera.viewmat, background, camera, density.omega0, settings, stats,
+    )  # fmt: skip
+    dtype = g.means.dtype
+    alpha = 1 - T
+    depth = None
+    if settings.depth:
+        hit = alpha > 0
+        depth = torch.where(hit, zsum / torch.where(hit, alpha, torch.ones_like(alpha)), torch.zeros_like(zsum)).to(dtype)
+    return RenderOutput(rgb.to(dtype), alpha.to(dtype), depth, stats)

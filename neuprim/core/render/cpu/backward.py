@@ -1,0 +1,378 @@
+"""Tile-wise compositing, backward: back to front, transmittance recovered by T/(1 - alpha).
+
+Each (tile, primitive) pair writes one gradient row; the rows of a primitive are then added in a fixed order, so the
+result is bit-identical for any number of threads.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neuprim.core.render.cpu.compile import exact_kernel, inline, kernel
+from neuprim.core.render.cpu.layout import (
+    AMPLITUDE,
+    B_LAST,
+    B_NORM,
+    BACKWARD_SCRATCH,
+    DH,
+    DU,
+    DV,
+    E0,
+    ERR,
+    EX,
+    EXL,
+    EY,
+    EYL,
+    EZL,
+    FIELD,
+    G_COLOR,
+    G_ERROR,
+    G_LOG_M,
+    G_WEIGHT,
+    GEX,
+    GEY,
+    GEZ,
+    GF,
+    GMID,
+    GQX,
+    GQY,
+    GQZ,
+    GRAD,
+    GZ,
+    HALF,
+    IA,
+    MID,
+    MX,
+    MY,
+    MZ,
+    N_COS,
+    N_DSINC,
+    N_SIN,
+    NEURON_SCRATCH,
+    NEURONS,
+    OFFSET,
+    PER_NEURON,
+    PHASE,
+    PIXELS,
+    QX,
+    QY,
+    QZ,
+    S_,
+    T_,
+    TC,
+    TILE,
+    TM,
+    UNCUT,
+    UNIT,
+    ANCHOR_Z,
+    UX,
+    UY,
+    WX,
+    WY,
+    WZ,
+    XA,
+)
+from neuprim.core.render.cpu.tiles import chords, compact, row_spans
+from neuprim.core.render.cpu.turns import TAU, cos_turns, dsinc_turns, one_minus_exp, sinc_turns
+
+__all__ = ["backward_tiles", "sum_rows"]
+
+f = np.float32
+_STEPS = np.arange(TILE).astype(np.float32)
+
+
+@inline
+def _neuron_simple(S, V, n, wx, wy, wz, phase, amplitude):  # type: ignore[no-untyped-def]
+    """Forward value, and the three products the gradients need, for a rate below half a turn per half chord."""
+    for k in range(n):
+        v = (S[EXL + k] * wx + S[EYL + k] * wy + S[EZL + k] * wz) * S[HALF + k]
+        u = S[QX + k] * wx + S[QY + k] * wy + S[QZ + k] * wz + phase
+        r = u - np.rint(u)
+        z, zv = r * r, v * v
+        c, si = cos_turns(z), sinc_turns(zv)
+        V[N_COS + k] = c * si
+        V[N_SIN + k] = -TAU * TAU * r * sinc_turns(z) * si
+        V[N_DSINC + k] = c * dsinc_turns(zv) * f(2) * v
+        S[FIELD + k] += c * si * amplitude
+
+
+@inline
+def _neuron(S, V, n, wx, wy, wz, phase, amplitude):  # type: ignore[no-untyped-def]
+    """The same for any rate; d sinc/dv = (cos - sinc)/v beyond half a turn."""
+    for k in range(n):
+        v = (S[EXL + k] * wx + S[EYL + k] * wy + S[EZL + k] * wz) * S[HALF + k]
+        u = S[QX + k] * wx + S[QY + k] * wy + S[QZ + k] * wz + phase
+        r = u - np.rint(u)
+        z = r * r
+        turns = np.rint(v)
+        rv = v - turns
+        zv = rv * rv
+        near = turns == f(0)
+        iv = f(1) / (f(1) if near else v)
+        base = sinc_turns(zv)
+        si = base if near else base * rv * iv
+        ds = dsinc_turns(zv) * f(2) * v if near else (cos_turns(zv) - si) * iv
+        c = cos_turns(z)
+        V[N_COS + k] = c * si
+        V[N_SIN + k] = -TAU * TAU * r * sinc_turns(z) * si
+        V[N_DSINC + k] = c * ds
+        S[FIELD + k] += c * si * amplitude
+
+
+@inline
+def _uncomposite_row(state, tau, grad, cg, w, base, at, a, b, amin, amax, rank):  # type: ignore[no-untyped-def]
+    """One pixel row: recover T before this primitive, dL/d(optical depth), and the weights.
+
+    ``cg`` holds sum_c color_c dL/drgb_c (+ z dL/dz) on entry. S accumulates what lies behind: dL/dT_after x T_after.
+    """
+    st = state[base:]
+    tr, gr = tau[at : at + TILE], grad[at : at + TILE]
+    a, b = f(a), f(b)
+    sw, se = f(0), f(0)
+    for k in range(TILE):
+        step = _STEPS[k]
+        norm = st[k + B_NORM]
+        depth = tr[k] * norm
+        raw = one_minus_exp(depth)
+        alpha = min(raw, amax)
+        inside = (step >= a) & (step < b)
+        use = inside & (alpha >= amin) & (depth > f(0)) & (st[k + B_LAST] >= rank)
+        T, behind = st[k + T_], st[k + S_]
+        over = f(1) / (f(1) - alpha)
+        before = T * over
+        weight = alpha * before if use else f(0)
+        w[k] = weight
+        g_alpha = before * cg[k] - behind * over
+        st[k + S_] = behind + weight * cg[k]
+        st[k + T_] = before if use else T
+        g = g_alpha * (f(1) - raw) * norm
+        g = g if use & (raw < amax) else f(0)
+        gr[k] = g if inside else gr[k]
+        sw += weight
+        se += weight * st[k + ERR]
+    return sw, se
+
+
+@inline
+def _field_gradient(S, grad, n, out):  # type: ignore[no-untyped-def]
+    """From dL/d tau (per unit |d|) to dL/d FIELD, and the sums for b2 and log m."""
+    offset, log_m = f(0), f(0)
+    for k in range(n):
+        g, half = grad[TILE + k], S[HALF + k]
+        gf = f(2) * g * half
+        S[GRAD + k], S[GF + k] = f(2) * g, gf
+        offset += gf
+        log_m += gf * S[FIELD + k]
+        S[GQX + k], S[GQY + k], S[GQZ + k] = f(0), f(0), f(0)
+        S[GEX + k], S[GEY + k], S[GEZ + k] = f(0), f(0), f(0)
+    out[OFFSET], out[G_LOG_M] = offset, log_m
+
+
+@inline
+def _two_neurons(S, V0, V1, n, p, o, out):  # type: ignore[no-untyped-def]
+    """Gradients of two neurons, and their share of dL/dQ and dL/d(half e); two at a time to share the loads."""
+    ax, ay, az, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + AMPLITUDE]
+    o2 = o + PER_NEURON
+    bx, by, bz, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + AMPLITUDE]
+    s0, s1, s2, s3, s4 = f(0), f(0), f(0), f(0), f(0)
+    r0, r1, r2, r3, r4 = f(0), f(0), f(0), f(0), f(0)
+    for k in range(n):
+        gf, half = S[GF + k], S[HALF + k]
+        qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
+        ex, ey, ez = S[EXL + k] * half, S[EYL + k] * half, S[EZL + k] * half
+        s0 += gf * V0[N_COS + k]
+        u = gf * aa * V0[N_SIN + k]
+        v = gf * aa * V0[N_DSINC + k]
+        s1 += u
+        s2 += u * qx + v * ex
+        s3 += u * qy + v * ey
+        s4 += u * qz + v * ez
+        r0 += gf * V1[N_COS + k]
+        u1 = gf * ba * V1[N_SIN + k]
+        v1 = gf * ba * V1[N_DSINC + k]
+        r1 += u1
+        r2 += u1 * qx + v1 * ex
+        r3 += u1 * qy + v1 * ey
+        r4 += u1 * qz + v1 * ez
+        S[GQX + k] += u * ax + u1 * bx
+        S[GQY + k] += u * ay + u1 * by
+        S[GQZ + k] += u * az + u1 * bz
+        S[GEX + k] += v * ax + v1 * bx
+        S[GEY + k] += v * ay + v1 * by
+        S[GEZ + k] += v * az + v1 * bz
+    out[o + AMPLITUDE], out[o + PHASE], out[o + WX], out[o + WY], out[o + WZ] = s0, s1, s2, s3, s4
+    out[o2 + AMPLITUDE], out[o2 + PHASE], out[o2 + WX], out[o2 + WY], out[o2 + WZ] = r0, r1, r2, r3, r4
+
+
+@inline
+def _chord_gradient(S, n, p, out):  # type: ignore[no-untyped-def]
+    """From chord middle, half chord and direction back to the affine ray (E0, EX, EY, XA)."""
+    tc = p[TC]
+    a0, a1, a2, a3, a4, a5 = f(0), f(0), f(0), f(0), f(0), f(0)
+    a6, a7, a8, a9, b0, b1 = f(0), f(0), f(0), f(0), f(0), f(0)
+    for k in range(n):
+        half, ex, ey, ez = S[HALF + k], S[EXL + k], S[EYL + k], S[EZL + k]
+        mid, tm, ia, uncut, dh = S[MID + k], S[TM + k], S[IA + k], S[UNCUT + k], S[DH + k]
+        mx, my, mz = S[MX + k], S[MY + k], S[MZ + k]
+        gqx, gqy, gqz = S[GQX + k], S[GQY + k], S[GQZ + k]
+        vx, vy, vz = S[GEX + k], S[GEY + k], S[GEZ + k]
+        g_half = vx * ex + vy * ey + vz * ez + S[GRAD + k] * S[FIELD + k]
+        gex, gey, gez = vx * half + mid * gqx, vy * half + mid * gqy, vz * half + mid * gqz
+        g_mid = gqx * ex + gqy * ey + gqz * ez + S[GMID + k]
+        gt1 = (g_mid + g_half) * f(0.5)
+        gt0 = (g_mid - g_half) * f(0.5) * uncut
+        g_tm, g_h = gt0 + gt1, gt1 - gt0  # t0 = tm - h, t1 = tm + h
+        px, py, pz = mx + tm * ex, my + tm * ey, mz + tm * ez
+        D = max(f(1) - (px * px + py * py + pz * pz), f(0))
+        h = np.sqrt(D * ia)
+        gD = g_h * dh  # dh/dD with D floored
+        gA = -(g_h * h * f(0.5) + g_tm * tm) * ia  # via a = e.e, h = sqrt(D/a), tm = -(m.e)/a
+        gB = -g_tm * ia
+        m2 = f(-2) * gD  # D = 1 - |m + tm e|^2, and |m + tm e| does not change with tm
+        gmx, gmy, gmz = gqx + m2 * px + gB * ex, gqy + m2 * py + gB * ey, gqz + m2 * pz + gB * ez
+        gA2 = f(2) * gA
+        gex += tm * m2 * px + gB * mx + gA2 * ex
+        gey += tm * m2 * py + gB * my + gA2 * ey
+        gez += tm * m2 * pz + gB * mz + gA2 * ez
+        du, dv = S[DU + k], S[DV + k]
+        hx, hy, hz = gex + tc * gmx, gey + tc * gmy, gez + tc * gmz
+        a0 += gex
+        a1 += gey
+        a2 += gez
+        a3 += du * hx
+        a4 += du * hy
+        a5 += du * hz
+        a6 += dv * hx
+        a7 += dv * hy
+        a8 += dv * hz
+        a9 += gmx
+        b0 += gmy
+        b1 += gmz
+    out[E0], out[E0 + 1], out[E0 + 2] = a0, a1, a2
+    out[EX], out[EX + 1], out[EX + 2] = a3, a4, a5
+    out[EY], out[EY + 1], out[EY + 2] = a6, a7, a8
+    out[XA], out[XA + 1], out[XA + 2] = a9, b0, b1
+
+
+@kernel
+def backward_tiles(  # type: ignore[no-untyped-def]
+    start, stop, rows, spans, simple, boxes, starts, ids, colors, norms, limits, with_depth, neurons,
+    transmittance, last, g_rgb, g_transmittance, g_z, error, pair_rows,
+):  # fmt: skip
+    """Gradient rows of every pair of tiles ``start:stop``. ``g_transmittance`` already holds the background's share."""
+    height, width = norms.shape
+    across = (width + TILE - 1) // TILE
+    C = colors.shape[1]
+    color_at = NEURONS + PER_NEURON * neurons
+    amin, amax, floor = limits[0], limits[1], limits[3]
+    S = np.zeros(BACKWARD_SCRATCH + 1024, np.float32)
+    V = np.zeros((neurons, NEURON_SCRATCH), np.float32)
+    state = np.zeros((6 + C) * PIXELS + TILE, np.float32)
+    tau, grad = np.zeros(PIXELS + 4 * TILE, np.float32), np.zeros(PIXELS + 4 * TILE, np.float32)
+    w, cg = np.zeros(TILE, np.float32), np.zeros(TILE, np.float32)
+    left, right, offset = np.zeros(TILE, np.int32), np.zeros(TILE, np.int32), np.zeros(TILE, np.int32)
+    rows_live = np.zeros(TILE, np.float32)
+    lanes = 0
+    for t in range(start, stop):
+        tx, ty = (t % across) * TILE, (t // across) * TILE
+        state[:] = f(0)
+        deepest = 0
+        for y in range(TILE):
+            for x in range(TILE):
+                j, Y, X = y * TILE + x, ty + y, tx + x
+                state[j + T_] = f(1)
+                if X < width and Y < height:
+                    T = transmittance[Y, X]
+                    state[j + T_], state[j + B_NORM] = T, norms[Y, X]
+                    state[j + S_] = T * g_transmittance[Y, X]
+                    state[j + B_LAST], state[j + ERR] = f(last[Y, X]), error[Y, X]
+                    if with_depth:
+                        state[j + GZ] = g_z[Y, X]
+                    for c in range(C):
+                        state[j + G_COLOR + c * PIXELS] = g_rgb[Y, X, c]
+                    deepest = max(deepest, last[Y, X])
+        first = starts[t]
+        for q in range(first + deepest, starts[t + 1]):
+            pair_rows[q, :] = f(0)
+        for back in range(deepest):
+            q = first + deepest - 1 - back
+            i = ids[q]
+            p, out = rows[i], pair_rows[q]
+            rank = f(q - first + 1)
+            y0, y1 = max(boxes[i, 1] - ty, 0), min(boxes[i, 3] - ty, TILE)
+            x0, x1 = max(boxes[i, 0] - tx, 0), min(boxes[i, 2] - tx, TILE)
+            fx0, fy0 = f(tx) + f(0.5) - p[UX], f(ty) + f(0.5) - p[UY]
+            row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, left, right)
+            for y in range(y0, y1):
+                reach = f(0)
+                for k in range(TILE):
+                    reach = max(reach, state[B_LAST + y * TILE + k])
+                rows_live[y] = f(1) if reach >= rank else f(0)
+            n = compact(S, offset, left, right, y0, y1, rows_live, fx0, fy0)
+            out[:] = f(0)
+            if n == 0:
+                continue
+            n16 = ((n + 15) // 16) * 16
+            lanes += n16
+            chords(S, n16, p, floor, True)
+            for m in range(neurons):
+                o = NEURONS + PER_NEURON * m
+                if simple[i, m]:
+                    _neuron_simple(S, V[m], n16, p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE])
+                else:
+                    _neuron(S, V[m], n16, p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE])
+            for k in range(n16):
+                tau[TILE + k] = S[k + FIELD] * S[k + HALF] * f(2)
+            for k in range(n, n16):
+                grad[TILE + k] = f(0)
+            for k in range(n16):
+                S[GMID + k] = f(0)
+            weight, weighted_error = f(0), f(0)
+            for y in range(y0, y1):
+                a, b = left[y], right[y]
+                if b > a:
+                    at = offset[y] - a
+                    for k in range(TILE):
+                        cg[k] = f(0)
+                    for c in range(C):
+                        st, color = state[G_COLOR + c * PIXELS + y * TILE :], colors[i, c]
+                        for k in range(TILE):
+                            cg[k] += color * st[k]
+                    if with_depth:
+                        st = state[GZ + y * TILE :]
+                        for k in range(a, b):
+                            cg[k] += st[k] * (p[ANCHOR_Z] + p[UNIT] * S[MID + at + k])
+                    sw, se = _uncomposite_row(state, tau, grad, cg, w, y * TILE, TILE + at, a, b, amin, amax, rank)
+                    weight += sw
+                    weighted_error += se
+                    for c in range(C):
+                        st = state[G_COLOR + c * PIXELS + y * TILE :]
+                        total = f(0)
+                        for k in range(TILE):
+                            total += w[k] * st[k]
+                        out[color_at + c] += total
+                    if with_depth:
+                        st = state[GZ + y * TILE :]
+                        for k in range(a, b):
+                            S[GMID + at + k] = w[k] * st[k] * p[UNIT]
+            out[G_WEIGHT], out[G_ERROR] = weight, weighted_error
+            _field_gradient(S, grad, n16, out)
+            for m in range(0, neurons, 2):
+                _two_neurons(S, V[m], V[m + 1], n16, p, NEURONS + PER_NEURON * m, out)
+            _chord_gradient(S, n16, p, out)
+    return lanes
+
+
+@exact_kernel
+def sum_rows(start, stop, order, first, slots, pair_rows, grads, touched):  # type: ignore[no-untyped-def]
+    """grads[i] = sum of primitive i's pair rows, in pair order, for depth ranks ``start:stop``."""
+    for r in range(start, stop):
+        i = order[r]
+        g = grads[i]
+        g[:] = np.float32(0)
+        seen = first[r + 1] > first[r]
+        touched[i] = seen
+        for k in range(first[r], first[r + 1]):
+            row = pair_rows[slots[k]]
+            for c in range(g.shape[0]):
+                g[c] += row[c]

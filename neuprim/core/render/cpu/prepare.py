@@ -1,0 +1,307 @@
+"""The per-primitive stage, in float64: anchors, whitening, exact bounds; and its hand-written backward.
+
+Precision is won here. Each primitive is anchored at its own projected centre, so that whitened rays are affine in the
+pixel offset and float32 never sees the distance to the camera (method: "Line integral").
+
+The anchor (depth, pixel) and the unit of t are constants of the frame: the image does not depend on their choice, so
+they carry no gradient.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from neuprim.core.render.cpu.compile import exact_kernel
+from neuprim.core.render.cpu.layout import (
+    AMPLITUDE,
+    ANCHOR_Z,
+    E0,
+    EX,
+    EY,
+    G_LOG_M,
+    HX,
+    HY,
+    NEAR,
+    NEURONS,
+    OFFSET,
+    PER_NEURON,
+    PHASE,
+    SKEW,
+    TC,
+    UNBOUNDED,
+    UNIT,
+    UX,
+    UY,
+    WX,
+    XA,
+    XC,
+    YC,
+)
+
+__all__ = ["CULLED", "NON_FINITE", "VISIBLE", "prepare", "prepare_backward"]
+
+VISIBLE, CULLED, NON_FINITE = 0, 1, 2
+_FLOAT32_MAX = 3.0e38
+
+strict = njit(error_model="numpy", forceinline=True)
+
+
+@strict
+def _rotation(q, out):  # type: ignore[no-untyped-def]
+    n = 1.0 / np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    w, x, y, z = q[0] * n, q[1] * n, q[2] * n, q[3] * n
+    out[0, 0] = 1 - 2 * (y * y + z * z)
+    out[0, 1] = 2 * (x * y - w * z)
+    out[0, 2] = 2 * (x * z + w * y)
+    out[1, 0] = 2 * (x * y + w * z)
+    out[1, 1] = 1 - 2 * (x * x + z * z)
+    out[1, 2] = 2 * (y * z - w * x)
+    out[2, 0] = 2 * (x * z - w * y)
+    out[2, 1] = 2 * (y * z + w * x)
+    out[2, 2] = 1 - 2 * (x * x + y * y)
+    return n
+
+
+@strict
+def _rotation_backward(q, n, g, out):  # type: ignore[no-untyped-def]
+    """dL/dq from dL/dR; the normalisation projects out the radial part."""
+    w, x, y, z = q[0] * n, q[1] * n, q[2] * n, q[3] * n
+    gw = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
+    gx = 2 * (w * (g[2, 1] - g[1, 2]) + y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) - 2 * x * (g[1, 1] + g[2, 2]))
+    gy = 2 * (w * (g[0, 2] - g[2, 0]) + x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) - 2 * y * (g[0, 0] + g[2, 2]))
+    gz = 2 * (w * (g[1, 0] - g[0, 1]) + x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) - 2 * z * (g[0, 0] + g[1, 1]))
+    dot = gw * w + gx * x + gy * y + gz * z
+    out[0] = (gw - dot * w) * n
+    out[1] = (gx - dot * x) * n
+    out[2] = (gy - dot * y) * n
+    out[3] = (gz - dot * z) * n
+
+
+@strict
+def _cross(a, b, out):  # type: ignore[no-untyped-def]
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+
+
+@strict
+def _dot(a, b):  # type: ignore[no-untyped-def]
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@strict
+def _frame(mean, log_scale, quat, R, t, cam, near, local, B, axes, c, anchor):  # type: ignore[no-untyped-def]
+    """Fill camera-axes orientation B, axes s/m, centre c and the anchor (depth, pixel x, pixel y); returns (m, 1/|q|).
+
+    The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same number.
+    """
+    n = _rotation(quat, local)
+    top = max(np.float64(log_scale[0]), np.float64(log_scale[1]), np.float64(log_scale[2]))
+    m = np.exp(top)
+    for i in range(3):
+        axes[i] = np.exp(np.float64(log_scale[i]) - top)
+        c[i] = R[i, 0] * mean[0] + R[i, 1] * mean[1] + R[i, 2] * mean[2] + t[i]
+        for j in range(3):
+            B[i, j] = R[i, 0] * local[0, j] + R[i, 1] * local[1, j] + R[i, 2] * local[2, j]
+    fx, fy, cx, cy = cam[0], cam[1], cam[2], cam[3]
+    if c[2] > 1.5 * m + near:
+        anchor[0] = m * np.float64(np.float32(c[2] / m))
+        anchor[1] = np.float64(np.float32(fx * c[0] / c[2] + cx))
+        anchor[2] = np.float64(np.float32(fy * c[1] / c[2] + cy))
+    else:  # the centre is near or behind the camera: anchor at the camera itself
+        anchor[0] = 0.0
+        anchor[1] = np.float64(np.float32(cx))
+        anchor[2] = np.float64(np.float32(cy))
+    return m, n
+
+
+@exact_kernel
+def prepare(start, stop, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, size, near, turns, rows, spans, simple, boxes, depth, status):  # type: ignore[no-untyped-def]
+    """Fill kernel rows, silhouette spans, pixel boxes, view depths and status of primitives ``start:stop``.
+
+    cam = (fx, fy, cx, cy); size = (width, height); turns = omega0 / 2 pi. ``simple[i, k]`` says that neuron k's phase
+    changes by less than a turn over any chord, so that sinc needs no range reduction.
+    """
+    K = W1.shape[1]
+    local, B, A = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    axes, c, anchor, ref, w = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    e0, ex, ey, xa = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    k0, ka, kb, tmp = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    fx, fy, cx, cy = cam[0], cam[1], cam[2], cam[3]
+    for i in range(start, stop):
+        row = rows[i]
+        row[:] = np.float32(0)
+        m, _ = _frame(means[i], log_scales[i], quats[i], R, t, cam, near, local, B, axes, c, anchor)
+        tc = anchor[0] / m
+        ref[0] = (anchor[1] - cx) / fx
+        ref[1] = (anchor[2] - cy) / fy
+        ref[2] = 1.0
+        for j in range(3):
+            w[j] = tc * ref[j] - c[j] / m
+        biggest = 0.0
+        total = 0.0
+        for a in range(3):
+            for j in range(3):
+                A[a, j] = B[j, a] / axes[a]  # m S^-1 B^T
+            e0[a] = A[a, 0] * ref[0] + A[a, 1] * ref[1] + A[a, 2]
+            ex[a] = A[a, 0] / fx
+            ey[a] = A[a, 1] / fy
+            xa[a] = A[a, 0] * w[0] + A[a, 1] * w[1] + A[a, 2] * w[2]
+            row[E0 + a], row[EX + a], row[EY + a], row[XA + a] = e0[a], ex[a], ey[a], xa[a]
+            biggest = max(biggest, abs(xa[a]), abs(e0[a]))
+            total += e0[a] + ex[a] + ey[a] + xa[a]
+        row[TC], row[UX], row[UY] = tc, anchor[1], anchor[2]
+        row[NEAR] = (near - anchor[0]) / m
+        row[OFFSET] = b2[i]
+        row[UNIT], row[ANCHOR_Z] = m, anchor[0]
+        biggest = max(biggest, tc, abs(near - anchor[0]) / m, m, abs(np.float64(b2[i])))
+        total += tc + row[NEAR] + m + b2[i]
+        for k in range(K):
+            o = NEURONS + PER_NEURON * k
+            norm = 0.0
+            for j in range(3):
+                v = turns * axes[j] * (W1[i, k, 0] * local[0, j] + W1[i, k, 1] * local[1, j] + W1[i, k, 2] * local[2, j])
+                row[o + WX + j] = v
+                norm += v * v
+                biggest = max(biggest, abs(v))
+            phase = turns * np.float64(b1[i, k])
+            row[o + PHASE] = phase - np.rint(phase)
+            row[o + AMPLITUDE] = w2[i, k]
+            simple[i, k] = norm < 0.4999 * 0.4999
+            total += norm + phase + w2[i, k]
+            biggest = max(biggest, abs(np.float64(w2[i, k])))
+        for k in range(K, simple.shape[1]):
+            simple[i, k] = True
+
+        depth[i] = c[2]
+        boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
+        if not np.isfinite(total):
+            status[i] = NON_FINITE
+            continue
+        status[i] = CULLED
+        szz = m * m * ((B[2, 0] * axes[0]) ** 2 + (B[2, 1] * axes[1]) ** 2 + (B[2, 2] * axes[2]) ** 2)
+        reach = np.sqrt(szz)
+        if c[2] + reach <= near:
+            continue
+        if biggest > _FLOAT32_MAX:
+            if m > 1.0:
+                status[i] = NON_FINITE  # a scale or weight beyond float32
+            continue  # so small against its distance that no pixel centre can hit it
+        span = spans[i]
+        span[SKEW], span[XC], span[YC], span[HX], span[HY] = 0.0, 0.0, 0.0, UNBOUNDED, UNBOUNDED
+        x0, x1, y0, y1 = 0.0, float(size[0]), 0.0, float(size[1])
+        if c[2] - reach > 1e-3 * reach:  # wholly in front of the camera plane: the silhouette is an ellipse
+            # in units of m: tangents (k +- sqrt(D))/(z^2 - S_zz), see projection.screen_boxes
+            z, s22 = c[2] / m, szz / (m * m)
+            for axis in range(2):
+                ci = c[axis] / m
+                sii = (B[axis, 0] * axes[0]) ** 2 + (B[axis, 1] * axes[1]) ** 2 + (B[axis, 2] * axes[2]) ** 2
+                siz = B[axis, 0] * B[2, 0] * axes[0] ** 2 + B[axis, 1] * B[2, 1] * axes[1] ** 2 + B[axis, 2] * B[2, 2] * axes[2] ** 2
+                D = z * z * sii - 2 * ci * z * siz + ci * ci * s22 - (sii * s22 - siz * siz)
+                root, mid, den = np.sqrt(max(D, 0.0)), ci * z - siz, z * z - s22
+                lo, hi = cam[axis] * (mid - root) / den + cam[2 + axis], cam[axis] * (mid + root) / den + cam[2 + axis]
+                if axis == 0:
+                    x0, x1 = max(x0, np.ceil(lo - 0.5)), min(x1, np.floor(hi - 0.5) + 1)
+                else:
+                    y0, y1 = max(y0, np.ceil(lo - 0.5)), min(y1, np.floor(hi - 0.5) + 1)
+            # |e|^2 - |x x e|^2 > 0 is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half width from (HX, HY)
+            _cross(xa, e0, k0)
+            _cross(xa, ex, ka)
+            _cross(ex, e0, tmp)
+            for j in range(3):
+                ka[j] += tc * tmp[j]
+            _cross(xa, ey, kb)
+            _cross(ey, e0, tmp)
+            for j in range(3):
+                kb[j] += tc * tmp[j]
+            q0, q1, q2 = _dot(e0, e0) - _dot(k0, k0), _dot(e0, ex) - _dot(k0, ka), _dot(e0, ey) - _dot(k0, kb)
+            q3, q4, q5 = _dot(ex, ex) - _dot(ka, ka), _dot(ex, ey) - _dot(ka, kb), _dot(ey, ey) - _dot(kb, kb)
+            d0, d1, d2 = q1 * q1 - q3 * q0, q1 * q4 - q3 * q2, q4 * q4 - q3 * q5
+            if q3 < 0.0 and d2 < 0.0:
+                yc = -d1 / d2
+                peak = d0 + d1 * yc
+                if peak > 0.0:
+                    span[SKEW], span[XC], span[YC] = -q4 / q3, -(q1 + q4 * yc) / q3, yc
+                    span[HX], span[HY] = np.sqrt(peak) / -q3, np.sqrt(-peak / d2)
+        if x1 > x0 and y1 > y0:
+            boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = int(x0), int(y0), int(x1), int(y1)
+            status[i] = VISIBLE
+
+
+@exact_kernel
+def prepare_backward(  # type: ignore[no-untyped-def]
+    start, stop, means, log_scales, quats, W1, R, t, cam, near, turns, rows, grads, touched,
+    g_means, g_log_scales, g_quats, g_W1, g_b1, g_w2, g_b2, g_view, want_view,
+):  # fmt: skip
+    """Chain rule from gradient rows to parameters, for primitives ``start:stop``; returns dL/d(R | t) of this chunk, (3, 4)."""
+    K = W1.shape[1]
+    local, B, A, gA, gB, gL = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    axes, c, anchor, ref, w = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    gc, gl, gq, q = np.empty(3), np.empty(3), np.empty(4), np.empty(4)
+    fx, fy, cx, cy = cam[0], cam[1], cam[2], cam[3]
+    for i in range(start, stop):
+        if not touched[i]:
+            continue
+        g = grads[i]
+        m, n = _frame(means[i], log_scales[i], quats[i], R, t, cam, near, local, B, axes, c, anchor)
+        tc = anchor[0] / m
+        ref[0], ref[1], ref[2] = (anchor[1] - cx) / fx, (anchor[2] - cy) / fy, 1.0
+        for j in range(3):
+            w[j] = tc * ref[j] - c[j] / m
+            gc[j] = 0.0
+        for a in range(3):
+            gx = np.float64(g[XA + a])
+            row_sum = 0.0
+            for j in range(3):
+                A[a, j] = B[j, a] / axes[a]
+                gA[a, j] = g[E0 + a] * ref[j] + gx * w[j]
+            gA[a, 0] += g[EX + a] / fx
+            gA[a, 1] += g[EY + a] / fy
+            for j in range(3):
+                gB[j, a] = gA[a, j] / axes[a]
+                row_sum += gA[a, j] * A[a, j]
+                gc[j] -= A[a, j] * gx / m
+            gl[a] = -row_sum  # A scales with 1/s_a
+        log_m = -np.float64(g[G_LOG_M])  # the density's own 1/m
+        for a in range(3):
+            for j in range(3):
+                gL[a, j] = 0.0
+        for k in range(K):
+            o = NEURONS + PER_NEURON * k
+            for j in range(3):
+                gw = np.float64(g[o + WX + j])
+                gl[j] += gw * rows[i, o + WX + j]  # W on whitened axes scales with s_j/m
+                log_m -= gw * rows[i, o + WX + j]
+                for a in range(3):
+                    gL[a, j] += turns * axes[j] * W1[i, k, a] * gw
+            for a in range(3):
+                g_W1[i, k, a] = turns * (
+                    g[o + WX] * axes[0] * local[a, 0] + g[o + WX + 1] * axes[1] * local[a, 1] + g[o + WX + 2] * axes[2] * local[a, 2]
+                )
+            g_b1[i, k] = turns * g[o + PHASE]
+            g_w2[i, k] = g[o + AMPLITUDE]
+        g_b2[i] = g[OFFSET]
+        first = 0
+        for j in range(1, 3):
+            if log_scales[i, j] > log_scales[i, first]:
+                first = j
+        gl[first] += log_m
+        for a in range(3):
+            g_log_scales[i, a] = gl[a]
+            g_means[i, a] = R[0, a] * gc[0] + R[1, a] * gc[1] + R[2, a] * gc[2]
+            for j in range(3):  # B = R local
+                gL[a, j] += R[0, a] * gB[0, j] + R[1, a] * gB[1, j] + R[2, a] * gB[2, j]
+        for j in range(4):
+            q[j] = quats[i, j]
+        _rotation_backward(q, n, gL, gq)
+        for j in range(4):
+            g_quats[i, j] = gq[j]
+        if want_view:
+            for a in range(3):
+                for j in range(3):
+                    value = gc[a] * means[i, j]
+                    for b in range(3):
+                        value += gB[a, b] * local[j, b]
+                    g_view[i, a, j] = value
+                g_view[i, a, 3] = gc[a]

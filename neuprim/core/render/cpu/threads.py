@@ -1,0 +1,50 @@
+"""Run a nogil kernel over a range on all cores. Results do not depend on the number of threads: chunks never share output."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+__all__ = ["core_count", "parallel_for"]
+
+_pools: dict[int, ThreadPoolExecutor] = {}
+_lock = threading.Lock()
+
+
+def core_count() -> int:
+    """Cores this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on every platform
+        return os.cpu_count() or 1
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    with _lock:
+        if threads not in _pools:
+            _pools[threads] = ThreadPoolExecutor(threads, thread_name_prefix="neuprim")
+        return _pools[threads]
+
+
+def parallel_for(function: Callable[..., Any], count: int, chunk: int, threads: int, *args: Any) -> list[Any]:
+    """Call ``function(start, stop, *args)`` for chunks of ``range(count)``, drawn dynamically; returns the results in chunk order."""
+    threads = threads or core_count()
+    chunks = -(-count // chunk) if count else 0
+    if threads == 1 or chunks <= 1:
+        return [function(c * chunk, min(count, (c + 1) * chunk), *args) for c in range(chunks)]
+    results: list[Any] = [None] * chunks
+    ticket = itertools.count()  # next() is atomic under the GIL
+
+    def work() -> None:
+        while (c := next(ticket)) < chunks:
+            results[c] = function(c * chunk, min(count, (c + 1) * chunk), *args)
+
+    futures = [_pool(threads).submit(work) for _ in range(min(threads, chunks) - 1)]
+    work()
+    for future in futures:
+        future.result()
+    return results

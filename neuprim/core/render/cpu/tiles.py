@@ -1,0 +1,133 @@
+"""Building blocks shared by the forward and the backward pass of one (tile, primitive) pair.
+
+Per pair: solve the silhouette for each pixel row, gather only the pixels inside it into a compact list of lanes, run
+chord and neurons over that list, scatter back row by row. Evaluated lanes then nearly equal true hits.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neuprim.core.render.cpu.compile import inline
+from neuprim.core.render.cpu.layout import (
+    DH,
+    DU,
+    DV,
+    E0,
+    EX,
+    EXL,
+    EY,
+    EYL,
+    EZL,
+    FIELD,
+    HALF,
+    HX,
+    HY,
+    IA,
+    MID,
+    MX,
+    MY,
+    MZ,
+    NEAR,
+    OFFSET,
+    QX,
+    QY,
+    QZ,
+    SKEW,
+    TC,
+    TILE,
+    TM,
+    UNCUT,
+    XA,
+    XC,
+    YC,
+)
+
+__all__ = ["chords", "compact", "row_spans"]
+
+f = np.float32
+_STEPS = np.arange(TILE).astype(np.float32)
+_MARGIN = f(2e-3)  # pixels; a lane too many is rejected by its own D
+
+
+@inline
+def row_spans(span, fx0, fy0, y0, y1, x0, x1, left, right):  # type: ignore[no-untyped-def]
+    """Pixels [left, right) of tile rows y0:y1 inside the silhouette; fx0, fy0: tile corner's pixel centre from the anchor."""
+    ihy = f(1) / span[HY]
+    for y in range(y0, y1):
+        dv = fy0 + f(y) - span[YC]
+        k = dv * ihy
+        s = f(1) - k * k
+        half = span[HX] * np.sqrt(max(s, f(0))) + _MARGIN
+        mid = span[XC] + span[SKEW] * dv - fx0
+        lo = max(np.ceil(mid - half), f(x0))
+        hi = min(np.floor(mid + half) + f(1), f(x1))
+        inside = s > f(-1e-2)
+        left[y] = np.int32(lo) if inside else np.int32(0)
+        right[y] = np.int32(hi) if inside else np.int32(0)
+
+
+@inline
+def compact(S, offset, left, right, y0, y1, rows_live, fx0, fy0):  # type: ignore[no-untyped-def]
+    """Gather pixel offsets of live rows into lanes; ``offset[y]`` is where row y starts. Returns the lane count.
+
+    Every row writes a whole vector; the next row, or the final padding, overwrites what stands over, so tail lanes
+    always hold finite numbers.
+    """
+    n = 0
+    for y in range(y0, y1):
+        offset[y] = n
+        a = left[y]
+        m = right[y] - a
+        if m > 0 and rows_live[y] > f(0):
+            x0, dv = fx0 + f(a), fy0 + f(y)
+            v = S[n : n + DV + 32]
+            for k in range(TILE):
+                v[k] = x0 + _STEPS[k]
+            for k in range(TILE):
+                v[k + DV] = dv
+            n += m
+        else:
+            right[y] = a
+    v = S[n : n + DV + 32]
+    for k in range(TILE):
+        v[k] = f(0)
+    for k in range(TILE):
+        v[k + DV] = f(0)
+    return n
+
+
+@inline
+def chords(S, n, p, depth_floor, backward):  # type: ignore[no-untyped-def]
+    """Chord middle Q, direction E and half length of n lanes (method: "Line integral"); HALF = 0 where the ray misses."""
+    e0, e1, e2 = p[E0], p[E0 + 1], p[E0 + 2]
+    x0, x1, x2 = p[EX], p[EX + 1], p[EX + 2]
+    y0, y1, y2 = p[EY], p[EY + 1], p[EY + 2]
+    a0, a1, a2 = p[XA], p[XA + 1], p[XA + 2]
+    tc, near, offset = p[TC], p[NEAR], p[OFFSET]
+    for k in range(n):
+        du, dv = S[DU + k], S[DV + k]
+        gx, gy, gz = du * x0 + dv * y0, du * x1 + dv * y1, du * x2 + dv * y2
+        ex, ey, ez = e0 + gx, e1 + gy, e2 + gz
+        mx, my, mz = a0 + tc * gx, a1 + tc * gy, a2 + tc * gz
+        ia = f(1) / (ex * ex + ey * ey + ez * ez)
+        tm = -(mx * ex + my * ey + mz * ez) * ia
+        px, py, pz = mx + tm * ex, my + tm * ey, mz + tm * ez
+        D = f(1) - (px * px + py * py + pz * pz)
+        h = np.sqrt(max(D, f(1e-12)) * ia)
+        t0, t1 = tm - h, tm + h
+        uncut = f(1) if t0 > near else f(0)
+        t0 = max(t0, near)
+        mid = (t0 + t1) * f(0.5)
+        half = (t1 - t0) * f(0.5)
+        half = half if D > f(0) else f(0)
+        half = max(half, f(0))
+        S[QX + k], S[QY + k], S[QZ + k] = mx + mid * ex, my + mid * ey, mz + mid * ez
+        S[EXL + k], S[EYL + k], S[EZL + k] = ex, ey, ez
+        S[HALF + k] = half
+        S[FIELD + k] = offset
+        S[MID + k] = mid
+        if backward:
+            S[MX + k], S[MY + k], S[MZ + k] = mx, my, mz
+            S[TM + k], S[IA + k], S[UNCUT + k] = tm, ia, uncut
+            S[DH + k] = f(0.5) * ia / np.sqrt(max(D, depth_floor) * ia)

@@ -1,0 +1,202 @@
+"""What a run directory holds, read without assuming that the run ended.
+
+Expected files, each of which may be missing: ``config.yaml`` (resolved settings), ``metrics.json`` (final numbers), ``metrics.jsonl``
+(one JSON object per logged step) and ``renders/`` (held-out views as ``test_<index>_<name>.png`` with ``_truth`` and ``_error``
+beside them, and ``orbit.webp``).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from neuprim.core.errors import DataError
+
+__all__ = ["RunRecord", "ViewFiles", "number", "read_run"]
+
+
+@dataclass(frozen=True)
+class ViewFiles:
+    """The pictures of one held-out view; ``stem`` is its name as file names spell it, ``index`` its place in the split."""
+
+    index: int
+    stem: str
+    render: Path
+    truth: Path | None
+    error: Path | None
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """A run directory's content.
+
+    Attributes:
+        config_text, config: ``config.yaml`` as written and as parsed; None and empty without the file.
+        metrics: ``metrics.json``, None while the run has not finished.
+        log: ``metrics.jsonl`` in order of steps. Where a resumed run logged a step again, the later line counts.
+        unreadable_lines: lines of the log that are not JSON objects with a step, as a kill in mid-write leaves them.
+    """
+
+    run_dir: Path
+    config_text: str | None
+    config: Mapping[str, Any]
+    metrics: Mapping[str, Any] | None
+    log: list[Mapping[str, Any]]
+    unreadable_lines: int
+    views: list[ViewFiles]
+    orbit: Path | None
+
+    @property
+    def finished(self) -> bool:
+        """Whether the final numbers are there."""
+        return self.metrics is not None
+
+    def field(self, key: str) -> Any:
+        """A value of ``metrics.json``, None where the file or the key is missing."""
+        return None if self.metrics is None else self.metrics.get(key)
+
+    def name_of(self, key: str) -> str | None:
+        """The task's or scene's name: from the metrics, else from the config (a string, or a section with ``name``)."""
+        value = self.field(key)
+        if value is None:
+            value = self.config.get(key)
+        if isinstance(value, Mapping):
+            value = value.get("name")
+        return None if value is None else str(value)
+
+    def last(self, key: str) -> tuple[float, float] | None:
+        """(step, value) of the newest log line that has a finite number under ``key``."""
+        for line in reversed(self.log):
+            value = number(line.get(key))
+            if value is not None and math.isfinite(value):
+                return float(line["step"]), value
+        return None
+
+    def view_numbers(self, view: ViewFiles) -> Mapping[str, Any]:
+        """The entry of ``per_view`` that belongs to a view's pictures; empty where none does.
+
+        File names may spell a view's name with other punctuation. Numbers are shown only where the names agree apart from that.
+        """
+        entries = per_view(self)
+        named = [e for e in entries if str(e.get("name")) == view.stem]
+        if len(named) == 1:
+            return named[0]
+        if view.index < len(entries) and _plain(str(entries[view.index].get("name"))) == _plain(view.stem):
+            return entries[view.index]
+        alike = [e for e in entries if _plain(str(e.get("name"))) == _plain(view.stem)]
+        return alike[0] if len(alike) == 1 else {}
+
+
+def per_view(run: RunRecord) -> list[Mapping[str, Any]]:
+    """The per-view entries of ``metrics.json``; empty where there are none."""
+    entries = run.field("per_view")
+    return [e for e in entries if isinstance(e, Mapping)] if isinstance(entries, list) else []
+
+
+def number(value: object) -> float | None:
+    """``value`` as a float if it is a number and not NaN, else None."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
+        return None
+    return float(value)
+
+
+def read_run(run_dir: Path) -> RunRecord:
+    """Read a run directory.
+
+    Raises:
+        DataError: no such directory, nothing of a run in it, or a damaged ``config.yaml`` or ``metrics.json``.
+    """
+    if not run_dir.is_dir():
+        raise DataError(f"{run_dir}: not a directory")
+    config_file, metrics_file, log_file = (run_dir / name for name in ("config.yaml", "metrics.json", "metrics.jsonl"))
+    if not any(f.is_file() for f in (config_file, metrics_file, log_file)):
+        raise DataError(f"{run_dir}: not a run directory, it has none of config.yaml, metrics.json and metrics.jsonl")
+    config_text = _text(config_file)
+    config = {} if config_text is None else _parsed_config(config_file, config_text)
+    log, unreadable = _log(_text(log_file) or "")
+    views, orbit = _pictures(run_dir / "renders")
+    return RunRecord(run_dir, config_text, config, _metrics(metrics_file), log, unreadable, views, orbit)
+
+
+def _text(path: Path) -> str | None:
+    if not path.is_file():
+        return None
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not UTF-8 text ({error})") from error
+
+
+def _parsed_config(path: Path, text: str) -> Mapping[str, Any]:
+    try:
+        config = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise DataError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
+    if config is None:
+        return {}
+    if not isinstance(config, Mapping):
+        raise DataError(f"{path}: expected a mapping of settings, found {type(config).__name__}")
+    return config
+
+
+def _metrics(path: Path) -> Mapping[str, Any] | None:
+    text = _text(path)
+    if text is None:
+        return None
+    try:
+        metrics = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise DataError(f"{path}: not valid JSON ({error})") from error
+    if not isinstance(metrics, Mapping):
+        raise DataError(f"{path}: expected an object, found {type(metrics).__name__}")
+    return metrics
+
+
+def _log(text: str) -> tuple[list[Mapping[str, Any]], int]:
+    """Readable lines in order of steps, and the number of the others."""
+    lines: list[Mapping[str, Any]] = []
+    unreadable = 0
+    for raw in text.splitlines():
+        if not raw.strip():
+            continue
+        try:
+            line = json.loads(raw)
+        except json.JSONDecodeError:
+            line = None
+        step = number(line.get("step")) if isinstance(line, Mapping) else None
+        if step is None:
+            unreadable += 1
+            continue
+        # A run resumed from a checkpoint logs the steps after it anew: what it had logged beyond that point is void.
+        while lines and lines[-1]["step"] >= step:
+            lines.pop()
+        lines.append(line)
+    return lines, unreadable
+
+
+def _pictures(folder: Path) -> tuple[list[ViewFiles], Path | None]:
+    groups: dict[str, set[str]] = defaultdict(set)
+    for path in folder.glob("test_*.png"):
+        match = re.match(r"test_(\d+)(_|$)", path.stem)
+        if match:
+            groups[match[1]].add(path.stem)
+    views = []
+    for index in sorted(groups, key=lambda digits: (int(digits), digits)):
+        # The shortest name of an index is the render, so that a view called "x_truth" is not taken for another's truth.
+        stem = min(groups[index], key=len)
+        truth, error = (folder / f"{stem}_{kind}.png" if f"{stem}_{kind}" in groups[index] else None for kind in ("truth", "error"))
+        views.append(ViewFiles(int(index), stem[len(f"test_{index}_") :], folder / f"{stem}.png", truth, error))
+    orbit = folder / "orbit.webp"
+    return views, orbit if orbit.is_file() else None
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"\W+|_+", "_", name).strip("_").lower()

@@ -1,0 +1,284 @@
+"""The parts of the page, each from a run's record to HTML. A part without content is empty and leaves no gap."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Mapping
+
+from neuprim.core.metrics import from_json
+from neuprim.report.curves import curve, dots, series
+from neuprim.report.pictures import ERROR_SCALE, Inlined, color_bar, inline
+from neuprim.report.record import RunRecord, ViewFiles, number, per_view
+from neuprim.report.text import MISSING, byte_size, count, decimal, duration, escape, setting
+
+__all__ = ["banner", "charts", "commands", "config", "facts", "headline", "heading", "held_out", "orbit", "settings", "view_table"]
+
+MAX_VIEWS = 24
+"""Held-out views shown as pictures; of more, evenly spaced ones."""
+
+PIXELATED_BELOW = 256
+"""Pictures narrower than this many pixels are enlarged with hard pixel edges."""
+
+SOURCES = {
+    "real": None,
+    "generated": ("generated data", "ray-cast scenes of our own, not photographs"),
+    "simulated": ("simulated data", "a stand-in for data that was not given"),
+}
+
+
+def heading(run: RunRecord) -> str:
+    """Task and scene, and a badge unless the data is real."""
+    task, scene = run.name_of("task"), run.name_of("scene")
+    html = f'<p class="eyebrow">{escape(task)}</p>\n<h1>{escape(scene)}</h1>'
+    source = run.field("data_source")
+    note: tuple[str, str] | None
+    if source is None:
+        note = ("data source not recorded", "real, generated or simulated is not known")
+    else:
+        note = SOURCES.get(str(source), (str(source), "not photographs or captures"))
+    if note is not None:
+        html += f'\n<p class="badge"><strong>{escape(note[0])}</strong> <span>{escape(note[1])}</span></p>'
+    return html
+
+
+def banner(run: RunRecord) -> str:
+    """What is not as it should be: no final metrics, unreadable log lines."""
+    notes = []
+    if not run.finished:
+        last = run.last("step")
+        where = "No step was logged." if last is None else f"The last logged step is {count(last[1])}{_of_iterations(run)}."
+        notes.append(
+            f"<strong>This run has not finished.</strong> There is no metrics.json yet: it is still going, or it was interrupted. {where}"
+        )
+    if run.unreadable_lines:
+        lines = "1 line" if run.unreadable_lines == 1 else f"{run.unreadable_lines} lines"
+        notes.append(
+            f"{lines} of metrics.jsonl could not be read and {'is' if run.unreadable_lines == 1 else 'are'} left out of the curves."
+        )
+    return "".join(f'<p class="banner" role="status">{note}</p>' for note in notes)
+
+
+def headline(run: RunRecord) -> str:
+    """The numbers in large type: final ones, or the last logged ones of an unfinished run."""
+    tiles = _final_tiles(run) if run.finished else _interim_tiles(run)
+    cells = (
+        f'<div class="tile{" lead" if i == 0 else ""}"><dt>{label}</dt><dd>{value}{f"<small>{unit}</small>" if unit else ""}</dd>'
+        f'<dd class="note">{note}</dd></div>'
+        for i, (label, value, unit, note) in enumerate(tiles)
+    )
+    html = f'<dl class="tiles">{"".join(cells)}</dl>'
+    if run.finished:
+        kept = run.field("checkpoint")
+        rule = "Metrics of the last checkpoint, not the best." if kept in (None, "last") else f"Metrics of checkpoint “{escape(kept)}”."
+        html += f'<p class="rule">{rule}</p>'
+    return html
+
+
+Tile = tuple[str, str, str, str]
+
+
+def _final_tiles(run: RunRecord) -> list[Tile]:
+    metrics = run.metrics or {}
+    mean, worst, similarity = (from_json(metrics, key) for key in ("psnr", "psnr_worst", "ssim"))
+    size, size_unit = byte_size(metrics.get("model_bytes"))
+    each, iterations, backend = (metrics.get(key) for key in ("parameters_per_primitive", "iterations", "backend"))
+    views, name = len(per_view(run)), _worst_name(run)
+    split = escape(metrics.get("split") or "held-out")
+    fps = number(metrics.get("render_fps"))
+    return [
+        ("PSNR, mean", decimal(mean, 2), _unit("dB", mean), f"{count(views)} {split} view{'s' if views != 1 else ''}" if views else ""),
+        ("PSNR, worst view", decimal(worst, 2), _unit("dB", worst), escape(name) if name else ""),
+        ("SSIM", decimal(similarity, 4), "", "" if similarity is None else "mean over views"),
+        ("Primitives", count(metrics.get("primitives")), "", ""),
+        ("Parameters", count(metrics.get("parameters")), "", "" if each is None else f"{count(each)} per primitive"),
+        ("Model size", size, size_unit, ""),
+        ("Training", duration(metrics.get("train_seconds")), "", "" if iterations is None else f"{count(iterations)} iterations"),
+        ("Rendering", decimal(fps, 1 if fps is None or fps < 100 else 0), _unit("fps", fps), escape(backend) if backend else ""),
+    ]
+
+
+def _unit(unit: str, value: float | None) -> str:
+    return "" if value is None else unit
+
+
+def _interim_tiles(run: RunRecord) -> list[Tile]:
+    def tile(label: str, key: str, digits: int | None, unit: str = "") -> Tile:
+        last = run.last(key)
+        if last is None:
+            return label, MISSING, "", "not logged yet"
+        value = count(last[1]) if digits is None else decimal(last[1], digits)
+        return label, value, unit, f"at step {count(last[0])}"
+
+    seconds = run.last("seconds")
+    return [
+        tile("PSNR, held-out", "eval_psnr", 2, "dB"),
+        tile("PSNR, training view", "psnr", 2, "dB"),
+        tile("Loss", "loss", 4),
+        tile("Primitives", "primitives", None),
+        ("Training", duration(seconds[1] if seconds else None), "", "so far" if seconds else "not logged yet"),
+    ]
+
+
+def _of_iterations(run: RunRecord) -> str:
+    train = run.config.get("train")
+    total = number(train.get("iterations")) if isinstance(train, Mapping) else None
+    return "" if total is None else f" of {count(total)}"
+
+
+def _worst_name(run: RunRecord) -> str | None:
+    known = [(value, entry.get("name")) for entry in per_view(run) if (value := from_json(entry, "psnr")) is not None]
+    name = min(known, key=lambda pair: pair[0])[1] if known else None
+    return None if name is None else str(name)
+
+
+def held_out(run: RunRecord) -> str:
+    """Each shown view: render, truth and error map with its numbers; the colour bar once."""
+    if not run.views:
+        return ""
+    shown = run.views
+    if len(shown) > MAX_VIEWS:
+        shown = [shown[round(i * (len(shown) - 1) / (MAX_VIEWS - 1))] for i in range(MAX_VIEWS)]
+    pictures = [(view, [_picture(view, kind) for kind in ("render", "truth", "error")]) for view in shown]
+    notes = []
+    if len(shown) < len(run.views):
+        notes.append(f"{len(shown)} of {len(run.views)} views, evenly spaced.")
+    if any(p is not None and p.compressed for _, row in pictures for p in row):
+        notes.append("Large pictures are compressed on this page (WebP, quality 90); the PNG files in renders/ are exact.")
+    ticks = "".join(f"<span>{'≥ ' if i == 4 else ''}{ERROR_SCALE * i / 4:g}</span>" for i in range(5))
+    bar = (
+        f'<div class="scale"><p>Error: mean absolute difference over channels</p><div class="bar" style="background: {color_bar()}"></div>'
+        f'<div class="ticks">{ticks}</div></div>'
+    )
+    rows = "".join(_view_row(run, view, row) for view, row in pictures)
+    note = f'<p class="note">{" ".join(notes)}</p>' if notes else ""
+    return _section("Held-out views", f"{bar}{rows}{note}")
+
+
+def _picture(view: ViewFiles, kind: str) -> Inlined | None:
+    path = {"render": view.render, "truth": view.truth, "error": view.error}[kind]
+    return None if path is None else inline(path)
+
+
+def _view_row(run: RunRecord, view: ViewFiles, row: list[Inlined | None]) -> str:
+    entry = run.view_numbers(view)
+    name = escape(entry.get("name") or view.stem or view.index)
+    files = (view.render, view.truth, view.error)
+    captions = ("render", "ground truth", "error")
+    figures = "".join(
+        _figure(picture, caption, f"{caption} of view {name}", file is not None)
+        for picture, caption, file in zip(row, captions, files, strict=True)
+    )
+    numbers = (
+        f"<span><b>{decimal(from_json(entry, 'psnr'), 2)}</b> dB PSNR</span><span><b>{decimal(from_json(entry, 'ssim'), 4)}</b> SSIM</span>"
+    )
+    if number(entry.get("seconds")) is not None:
+        numbers += f"<span><b>{decimal(number(entry['seconds']), 3)}</b> s</span>"
+    return f'<article class="view"><header><h3>{name}</h3><p>{numbers}</p></header>{figures}</article>'
+
+
+def _figure(picture: Inlined | None, caption: str, alternative: str, exists: bool) -> str:
+    """A captioned picture; ``alternative`` is HTML already."""
+    if picture is None:
+        return f'<figure><div class="absent">{"file damaged" if exists else "no picture"}</div><figcaption>{caption}</figcaption></figure>'
+    pixelated = ' class="pixelated"' if picture.width < PIXELATED_BELOW else ""
+    return (
+        f'<figure><img src="{picture.url}" width="{picture.width}" height="{picture.height}" alt="{alternative}"{pixelated}>'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def orbit(run: RunRecord) -> str:
+    """The camera's flight around the scene, if it was rendered."""
+    if run.orbit is None:
+        return ""
+    return _section(
+        "Orbit", f'<div class="orbit">{_figure(inline(run.orbit), "camera orbit", "camera orbit around the scene", True)}</div>'
+    )
+
+
+def charts(run: RunRecord) -> str:
+    """PSNR and loss over time and steps, primitives over time, PSNR per view."""
+    seconds, steps = "seconds", "step"
+    table: Iterable[tuple[str, str | None]] = (
+        ("PSNR over time, dB", curve(series(run, seconds, "psnr"), series(run, seconds, "eval_psnr"), seconds, "PSNR over time")),
+        ("Loss over time", curve(series(run, seconds, "loss"), None, seconds, "Loss over time", log=True)),
+        ("Primitives over time", curve(series(run, seconds, "primitives"), None, seconds, "Primitives over time")),
+        ("PSNR over steps, dB", curve(series(run, steps, "psnr"), series(run, steps, "eval_psnr"), steps, "PSNR over steps")),
+        ("Loss over steps", curve(series(run, steps, "loss"), None, steps, "Loss over steps", log=True)),
+        ("PSNR per view, dB", _view_dots(run)),
+    )
+    panels = "".join(f'<figure class="panel"><figcaption>{title}</figcaption>{svg}</figure>' for title, svg in table if svg)
+    if not panels:
+        return ""
+    key = '<p class="key"><span class="training">training views</span><span class="held-out">held-out views</span></p>'
+    return _section("Curves", f'{key}<div class="panels">{panels}</div>')
+
+
+def _view_dots(run: RunRecord) -> str | None:
+    values = [from_json(entry, "psnr") for entry in per_view(run)]
+    return dots(values, from_json(run.metrics or {}, "psnr"), _worst_name(run), "PSNR per view")
+
+
+def view_table(run: RunRecord) -> str:
+    """Every held-out view's numbers, folded."""
+    entries = per_view(run)
+    if not entries:
+        return ""
+    rows = "".join(
+        f"<tr><td>{count(i)}</td><th scope=row>{escape(e.get('name'))}</th><td>{decimal(from_json(e, 'psnr'), 3)}</td>"
+        f"<td>{decimal(from_json(e, 'ssim'), 5)}</td><td>{decimal(number(e.get('seconds')), 3)}</td></tr>"
+        for i, e in enumerate(entries)
+    )
+    head = "<tr><th>#</th><th>view</th><th>PSNR, dB</th><th>SSIM</th><th>render, s</th></tr>"
+    table = f'<div class="scroll"><table class="numbers"><thead>{head}</thead><tbody>{rows}</tbody></table></div>'
+    return f"<details><summary>All {count(len(entries))} held-out views</summary>{table}</details>"
+
+
+def settings(run: RunRecord) -> str:
+    """Every setting that is not at its default."""
+    changed = run.field("non_default")
+    if not isinstance(changed, Mapping):
+        body = f'<p class="note">{MISSING} not recorded</p>'
+    elif not changed:
+        body = '<p class="note">All settings are at their defaults.</p>'
+    else:
+        rows = "".join(f"<tr><th scope=row>{escape(key)}</th>{_change(pair)}</tr>" for key, pair in changed.items())
+        body = f'<div class="scroll"><table><thead><tr><th>setting</th><th>default</th><th>this run</th></tr></thead><tbody>{rows}</tbody></table></div>'
+    return _section("Settings that differ from their defaults", body)
+
+
+def _change(pair: object) -> str:
+    default, value = pair if isinstance(pair, list | tuple) and len(pair) == 2 else (None, pair)
+    cells = (escape(setting(v)) for v in (default, value))
+    return '<td class="default"><code>{}</code></td><td><code>{}</code></td>'.format(*cells)
+
+
+def facts(run: RunRecord) -> str:
+    """Where the numbers come from: split, data, machine, versions."""
+    keys = ("split", "data_source", "color_space", "downsampling", "background", "seed", "iterations", "checkpoint", "backend", "device")
+    pairs = [(key.replace("_", " ").replace("color", "colour"), escape(run.field(key))) for key in keys]
+    versions = run.field("versions")
+    if isinstance(versions, Mapping):
+        pairs += [(escape(name), escape(value)) for name, value in versions.items()]
+    else:
+        pairs.append(("versions", MISSING))
+    return _section("Run", '<dl class="facts">' + "".join(f"<div><dt>{k}</dt><dd>{v}</dd></div>" for k, v in pairs) + "</dl>")
+
+
+def commands(run: RunRecord) -> str:
+    """The commands that go on from here."""
+    folder = shlex.quote(str(run.run_dir))
+    lines = ((f"neuprim eval {folder}", "measure again"), (f"neuprim render {folder} --camera orbit", "fly around the scene"))
+    items = "".join(f"<li><code>{escape(line)}</code><span>{what}</span></li>" for line, what in lines)
+    return _section("Go on", f'<ul class="commands">{items}</ul>')
+
+
+def config(run: RunRecord) -> str:
+    """The resolved configuration, folded."""
+    if run.config_text is None:
+        return '<p class="note">There is no config.yaml in this run directory.</p>'
+    return f"<details><summary>Full configuration</summary><pre><code>{escape(run.config_text)}</code></pre></details>"
+
+
+def _section(title: str, body: str) -> str:
+    return f"<section><h2>{title}</h2>{body}</section>\n"

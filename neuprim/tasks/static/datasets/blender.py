@@ -1,0 +1,78 @@
+"""NeRF-synthetic ("Blender") scenes: ``transforms_SPLIT.json`` with a field of view, OpenGL poses and RGBA images.
+
+Settings beside the common ones: ``train_split`` and ``test_split`` (names in the files' names, default train and test);
+``hold_out`` (default 0; n > 1 makes every n-th training view the test split and leaves the real one unread, for tuning).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from neuprim.core.cameras import Camera, opengl_to_viewmat
+from neuprim.core.data import Dataset
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.images import image_info
+from neuprim.core.task import SceneContext
+from neuprim.tasks.static.datasets.common import every_nth, find_image, missing_files, posed_images, unique_names
+from neuprim.tasks.static.datasets.records import read_json
+from neuprim.tasks.static.datasets.settings import Setting, data_folder, read_settings, text
+from neuprim.tasks.static.datasets.views import Frame
+
+__all__ = ["load"]
+
+_SETTINGS = {
+    "train_split": text("train", "the name in transforms_NAME.json"),
+    "test_split": text("test", "the name in transforms_NAME.json"),
+    "hold_out": Setting(
+        0, "0, or a whole number of at least 2", lambda v: isinstance(v, int) and not isinstance(v, bool) and (v == 0 or v >= 2)
+    ),
+}
+
+
+def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """The scene in the folder ``settings["path"]``; straight-alpha PNG is premultiplied in its stored sRGB values.
+
+    Raises:
+        ConfigError: unknown or impossible settings.
+        DataError: missing or damaged files, wrong or missing fields, mixed image sizes, impossible cameras.
+    """
+    values = read_settings(settings, _SETTINGS)
+    folder = data_folder(values["path"])
+    train = _read_split(folder, values["train_split"])
+    if values["hold_out"]:
+        if len(train) < 2:
+            raise ConfigError(f"scene.hold_out is {values['hold_out']}, but {folder} has only {len(train)} training view; expected at least 2")
+        train, test = every_nth(train, values["hold_out"])
+    else:
+        test = _read_split(folder, values["test_split"])
+    return posed_images(str(folder), folder.resolve().name, train, test, values, context, up=torch.tensor([0.0, 0.0, 1.0]))
+
+
+def _read_split(folder: Path, split: str) -> list[Frame]:
+    path = folder / f"transforms_{split}.json"
+    document = read_json(path)
+    records = list(document.objects("frames"))
+    texts = [r.text("file_path") for r in records]
+    files = [find_image(folder, t) for t in texts]
+    absent = [t for t, f in zip(texts, files, strict=True) if f is None]
+    if absent:
+        raise missing_files(str(path), absent)
+    frames: list[Frame] = []
+    for record, file, name in zip(records, files, unique_names(texts, str(path)), strict=True):
+        assert file is not None  # listed above otherwise
+        info = image_info(file)
+        if frames and (info.width, info.height) != (frames[0].info.width, frames[0].info.height):
+            first = frames[0]
+            raise DataError(f"{file}: image is {info.width}x{info.height}; expected {first.info.width}x{first.info.height} as {first.path}")
+        source = record if record.has("camera_angle_x") else document
+        angle = source.number("camera_angle_x", "the horizontal field of view in radians, between 0 and pi", 0.0, math.pi)
+        focal = 0.5 * info.width / math.tan(0.5 * angle)
+        viewmat = opengl_to_viewmat(record.matrix("transform_matrix"))
+        camera = Camera(viewmat, focal, focal, 0.5 * info.width, 0.5 * info.height, info.width, info.height)
+        frames.append(Frame(name, file, camera.validate(f"{record.where}.transform_matrix"), info))
+    return frames

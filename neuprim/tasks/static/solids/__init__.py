@@ -1,0 +1,4 @@
+"""The built-in scene ``solids``: a power drill and small things with sharp edges, thin parts and smooth curves; needs no download.
+
+``shapes`` and ``meshes`` say what there is, ``raycast`` what a ray meets, ``shading`` how it is lit, ``generate`` writes the data set.
+"""

@@ -1,0 +1,210 @@
+"""The scene ``solids`` as a data set on disk, in the NeRF-synthetic (Blender) layout that any loader of it reads.
+
+    transforms_train.json, transforms_test.json    camera_angle_x in radians, camera-to-world matrices with OpenGL axes
+    train/r_0.png ..., test/r_0.png ...            RGBA, sRGB, straight alpha, transparent where nothing is hit
+
+The scene, its cameras and its light are fixed: equal settings give equal files whatever the seed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from neuprim.core.cameras import look_at
+from neuprim.core.data import Dataset
+from neuprim.core.errors import ConfigError, DataError, nearest
+from neuprim.core.task import SceneContext
+from neuprim.tasks.static.solids.raycast import Scene
+from neuprim.tasks.static.solids.shading import encode_srgb, radiance
+from neuprim.tasks.static.solids.shapes import build
+
+__all__ = ["GENERATOR_VERSION", "SolidsSettings", "camera_matrices", "generate", "load", "picture"]
+
+GENERATOR_VERSION = 1
+"""Part of the cache's key: to be raised with every change to shapes, light, cameras or file layout."""
+
+DISTANCE = 4.0
+FIELD_OF_VIEW = math.radians(40.0)
+RAYS_AT_ONCE = 1 << 15  # small enough for the arrays to stay in the processor's cache
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class SolidsSettings:
+    """What the user may set for ``scene=solids``.
+
+    Attributes:
+        size: width and height of the images in pixels.
+        train_views, test_views: images of each split.
+        supersampling: rays per pixel along each axis.
+    """
+
+    size: int = 200
+    train_views: int = 80
+    test_views: int = 20
+    supersampling: int = 3
+
+    def __post_init__(self) -> None:
+        for name, lowest, highest in (("size", 8, 4096), ("train_views", 1, 10000), ("test_views", 1, 10000), ("supersampling", 1, 16)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
+                raise ConfigError(f"scene solids: {name}={value!r}; expected a whole number from {lowest} to {highest}")
+
+    @staticmethod
+    def parse(settings: Mapping[str, Any]) -> SolidsSettings:
+        """Settings from a mapping; :class:`ConfigError` for an unknown name or impossible value."""
+        known = [f.name for f in fields(SolidsSettings)]
+        for name in settings:
+            if name not in known:
+                raise ConfigError(f"scene solids: unknown setting '{name}'{nearest(str(name), known)}")
+        return SolidsSettings(**settings)
+
+    def key(self) -> str:
+        """A short hash of every setting and the generator's version."""
+        text = json.dumps({"version": GENERATOR_VERSION, **asdict(self)}, sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """The data set of ``scene=solids``, drawn on first use and read from ``context.cache_dir`` afterwards.
+
+    Raises:
+        ConfigError: unknown setting or impossible value.
+        DataError: the cache directory cannot be written.
+    """
+    folder = generate(SolidsSettings.parse(settings), context.cache_dir, context.progress)
+    from neuprim.tasks.static.datasets import blender
+
+    dataset = blender.load({"path": str(folder)}, context)
+    dataset.name, dataset.data_source = "solids", "generated"
+    return dataset
+
+
+def generate(settings: SolidsSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None) -> Path:
+    """Write the data set unless a complete one is there; returns its folder ``cache_dir/solids-KEY``.
+
+    The folder appears under its name only when complete, so an interrupted run leaves nothing that could be taken for a data set.
+
+    Raises:
+        DataError: the cache directory cannot be written.
+    """
+    final = Path(cache_dir) / f"solids-{settings.key()}"
+    if _complete(final, settings):
+        return final
+    try:
+        final.parent.mkdir(parents=True, exist_ok=True)
+        draft = Path(tempfile.mkdtemp(prefix=f".{final.name}-", dir=final.parent))
+        try:
+            draft.chmod(0o755)  # mkdtemp's 0700 would hide a shared cache from its other users
+            _write(settings, draft, progress)
+            _publish(draft, final, settings)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+    except OSError as error:
+        raise DataError(f"scene solids: cannot write the generated images to {final}: {error}") from error
+    return final
+
+
+def camera_matrices(split: str, count: int) -> list[NDArray[np.float64]]:
+    """``count`` camera-to-world matrices (4, 4), OpenGL axes, looking at the origin from distance 4.
+
+    "train" is a Fibonacci lattice of equal area from 9 degrees below the horizon to 78 above; "test" is another, turning the other way
+    from 3 to 64 degrees, so that its views fall between the first's.
+    """
+    low, high, phase, turn = {"train": (-0.16, 0.98, 0.0, GOLDEN_ANGLE), "test": (0.05, 0.9, 1.0, -GOLDEN_ANGLE)}[split]
+    matrices = []
+    for i in range(count):
+        z = low + (high - low) * (i + 0.5) / count
+        across, angle = math.sqrt(1 - z * z), phase + i * turn
+        eye = DISTANCE * torch.tensor([across * math.cos(angle), across * math.sin(angle), z], dtype=torch.float64)
+        view = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+        matrices.append(torch.linalg.inv(view).numpy() @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    return matrices
+
+
+def picture(scene: Scene, camera_to_world: NDArray[np.float64], size: int, supersampling: int) -> NDArray[np.uint8]:
+    """(size, size, 4) RGBA in sRGB with straight alpha, as Blender stores it: rays are averaged premultiplied and linear, then encoded."""
+    fine = size * supersampling
+    # The middle of each ray's cell, in the image plane at distance 1.
+    plane = ((np.arange(fine) + 0.5) / fine * 2 - 1) * math.tan(FIELD_OF_VIEW / 2)
+    rows = max(1, RAYS_AT_ONCE // (fine * supersampling)) * supersampling
+    bands = [_band(scene, camera_to_world, plane, -plane[top : top + rows], supersampling) for top in range(0, fine, rows)]
+    mean = np.concatenate(bands)
+    alpha = mean[..., 3:]
+    colour = encode_srgb(mean[..., :3] / np.maximum(alpha, np.float32(1e-6)))
+    return np.round(np.concatenate([colour, alpha], axis=-1) * 255).astype(np.uint8)
+
+
+def _band(scene: Scene, pose: NDArray[np.float64], across: NDArray[np.float64], up: NDArray[np.float64], s: int) -> NDArray[np.float32]:
+    """(len(up) / s, len(across) / s, 4) premultiplied linear means of s x s rays through the image plane's points."""
+    x, y = np.meshgrid(across, up)
+    local = np.stack([x, y, -np.ones_like(x)], axis=-1).reshape(-1, 3)
+    local /= np.sqrt(np.einsum("nc,nc->n", local, local))[:, None]
+    rgb, hit = radiance(scene, pose[:3, 3], local @ pose[:3, :3].T)
+    samples = np.concatenate([rgb, hit[:, None].astype(np.float32)], axis=1)
+    return samples.reshape(len(up) // s, s, len(across) // s, s * 4).mean(axis=1).reshape(len(up) // s, -1, s, 4).mean(axis=2)
+
+
+def _splits(settings: SolidsSettings) -> Iterator[tuple[str, int]]:
+    yield "train", settings.train_views
+    yield "test", settings.test_views
+
+
+def _write(settings: SolidsSettings, folder: Path, progress: Progress) -> None:
+    progress("solids: building the scene", 0.0)
+    scene = Scene(build())
+    text = f"solids: drawing {settings.size}x{settings.size} images"
+    if scene.engine != "embree":
+        text += " (without embreex: slow)"
+    jobs: list[tuple[NDArray[np.float64], Path]] = []
+    for split, count in _splits(settings):
+        (folder / split).mkdir()
+        matrices = camera_matrices(split, count)
+        frames = [{"file_path": f"./{split}/r_{i}", "transform_matrix": matrix.tolist()} for i, matrix in enumerate(matrices)]
+        layout = {"camera_angle_x": FIELD_OF_VIEW, "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(layout, indent=1), encoding="utf-8")
+        jobs += [(matrix, folder / split / f"r_{i}.png") for i, matrix in enumerate(matrices)]
+
+    def draw(job: tuple[NDArray[np.float64], Path]) -> None:
+        Image.fromarray(picture(scene, job[0], settings.size, settings.supersampling), "RGBA").save(job[1])
+
+    pool = ThreadPoolExecutor(min(4, os.cpu_count() or 1))
+    try:
+        for done, _ in enumerate(pool.map(draw, jobs), start=1):
+            progress(text, done / len(jobs))
+    finally:
+        pool.shutdown(cancel_futures=True)  # on an interrupt, wait for the running images only
+
+
+def _complete(folder: Path, settings: SolidsSettings) -> bool:
+    files = [folder / f"transforms_{split}.json" for split, _ in _splits(settings)]
+    files += [folder / split / f"r_{i}.png" for split, count in _splits(settings) for i in range(count)]
+    return all(file.is_file() for file in files)
+
+
+def _publish(draft: Path, final: Path, settings: SolidsSettings) -> None:
+    """Give the draft its name. Another process may have been faster: its files are the same ones."""
+    if final.exists() and not _complete(final, settings):
+        shutil.rmtree(final)  # somebody deleted part of it
+    try:
+        draft.rename(final)
+    except OSError:
+        if not _complete(final, settings):
+            raise

@@ -1,0 +1,48 @@
+"""Random models and cameras for tests."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera, look_at
+from neuprim.core.fields import Constant, Cosine
+from neuprim.core.geometry import Geometry
+from neuprim.core.primitives import Lowered
+
+
+def camera(width: int = 64, height: int = 48, distance: float = 3.0, fov: float = 40.0, shift: tuple[float, float] = (0.0, 0.0)) -> Camera:
+    """A camera on the diagonal, looking at the origin; ``shift`` moves the principal point off centre, in pixels."""
+    eye = torch.tensor([0.5, -0.4, 0.77], dtype=torch.float64)
+    view = look_at(eye / eye.norm() * distance, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    f = 0.5 * width / math.tan(math.radians(fov) / 2)
+    return Camera(view, f, f * 1.05, width / 2 + shift[0], height / 2 + shift[1], width, height)
+
+
+def tensors(
+    count: int = 60, neurons: int = 8, channels: int = 3, seed: int = 0, radius: float = 0.25, frequency: float = 1.0 / 3.0, dtype: torch.dtype = torch.float32
+) -> dict[str, Tensor]:
+    """Random primitives in the unit cube: overlapping, anisotropic, of positive and negative density."""
+    g = torch.Generator().manual_seed(seed)
+
+    def u(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g, dtype=torch.float64) * 2 - 1
+
+    values = {
+        "means": u(count, 3) * 0.6,
+        "log_scales": math.log(radius) + 0.6 * u(count, 3),
+        "quats": u(count, 4),
+        "W1": u(count, neurons, 3) * frequency,
+        "b1": u(count, neurons),
+        "w2": u(count, neurons) * 0.3,
+        "b2": 0.3 + 0.4 * u(count, 1),
+        "colors": u(count, channels) * 0.5 + 0.5,
+    }
+    return {k: v.to(dtype) for k, v in values.items()}
+
+
+def lowered(t: dict[str, Tensor]) -> Lowered:
+    """The renderer's input from a dictionary of :func:`tensors`."""
+    return Lowered(Geometry(t["means"], t["log_scales"], t["quats"]), Cosine(t["W1"], t["b1"], t["w2"], t["b2"]), Constant(t["colors"]))

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,10 @@ import pytest
 import torch
 from PIL import Image
 
-from neuprim.core.errors import ConfigError, DataError, NonFiniteError
+from neuprim.core.errors import DataError
 from neuprim.core.metrics import psnr, ssim, to_json
-from neuprim.report import ERROR_SCALE, error_map, write_report
-from neuprim.report.curves import curve, dots
-from neuprim.report.pictures import inline
+from neuprim.report import error_map, write_report
 from neuprim.report.record import read_run
-from neuprim.report.text import byte_size, count, decimal, duration, escape
 
 NAMES = ("r_0", "r_25", "night-view", "r_75")
 
@@ -114,3 +112,259 @@ def change(run: Path, **entries: Any) -> None:
     path = run / "metrics.json"
     metrics = json.loads(path.read_text(encoding="utf-8")) | entries
     path.write_text(json.dumps({k: v for k, v in metrics.items() if v is not ...}), encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run and its report; tests only read it."""
+    run = make_run(tmp_path_factory.mktemp("runs") / "static,scene=ball 1")
+    assert write_report(run) == run / "report.html"
+    return run
+
+
+@pytest.fixture
+def quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A tiny finished run to change, for tests that do not look at its charts (which take most of the time)."""
+    monkeypatch.setattr("neuprim.report.sections.charts", lambda run: "")
+    return make_run(tmp_path / "run", size=(8, 10), lines=4, names=("a", "b"))
+
+
+def page_of(run: Path) -> str:
+    return write_report(run).read_text(encoding="utf-8")
+
+
+class Structure(html.parser.HTMLParser):
+    """Collects elements, and asserts that every element that opens also closes in order."""
+
+    VOID = frozenset({"meta", "link", "img"})
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.open: list[str] = []
+        self.feed(page)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self.open:
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+def test_a_finished_run_shows_what_it_measured(finished: Path) -> None:
+    metrics = json.loads((finished / "metrics.json").read_text(encoding="utf-8"))
+    page = (finished / "report.html").read_text(encoding="utf-8")
+    text = Structure(page).text
+    assert "<title>static / chequered-ball – neuprim</title>" in page
+    for expected in (
+        "generated data", "Metrics of the last checkpoint, not the best.", f"PSNR, mean {metrics['psnr']:.2f} dB 4 test views",
+        f"PSNR, worst view {metrics['psnr_worst']:.2f} dB r_75", f"SSIM {metrics['ssim']:.4f}", "Primitives 10,000", "670,000 67 per primitive",
+        "2.68 MB", "11 min 04 s 4,000 iterations", "41.4 fps cpu", "16-core CPU", "2.13.0+cpu", "200x200 from 800x800 by area",
+        "train.iterations 30000 4000", 'model.growth null {"until": 3000}', "train.ssim true false", "neurons: 8", "≥ 0.2", "night-view",
+        "mean absolute difference",
+    ):  # fmt: skip
+        assert expected in text, expected
+    for entry in metrics["per_view"]:
+        assert f"{entry['name']} {entry['psnr']:.2f} dB PSNR {entry['ssim']:.4f} SSIM" in text
+    assert f"neuprim eval '{finished}'" in text
+    assert f"neuprim render '{finished}' --camera orbit" in text
+
+
+def test_pictures_and_charts_are_all_there(finished: Path) -> None:
+    elements = Structure((finished / "report.html").read_text(encoding="utf-8")).elements
+    images = [attributes for tag, attributes in elements if tag == "img"]
+    assert len(images) == 3 * len(NAMES) + 1
+    assert all(i["alt"] and i["width"] == "64" and i["height"] == "48" and i.get("class") == "pixelated" for i in images)
+    assert sum(str(i["src"]).startswith("data:image/webp;base64,") for i in images) == 1
+    labels = [attributes["aria-label"] for tag, attributes in elements if tag == "svg"]
+    assert labels == ["PSNR over time", "Loss over time", "Primitives over time", "PSNR over steps", "Loss over steps", "PSNR per view"]
+
+
+def test_the_page_stands_alone(finished: Path) -> None:
+    page = (finished / "report.html").read_text(encoding="utf-8")
+    assert "http://" not in page and "https://" not in page
+    assert "@import" not in page and "<script" not in page
+    assert "default-src 'none'; img-src data:; style-src 'unsafe-inline'" in page
+    assert "prefers-color-scheme: dark" in page and 'name="viewport"' in page
+    assert all(address.startswith("#") for address in re.findall(r"url\((.*?)\)", page))
+    ids = []
+    for tag, attributes in Structure(page).elements:
+        assert tag not in {"script", "iframe", "object", "embed", "base", "form"}
+        for key, value in attributes.items():
+            assert not key.startswith("on") and key != "srcset"
+            if key in {"src", "href", "xlink:href"}:
+                assert str(value).startswith(("data:", "#")), (tag, key)
+        if "id" in attributes:
+            ids.append(attributes["id"])
+    assert len(ids) == len(set(ids))
+    references = set(re.findall(r'(?:href="|url\()#([^")]+)', page))
+    assert references and references <= set(ids)
+
+
+def test_the_same_run_gives_the_same_page(finished: Path) -> None:
+    before = (finished / "report.html").read_text(encoding="utf-8")
+    assert page_of(finished) == before
+
+
+@pytest.mark.parametrize(
+    ("source", "badge"), [("real", None), ("generated", "generated data"), ("simulated", "simulated data"), ("dreamt", "dreamt")]
+)
+def test_badge(quick: Path, source: str, badge: str | None) -> None:
+    change(quick, data_source=source)
+    page = page_of(quick)
+    assert ('class="badge"' in page) == (badge is not None)
+    assert badge is None or f'class="badge"><strong>{badge}</strong>' in page
+    change(quick, data_source=...)
+    assert "data source not recorded" in page_of(quick)
+
+
+def test_everything_from_outside_is_escaped(tmp_path: Path) -> None:
+    evil = "<script>alert(1)</script>\"'&$x^2$<i>"
+    run = make_run(tmp_path / "a <i> & 'b' \"c\"", size=(8, 10), lines=3, names=("a",))
+    metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+    strings = {key: evil for key, value in metrics.items() if isinstance(value, str)}
+    views = [{"name": evil, "psnr": 20.0, "ssim": 0.5}, {"name": "z", "psnr": 30.0, "ssim": 0.5}]
+    change(run, **strings, per_view=views, versions={evil: evil}, non_default={evil: [evil, [evil]], "plain": evil}, background=[evil])
+    (run / "config.yaml").write_text("x: '</code></pre><script>bad</script>'\n", encoding="utf-8")
+    page = page_of(run)
+    structure = Structure(page)
+    assert not {"script", "i"} & {tag for tag, _ in structure.elements}
+    assert structure.text.count("<script>alert(1)</script>\"'&$x^2$<i>") >= len(strings)
+    assert "</code></pre><script>bad</script>" in structure.text
+    # The name of the worst view is inside the chart too, as it is and not as a formula.
+    chart = re.search(r'<svg[^>]*aria-label="PSNR per view".*?</svg>', page, re.DOTALL)
+    assert chart and "&lt;script&gt;alert(1)&lt;/script&gt;" in chart[0] and "$x^2$" in chart[0]
+
+
+def test_any_missing_or_wrong_field_is_a_dash(quick: Path) -> None:
+    shutil.rmtree(quick / "renders")
+    dashes = Structure(page_of(quick)).text.count("–")
+    metrics = json.loads((quick / "metrics.json").read_text(encoding="utf-8"))
+    for key in metrics:
+        for value in (..., None, "text", [], {}, [1], {"a": 1}, True, float("nan")):
+            (quick / "metrics.json").write_text(json.dumps({k: v for k, v in (metrics | {key: value}).items() if v is not ...}))
+            structure = Structure(page_of(quick))
+            if value is ... and key in ("psnr", "ssim", "primitives", "model_bytes", "render_fps", "seed", "versions", "device"):
+                assert structure.text.count("–") > dashes, key
+
+
+def test_empty_metrics(quick: Path) -> None:
+    (quick / "metrics.json").write_text("{}")
+    text = Structure(page_of(quick)).text
+    assert "PSNR, mean –" in text and "Training –" in text and "chequered-ball" in text and "not finished" not in text
+
+
+def test_infinite_psnr(quick: Path) -> None:
+    views = [{"name": "a", **to_json("psnr", math.inf), "ssim": 1.0}, {"name": "b", "psnr": 30.0, "ssim": 0.9}]
+    change(quick, per_view=views, **to_json("psnr", math.inf), psnr_worst=30.0)
+    text = Structure(page_of(quick)).text
+    assert "PSNR, mean ∞ dB" in text and "a ∞ dB PSNR 1.0000 SSIM" in text and "PSNR, worst view 30.00 dB b" in text
+
+
+def test_an_interrupted_run_says_so(quick: Path) -> None:
+    (quick / "metrics.json").unlink()
+    with (quick / "metrics.jsonl").open("a") as log:
+        log.write('{"step": 50, "lo')
+    text = Structure(page_of(quick)).text
+    assert "This run has not finished." in text and "The last logged step is 40 of 4,000." in text
+    assert "1 line of metrics.jsonl could not be read" in text
+    assert "PSNR, held-out – not logged yet" in text and "at step 40" in text
+    assert "Metrics of the last checkpoint" not in text and "static" in text
+
+
+def test_a_run_that_only_has_its_config(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("task: {name: relight}\nscene: null\n")
+    text = Structure(page_of(tmp_path)).text
+    assert "relight" in text and "No step was logged." in text and "Curves" not in text and "Held-out views" not in text
+
+
+def test_views_are_told_apart_by_index(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("")
+    folder = tmp_path / "renders"
+    folder.mkdir()
+    for stem in ("test_010_a", "test_002_x_truth", "test_002_x_truth_truth", "test_002_x_truth_error", "test_1000_b", "test_note"):
+        save(folder / f"{stem}.png", scene(4, 4, 0.0))
+    views = read_run(tmp_path).views
+    assert [(v.index, v.stem) for v in views] == [(2, "x_truth"), (10, "a"), (1000, "b")]
+    assert views[0].truth == folder / "test_002_x_truth_truth.png" and views[0].error == folder / "test_002_x_truth_error.png"
+    assert views[1].truth is None and views[1].error is None
+    assert Structure(page_of(tmp_path)).text.count("no picture") == 4
+
+
+def test_numbers_go_to_the_view_they_belong_to(quick: Path) -> None:
+    views = [{"name": "cam/a b", "psnr": 11.0, "ssim": 0.1}, {"name": "other", "psnr": 22.0, "ssim": 0.2}]
+    change(quick, per_view=views)
+    for kind in ("", "_truth", "_error"):
+        (quick / "renders" / f"test_000_a{kind}.png").rename(quick / "renders" / f"test_000_cam_a-b{kind}.png")
+    text = Structure(page_of(quick)).text
+    assert "cam/a b 11.00 dB PSNR" in text
+    assert "b – dB PSNR – SSIM" in text  # "b" is no other spelling of "other", whatever its index
+
+
+def test_damaged_pictures_are_named_as_such(quick: Path) -> None:
+    path = quick / "renders" / "test_000_a_truth.png"
+    path.write_bytes(path.read_bytes()[:60])
+    (quick / "renders" / "orbit.webp").write_bytes(b"")
+    assert Structure(page_of(quick)).text.count("file damaged") == 2
+
+
+def test_many_views_are_thinned_and_it_is_said(quick: Path) -> None:
+    change(quick, per_view=[{"name": f"v{i}", "psnr": 20.0 + i, "ssim": 0.5} for i in range(40)])
+    pictures = quick / "renders"
+    for kind in ("", "_truth", "_error"):
+        content = (pictures / f"test_000_a{kind}.png").read_bytes()
+        (pictures / f"test_001_b{kind}.png").unlink()
+        (pictures / f"test_000_a{kind}.png").unlink()
+        for i in range(40):
+            (pictures / f"test_{i:03d}_v{i}{kind}.png").write_bytes(content)
+    structure = Structure(page_of(quick))
+    assert "24 of 40 views, evenly spaced." in structure.text and "All 40 held-out views" in structure.text
+    titles = [a["alt"] for t, a in structure.elements if t == "img" and str(a["alt"]).startswith("render of")]
+    assert len(titles) == 24 and titles[0] == "render of view v0" and titles[-1] == "render of view v39"
+
+
+def test_large_pictures_are_compressed_and_it_is_said(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "compressed on this page" not in page_of(quick)
+    monkeypatch.setattr("neuprim.report.pictures.INLINE_LIMIT", 50)
+    assert "compressed on this page" in Structure(page_of(quick)).text
+
+
+@pytest.mark.parametrize("step", ["replace", "render"])
+def test_a_failed_write_keeps_the_old_report(quick: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
+    (quick / "report.html").write_text("old")
+
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    if step == "replace":
+        monkeypatch.setattr(os, "replace", fail)
+    else:
+        monkeypatch.setattr("neuprim.report.page.render_page", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_report(quick)
+    assert (quick / "report.html").read_text() == "old"
+    assert not list(quick.glob(".*"))
+
+
+def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="not a directory"):
+        write_report(tmp_path / "absent")
+    with pytest.raises(DataError, match="not a run directory"):
+        write_report(tmp_path)
+    assert not list(tmp_path.iterdir())

@@ -17,6 +17,8 @@ from neuprim.report.record import RunRecord, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import Locator
 
 __all__ = ["Series", "curve", "dots", "series"]
 
@@ -49,7 +51,7 @@ def curve(training: Series, held_out: Series | None, x: str, label: str, log: bo
 
     Args:
         training: drawn as a line, or as median and range where it has many points.
-        held_out: drawn as marked points.
+        held_out: drawn as a line, its points marked while they are few.
         label: the chart in words, for readers who do not see it.
         log: ask for a logarithmic y axis; see :data:`LOG_RATIO`.
     """
@@ -58,21 +60,23 @@ def curve(training: Series, held_out: Series | None, x: str, label: str, log: bo
         return None
     unit, divisor = _time_unit(max(float(s[0].max()) for s in drawn)) if x == "seconds" else ("steps", 1.0)
     with _look():
-        axes = _axes()
+        figure, axes = _axes()
         if training[0].size:
             _line(axes, training[0] / divisor, training[1])
         if held_out is not None and held_out[0].size:
-            axes.plot(held_out[0] / divisor, held_out[1], color=HELD_OUT, linewidth=1.6, marker="o", markersize=4, zorder=4)
+            size = 4 if held_out[0].size <= 40 else 0
+            axes.plot(held_out[0] / divisor, held_out[1], color=HELD_OUT, linewidth=1.6, marker="o", markersize=size, zorder=4)
         values = np.concatenate([s[1] for s in drawn])
         if log and values.min() > 0 and values.max() / values.min() >= LOG_RATIO:
             _log_axis(axes, float(values.min()), float(values.max()))
         axes.set_xlabel(unit)
-        axes.set_xlim(left=0)
-        return _svg(axes, label)
+        right = max(float(s[0].max()) for s in drawn) / divisor
+        axes.set_xlim(0, right * 1.02 if right > 0 else 1)
+        return _svg(figure, label)
 
 
 def dots(values: Sequence[float | None], mean: float | None, worst: str | None, label: str) -> str | None:
-    """One value per view, in the split's order, hung from their mean; infinite and missing values are left out.
+    """One value per view, in the split's order, hung from their mean (the dashed line); infinite and missing values are left out.
 
     Args:
         worst: text for the lowest dot, e.g. the view's name.
@@ -82,12 +86,10 @@ def dots(values: Sequence[float | None], mean: float | None, worst: str | None, 
         return None
     xs, ys = (np.array(column, dtype=np.float64) for column in zip(*known, strict=True))
     with _look():
-        axes = _axes()
+        figure, axes = _axes()
         if mean is not None and math.isfinite(mean):
             axes.axhline(mean, color=INK, linewidth=1, linestyle=(0, (4, 3)), zorder=2)
             axes.vlines(xs, mean, ys, color=HELD_OUT, linewidth=1, alpha=0.45, zorder=3)
-            text = axes.annotate("mean", (1, mean), (-1, 3), xycoords=("axes fraction", "data"), textcoords="offset points")
-            text.set(color=INK, ha="right", va="bottom", fontsize=9)
         axes.plot(xs, ys, linestyle="none", marker="o", markersize=4.5 if len(known) <= 60 else 2.5, color=HELD_OUT, zorder=4)
         lowest = int(ys.argmin())
         side = "left" if lowest < len(ys) / 2 else "right"
@@ -106,9 +108,9 @@ def dots(values: Sequence[float | None], mean: float | None, worst: str | None, 
             )
         axes.set_xlabel("view")
         axes.set_xlim(-0.7, len(values) - 0.3)
-        axes.xaxis.get_major_locator().set_params(integer=True)
+        axes.xaxis.set_major_locator(_ticks(6, integer=True))
         axes.margins(y=0.14)
-        return _svg(axes, label)
+        return _svg(figure, label)
 
 
 def _line(axes: Axes, x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
@@ -148,7 +150,7 @@ def _look() -> AbstractContextManager[None]:
     """Settings of every chart, to hold from its axes' creation to its SVG."""
     import matplotlib  # slow to import, and only reports need it
 
-    settings: dict[str, Any] = {
+    settings: Any = {
         "svg.fonttype": "none",
         "svg.hashsalt": "neuprim",
         "font.size": 10,
@@ -172,27 +174,28 @@ def _look() -> AbstractContextManager[None]:
     return matplotlib.rc_context(settings)
 
 
-def _axes() -> Axes:
+def _axes() -> tuple[Figure, Axes]:
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter
 
-    axes = Figure(figsize=(WIDTH / 72, HEIGHT / 72)).add_axes((0.115, 0.2, 0.865, 0.76))
+    figure = Figure(figsize=(WIDTH / 72, HEIGHT / 72))
+    axes = figure.add_axes((0.115, 0.2, 0.865, 0.76))
     for axis, most in ((axes.xaxis, 6), (axes.yaxis, 5)):
         axis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
         axis.set_major_locator(_ticks(most))
-    return axes
+    return figure, axes
 
 
-def _ticks(most: int) -> Any:
+def _ticks(most: int, integer: bool = False) -> Locator:
     from matplotlib.ticker import MaxNLocator
 
-    return MaxNLocator(nbins=most, steps=[1, 2, 2.5, 5, 10])
+    return MaxNLocator(nbins=most, steps=[1, 2, 2.5, 5, 10], integer=integer)
 
 
-def _svg(axes: Axes, label: str) -> str:
+def _svg(figure: Figure, label: str) -> str:
     """The chart as an element of the page: no outside addresses, no global styles, own ids, the page's font and colours."""
     buffer = io.StringIO()
-    axes.get_figure(root=True).savefig(buffer, format="svg", transparent=True)
+    figure.savefig(buffer, format="svg", transparent=True)
     body = buffer.getvalue()
     body = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->|<style.*?</style>", "", body[body.index("<svg") :], flags=re.DOTALL)
     opening = f'<svg class="chart" role="img" aria-label="{html.escape(label, quote=True)}" viewBox="0 0 {WIDTH} {HEIGHT}">'

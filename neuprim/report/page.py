@@ -45,7 +45,6 @@ def render_page(run: RunRecord) -> str:
         banner=sections.banner(run),
         headline=sections.headline(run),
         held_out=sections.held_out(run),
-        orbit=sections.orbit(run),
         charts=sections.charts(run),
         view_table=sections.view_table(run),
         settings=sections.settings(run),

@@ -79,7 +79,9 @@ def inline(path: Path) -> Inlined | None:
             compressed = len(content) > INLINE_LIMIT and image.mode in ("L", "P", "RGB", "RGBA") and getattr(image, "n_frames", 1) == 1
             if compressed:
                 buffer = io.BytesIO()
-                image.convert("RGBA" if image.has_transparency_data else "RGB").save(buffer, "WEBP", quality=90, method=4)
+                image.convert("RGBA" if image.mode == "RGBA" or "transparency" in image.info else "RGB").save(
+                    buffer, "WEBP", quality=90, method=4
+                )
                 content, kind = buffer.getvalue(), "image/webp"
     except (UnidentifiedImageError, OSError, SyntaxError):
         return None

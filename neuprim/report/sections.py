@@ -11,7 +11,7 @@ from neuprim.report.pictures import ERROR_SCALE, Inlined, color_bar, inline
 from neuprim.report.record import RunRecord, ViewFiles, number, per_view
 from neuprim.report.text import MISSING, byte_size, count, decimal, duration, escape, setting
 
-__all__ = ["banner", "charts", "commands", "config", "facts", "headline", "heading", "held_out", "orbit", "settings", "view_table"]
+__all__ = ["banner", "charts", "commands", "config", "facts", "headline", "heading", "held_out", "settings", "view_table"]
 
 MAX_VIEWS = 24
 """Held-out views shown as pictures; of more, evenly spaced ones."""
@@ -59,7 +59,7 @@ def banner(run: RunRecord) -> str:
 
 
 def headline(run: RunRecord) -> str:
-    """The numbers in large type: final ones, or the last logged ones of an unfinished run."""
+    """The numbers in large type (final, or the last logged ones of an unfinished run), beside the orbit if it was rendered."""
     tiles = _final_tiles(run) if run.finished else _interim_tiles(run)
     cells = (
         f'<div class="tile{" lead" if i == 0 else ""}"><dt>{label}</dt><dd>{value}{f"<small>{unit}</small>" if unit else ""}</dd>'
@@ -71,6 +71,9 @@ def headline(run: RunRecord) -> str:
         kept = run.field("checkpoint")
         rule = "Metrics of the last checkpoint, not the best." if kept in (None, "last") else f"Metrics of checkpoint “{escape(kept)}”."
         html += f'<p class="rule">{rule}</p>'
+    if run.orbit is not None:
+        picture = _figure(inline(run.orbit), "camera orbit", "camera orbit around the scene", exists=True)
+        html = f'<div class="with-orbit"><div>{html}</div><div class="orbit">{picture}</div></div>'
     return html
 
 
@@ -172,7 +175,7 @@ def _view_row(run: RunRecord, view: ViewFiles, row: list[Inlined | None]) -> str
         f"<span><b>{decimal(from_json(entry, 'psnr'), 2)}</b> dB PSNR</span><span><b>{decimal(from_json(entry, 'ssim'), 4)}</b> SSIM</span>"
     )
     if number(entry.get("seconds")) is not None:
-        numbers += f"<span><b>{decimal(number(entry['seconds']), 3)}</b> s</span>"
+        numbers += f"<span><b>{decimal(number(entry['seconds']), 3)}</b> s to render</span>"
     return f'<article class="view"><header><h3>{name}</h3><p>{numbers}</p></header>{figures}</article>'
 
 
@@ -187,15 +190,6 @@ def _figure(picture: Inlined | None, caption: str, alternative: str, exists: boo
     )
 
 
-def orbit(run: RunRecord) -> str:
-    """The camera's flight around the scene, if it was rendered."""
-    if run.orbit is None:
-        return ""
-    return _section(
-        "Orbit", f'<div class="orbit">{_figure(inline(run.orbit), "camera orbit", "camera orbit around the scene", True)}</div>'
-    )
-
-
 def charts(run: RunRecord) -> str:
     """PSNR and loss over time and steps, primitives over time, PSNR per view."""
     seconds, steps = "seconds", "step"
@@ -205,7 +199,7 @@ def charts(run: RunRecord) -> str:
         ("Primitives over time", curve(series(run, seconds, "primitives"), None, seconds, "Primitives over time")),
         ("PSNR over steps, dB", curve(series(run, steps, "psnr"), series(run, steps, "eval_psnr"), steps, "PSNR over steps")),
         ("Loss over steps", curve(series(run, steps, "loss"), None, steps, "Loss over steps", log=True)),
-        ("PSNR per view, dB", _view_dots(run)),
+        ("PSNR per view, dB <small>dashed: mean</small>", _view_dots(run)),
     )
     panels = "".join(f'<figure class="panel"><figcaption>{title}</figcaption>{svg}</figure>' for title, svg in table if svg)
     if not panels:

@@ -2,3 +2,7 @@
 
 ``shapes`` and ``meshes`` say what there is, ``raycast`` what a ray meets, ``shading`` how it is lit, ``generate`` writes the data set.
 """
+
+from neuprim.tasks.static.solids.generate import load
+
+__all__ = ["load"]

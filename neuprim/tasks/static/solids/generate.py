@@ -65,7 +65,7 @@ class SolidsSettings:
         for name, lowest, highest in (("size", 8, 4096), ("train_views", 1, 10000), ("test_views", 1, 10000), ("supersampling", 1, 16)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
-                raise ConfigError(f"scene solids: {name}={value!r}; expected a whole number from {lowest} to {highest}")
+                raise ConfigError(f"scene.{name} is {value!r}; expected a whole number from {lowest} to {highest}")
 
     @staticmethod
     def parse(settings: Mapping[str, Any]) -> SolidsSettings:
@@ -73,7 +73,7 @@ class SolidsSettings:
         known = [f.name for f in fields(SolidsSettings)]
         for name in settings:
             if name not in known:
-                raise ConfigError(f"scene solids: unknown setting '{name}'{nearest(str(name), known)}")
+                raise ConfigError(f"scene.{name} is not a setting of this scene{nearest(str(name), known)}")
         return SolidsSettings(**settings)
 
     def key(self) -> str:
@@ -148,7 +148,8 @@ def picture(scene: Scene, camera_to_world: NDArray[np.float64], size: int, super
     bands = [_band(scene, camera_to_world, plane, -plane[top : top + rows], supersampling) for top in range(0, fine, rows)]
     mean = np.concatenate(bands)
     alpha = mean[..., 3:]
-    colour = encode_srgb(mean[..., :3] / np.maximum(alpha, np.float32(1e-6)))
+    straight = (mean[..., :3] / np.maximum(alpha, np.float32(1e-6))).astype(np.float32, copy=False)
+    colour = encode_srgb(straight)
     return np.round(np.concatenate([colour, alpha], axis=-1) * 255).astype(np.uint8)
 
 
@@ -172,7 +173,7 @@ def _write(settings: SolidsSettings, folder: Path, progress: Progress) -> None:
     scene = Scene(build())
     text = f"solids: drawing {settings.size}x{settings.size} images"
     if scene.engine != "embree":
-        text += " (without embreex: slow)"
+        text += " (without embreex, which would be faster)"
     jobs: list[tuple[NDArray[np.float64], Path]] = []
     for split, count in _splits(settings):
         (folder / split).mkdir()
@@ -183,7 +184,7 @@ def _write(settings: SolidsSettings, folder: Path, progress: Progress) -> None:
         jobs += [(matrix, folder / split / f"r_{i}.png") for i, matrix in enumerate(matrices)]
 
     def draw(job: tuple[NDArray[np.float64], Path]) -> None:
-        Image.fromarray(picture(scene, job[0], settings.size, settings.supersampling), "RGBA").save(job[1])
+        Image.fromarray(picture(scene, job[0], settings.size, settings.supersampling)).save(job[1])
 
     pool = ThreadPoolExecutor(min(4, os.cpu_count() or 1))
     try:

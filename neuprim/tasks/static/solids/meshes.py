@@ -13,13 +13,13 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-__all__ = ["arc_tube", "ball", "chamfered_box", "corner_normals", "lathe", "pyramid", "ring", "rod"]
+__all__ = ["arc_tube", "ball", "chamfered_box", "corner_normals", "lathe", "merged", "pyramid", "ring", "rod"]
 
-CREASE_DEGREES = 30.0
+CREASE_DEGREES = 24.0
 """Faces that meet at more than this angle keep their own normals: chamfers and caps stay hard, facets of round parts blend."""
 
 
-def chamfered_box(size: Sequence[float], centre: Sequence[float], chamfer: float) -> trimesh.Trimesh:
+def chamfered_box(size: ArrayLike, centre: ArrayLike, chamfer: float) -> trimesh.Trimesh:
     """An axis-aligned box of edge lengths ``size`` (3,) about ``centre`` (3,), every edge cut at 45 degrees by ``chamfer``."""
     half = np.asarray(size, dtype=np.float64) / 2
     # Each corner becomes a triangle: one axis at full extent, the other two drawn in. Their hull is the chamfered box.
@@ -30,7 +30,7 @@ def chamfered_box(size: Sequence[float], centre: Sequence[float], chamfer: float
     return hull
 
 
-def pyramid(base: float, height: float, centre: Sequence[float], turn: float) -> trimesh.Trimesh:
+def pyramid(base: float, height: float, centre: ArrayLike, turn: float) -> trimesh.Trimesh:
     """A four-sided pyramid: square of edge ``base`` about ``centre`` (3,) turned by ``turn`` radians about z, apex ``height`` above."""
     angles = turn + np.pi / 4 + np.pi / 2 * np.arange(4)
     square = np.stack([np.cos(angles), np.sin(angles), np.zeros(4)], axis=1) * base / np.sqrt(2)
@@ -39,14 +39,14 @@ def pyramid(base: float, height: float, centre: Sequence[float], turn: float) ->
     return trimesh.Trimesh(vertices, faces)
 
 
-def ball(centre: Sequence[float], radius: float, fine: bool = True) -> trimesh.Trimesh:
-    """A sphere of 5,120 (or, not ``fine``, 320) triangles."""
-    mesh = trimesh.creation.icosphere(subdivisions=4 if fine else 2, radius=radius)
+def ball(centre: ArrayLike, radius: float, fine: bool = True) -> trimesh.Trimesh:
+    """A sphere of 5,120 (or, not ``fine``, 1,280) triangles."""
+    mesh = trimesh.creation.icosphere(subdivisions=4 if fine else 3, radius=radius)
     mesh.apply_translation(centre)
     return mesh
 
 
-def ring(centre: Sequence[float], axis: Sequence[float], major: float, minor: float) -> trimesh.Trimesh:
+def ring(centre: ArrayLike, axis: ArrayLike, major: float, minor: float) -> trimesh.Trimesh:
     """A torus about ``centre`` (3,): circle of radius ``major`` in the plane normal to ``axis`` (3,), tube radius ``minor``."""
     mesh = trimesh.creation.torus(major, minor, major_sections=128, minor_sections=48)
     mesh.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], axis))
@@ -54,7 +54,7 @@ def ring(centre: Sequence[float], axis: Sequence[float], major: float, minor: fl
     return mesh
 
 
-def rod(start: Sequence[float], end: Sequence[float], radius: float) -> trimesh.Trimesh:
+def rod(start: ArrayLike, end: ArrayLike, radius: float) -> trimesh.Trimesh:
     """A thin straight rod with flat ends from ``start`` (3,) to ``end`` (3,)."""
     length = float(np.linalg.norm(np.subtract(end, start)))
     return lathe(start, np.subtract(end, start), [(0.0, radius), (length, radius)], sections=24)
@@ -95,9 +95,7 @@ def _tube(path: NDArray, side: NDArray, across: NDArray, half: NDArray, sections
     """Rings of ``sections`` points about ``path`` (n, 3) in the planes of ``side`` (n, 3) and ``across`` (3,), joined and capped."""
     turn = 2 * np.pi * np.arange(sections) / sections
     rings = (
-        path[:, None]
-        + (half[:, :1] * np.cos(turn))[..., None] * side[:, None]
-        + (half[:, 1:] * np.sin(turn))[..., None] * across
+        path[:, None] + (half[:, :1] * np.cos(turn))[..., None] * side[:, None] + (half[:, 1:] * np.sin(turn))[..., None] * across
     )  # (n, sections, 3)
     n = len(path)
     here = (np.arange(n - 1)[:, None] * sections + np.arange(sections)).ravel()
@@ -110,6 +108,13 @@ def _tube(path: NDArray, side: NDArray, across: NDArray, half: NDArray, sections
     vertices = np.concatenate([rings.reshape(-1, 3), path[:1], path[-1:]])
     # Rings of radius zero (points of cones) collapse to one vertex; `validate` drops the faces that vanish with them.
     return trimesh.Trimesh(vertices, np.concatenate([walls, bottom, top]), process=True, validate=True)
+
+
+def merged(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """All of them as one mesh, each with vertices of its own even where they touch, so that each stays closed."""
+    start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = [mesh.faces.view(np.ndarray) + first for mesh, first in zip(meshes, start[:-1], strict=True)]
+    return trimesh.Trimesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces), process=False)
 
 
 def corner_normals(mesh: trimesh.Trimesh, crease: float = CREASE_DEGREES) -> NDArray[np.float64]:

@@ -1,19 +1,17 @@
 """Rays against the solids: what a ray meets first, and whether anything lies between two points.
 
-Embree does the work where its package ``embreex`` has a wheel. Elsewhere trimesh's own R-tree search gives the same answers some thousand
-times slower, which :class:`Scene` says in a warning.
+Embree does the work where its package ``embreex`` has a wheel; elsewhere (ARM) the compiled search of :mod:`.bvh` gives the same answers,
+about ten times slower. :attr:`Scene.engine` says which one runs.
 """
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
 import torch
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from neuprim.core.errors import BackendUnavailable
@@ -22,7 +20,7 @@ from neuprim.tasks.static.solids.shapes import Solid
 
 __all__ = ["Engine", "Hits", "Scene"]
 
-Engine = Literal["auto", "embree", "rtree"]
+Engine = Literal["auto", "embree", "numba"]
 
 LIFT = 2e-4
 """How far a shadow ray starts above the surface, in scene units: a hundred times the rounding of single precision in the unit box."""
@@ -62,7 +60,7 @@ class Scene:
 
     Attributes:
         solids: as given.
-        engine: "embree" or "rtree", whichever runs.
+        engine: "embree" or "numba", whichever runs.
 
     Raises:
         BackendUnavailable: ``engine="embree"`` without the package ``embreex``.
@@ -73,7 +71,9 @@ class Scene:
         meshes = [solid.mesh for solid in self.solids]
         start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
         self._vertices = np.concatenate([mesh.vertices.view(np.ndarray) for mesh in meshes]).astype(np.float32)
-        self._faces = np.concatenate([mesh.faces.view(np.ndarray) + first for mesh, first in zip(meshes, start, strict=False)]).astype(np.int32)
+        self._faces = np.concatenate([mesh.faces.view(np.ndarray) + first for mesh, first in zip(meshes, start, strict=False)]).astype(
+            np.int32
+        )
         self._face_normals = np.concatenate([mesh.face_normals.view(np.ndarray) for mesh in meshes]).astype(np.float32)
         self._corner_normals = np.concatenate([corner_normals(mesh) for mesh in meshes]).astype(np.float32)
         self._owner = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
@@ -91,10 +91,10 @@ class Scene:
         hit = triangle >= 0
         rows = np.flatnonzero(hit)
         triangle, distance = triangle[rows], distance[rows]
-        weight = np.stack([1 - u[rows] - v[rows], u[rows], v[rows]], axis=1)
-        normal = np.einsum("nk,nkc->nc", weight, self._corner_normals[triangle])
+        weight = np.stack([1 - u[rows] - v[rows], u[rows], v[rows]], axis=1, dtype=np.float32)
+        normal: NDArray[np.float32] = np.einsum("nk,nkc->nc", weight, self._corner_normals[triangle])
         normal /= np.sqrt(np.einsum("nc,nc->n", normal, normal))[:, None]
-        position = o[rows] + distance[:, None] * d[rows]
+        position = (o[rows] + distance[:, None] * d[rows]).astype(np.float32, copy=False)
         owner = self._owner[triangle]
         albedo = np.empty_like(position)
         for index in np.unique(owner):
@@ -140,7 +140,7 @@ class _Embree:
         self.scene = EmbreeScene()
         TriangleMesh(scene=self.scene, vertices=vertices, indices=faces)
         # The first query builds the tree; done here so that threads find it built.
-        self.scene.run(np.zeros((1, 3), np.float32), np.float32([[0, 0, 1]]))
+        self.scene.run(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
 
     def first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         found = self.scene.run(o, d, query="INTERSECT", output=1)
@@ -151,46 +151,16 @@ class _Embree:
         return self.scene.run(o, d, dists=limit, query="OCCLUDED") >= 0
 
 
-class _RTree:
-    def __init__(self, vertices: NDArray, faces: NDArray) -> None:
-        from trimesh.ray.ray_triangle import RayMeshIntersector
+def _open(vertices: NDArray, faces: NDArray, engine: Engine) -> tuple[Literal["embree", "numba"], _Search]:
+    if engine != "numba":
+        try:
+            return "embree", _Embree(vertices, faces)
+        except ImportError as error:
+            if engine == "embree":
+                raise BackendUnavailable(f"ray casting with embree needs the package 'embreex' (pip install embreex): {error}") from error
+    from neuprim.tasks.static.solids.bvh import Hierarchy
 
-        self.mesh = trimesh.Trimesh(vertices, faces, process=False)
-        self.search = RayMeshIntersector(self.mesh)
-
-    def first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        triangle = np.full(len(o), -1, dtype=np.int32)
-        u, v, distance = np.zeros((3, len(o)), dtype=np.float32)
-        for begin in range(0, len(o), 4096):  # the search lists every box a ray passes: bound its memory
-            part = slice(begin, begin + 4096)
-            index, ray, where = self.search.intersects_id(o[part], d[part], multiple_hits=False, return_locations=True)
-            ray = ray + begin
-            triangle[ray] = index
-            weight = trimesh.triangles.points_to_barycentric(self.mesh.triangles[index], where)
-            u[ray], v[ray] = weight[:, 1], weight[:, 2]
-            distance[ray] = ((where - o[ray]) * d[ray]).sum(1) / (d[ray] ** 2).sum(1)
-        return triangle, u, v, distance
-
-    def any(self, o: NDArray, d: NDArray, distance: NDArray) -> NDArray[np.bool_]:
-        triangle, _, _, found = self.first(o, d)
-        return (triangle >= 0) & (found < distance)
-
-
-def _open(vertices: NDArray, faces: NDArray, engine: Engine) -> tuple[Literal["embree", "rtree"], _Search]:
-    if engine == "rtree":
-        return "rtree", _RTree(vertices, faces)
-    try:
-        return "embree", _Embree(vertices, faces)
-    except ImportError as error:
-        if engine == "embree":
-            raise BackendUnavailable(f"ray casting with embree needs the package 'embreex' (pip install embreex): {error}") from error
-        warnings.warn(
-            "the package 'embreex' is not installed: casting rays with trimesh's R-tree, about a thousand times slower; "
-            "install embreex, or ask for smaller and fewer images",
-            RuntimeWarning,
-            stacklevel=3,
-        )
-        return "rtree", _RTree(vertices, faces)
+    return "numba", Hierarchy(vertices, faces)
 
 
 def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

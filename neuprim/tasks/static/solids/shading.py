@@ -48,8 +48,8 @@ def reflected(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> Array:
     """
     eye, light = np.asarray(to_eye, dtype=np.float32), np.asarray(to_light, dtype=np.float32)
     cosine = np.maximum(_dot(hits.normal, light), 0)
-    half = eye + light
-    half = half / np.sqrt(np.maximum(_dot(half, half), np.float32(1e-12)))[:, None]
+    half: Array = eye + light
+    half /= np.sqrt(np.maximum(_dot(half, half), np.float32(1e-12)))[:, None]
     exponent = 6 + 110 * hits.gloss**2
     highlight = 0.12 * hits.gloss * (exponent + 8) / 8 * np.maximum(_dot(hits.normal, half), 0) ** exponent
     return ((hits.albedo + highlight[:, None]) * (cosine / np.float32(np.pi))[:, None]).astype(np.float32)
@@ -85,7 +85,9 @@ def radiance(scene: Scene, origins: ArrayLike, directions: ArrayLike, light: Day
 def encode_srgb(linear: Array) -> Array:
     """Display values 0..1 of linear ones, clipped (IEC 61966-2-1)."""
     x = np.clip(linear, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, np.float32(0.0031308)) ** np.float32(1 / 2.4) - 0.055).astype(np.float32)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, np.float32(0.0031308)) ** np.float32(1 / 2.4) - 0.055).astype(
+        np.float32
+    )
 
 
 def _surroundings(light: Daylight, height: Array) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from neuprim.tasks.static.solids.meshes import arc_tube, ball, chamfered_box, lathe, pyramid, ring, rod
+from neuprim.tasks.static.solids.meshes import arc_tube, ball, chamfered_box, lathe, merged, pyramid, ring, rod
 
 __all__ = ["Albedo", "Solid", "build", "srgb"]
 
@@ -146,7 +146,7 @@ def _drill() -> list[Solid]:
     ]
     # Slats stand proud of both flanks: thin dark boxes right through the body.
     slats = [chamfered_box([0.022, 0.312, 0.13], [-0.50 + 0.05 * i, 0, 0.47], 0.003) for i in range(5)]
-    return [*parts, Solid("slats", trimesh.util.concatenate(slats), plain("#22223b"), 0.2)]
+    return [*parts, Solid("slats", merged(slats), plain("#22223b"), 0.2)]
 
 
 def _wire_cube() -> list[Solid]:
@@ -155,11 +155,13 @@ def _wire_cube() -> list[Solid]:
     centre = np.array([0.46, 0.46, FLOOR + side / 2 + 2 * thick])
     turn = trimesh.transformations.rotation_matrix(np.radians(20.0), [0, 0, 1])[:3, :3]
     corner = {sign: centre + turn @ (np.array(sign) * side / 2) for sign in product((-1, 1), repeat=3)}
-    rods = [rod(corner[a], corner[b], thick) for a in corner for b in corner if a < b and sum(x != y for x, y in zip(a, b, strict=True)) == 1]
+    rods = [
+        rod(corner[a], corner[b], thick) for a in corner for b in corner if a < b and sum(x != y for x, y in zip(a, b, strict=True)) == 1
+    ]
     knots = [ball(point, 2 * thick, fine=False) for point in corner.values()]
     return [
-        Solid("wire cube", trimesh.util.concatenate(rods), plain("#0fa34a"), 0.5),
-        Solid("knots", trimesh.util.concatenate(knots), plain("#0b5d2c"), 0.5),
+        Solid("wire cube", merged(rods), plain("#0fa34a"), 0.5),
+        Solid("knots", merged(knots), plain("#0b5d2c"), 0.5),
         Solid("ball", ball([centre[0], centre[1], FLOOR + 0.13], 0.13), plain("#e0218a"), 1.0),
     ]
 
@@ -169,9 +171,9 @@ def _pins() -> list[Solid]:
     solids = []
     for i, colour in enumerate(("#e63946", "#ff9f1c", "#ffe14d", "#2ec4b6", "#7b2cbf")):
         foot = np.array([-0.66 + 0.155 * i, 0.64 - 0.02 * i, FLOOR])
-        tip = foot + [0, 0, 0.3 + 0.11 * i]
+        tip = foot + np.array([0, 0, 0.3 + 0.11 * i])
         thick = 0.022 - 0.0035 * i
-        solids.append(Solid(f"pin {i}", rod(foot - [0, 0, 0.01], tip, thick), plain("#d9dde3"), 0.7))
+        solids.append(Solid(f"pin {i}", rod(foot - np.array([0, 0, 0.01]), tip, thick), plain("#d9dde3"), 0.7))
         solids.append(Solid(f"head {i}", ball(tip, 0.042 - 0.004 * i), plain(colour), 0.8))
     return solids
 
@@ -180,7 +182,7 @@ def _small_things() -> list[Solid]:
     major, minor = 0.21, 0.068
     span = np.radians(np.linspace(20.0, 140.0, 96))
     place = np.linspace(0.0, 1.0, 96)
-    thickness = 0.012 + 0.062 * np.sin(np.pi * np.clip(place, 0.0, 1.0)) ** 0.6
+    thickness = 0.012 + 0.062 * np.abs(np.sin(np.pi * place)) ** 0.6
     bend = np.array([-0.38, -0.8, FLOOR + 0.074])
 
     def tips(p: NDArray[np.float32]) -> NDArray[np.bool_]:

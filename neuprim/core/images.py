@@ -206,22 +206,21 @@ def _exr_layout(path: Path) -> tuple[list[str], int, int]:
     """Names of the R, G, B(, A) channels, width and height, from the header."""
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
-            headers = [part.header for part in file.parts]
-    except Exception as error:
-        raise DataError(f"{path}: OpenEXR header is truncated or corrupt ({error})") from None
-    if len(headers) != 1:
-        raise DataError(f"{path}: OpenEXR file has {len(headers)} parts; expected 1")
-    header = headers[0]
-    if header.get("type", OpenEXR.scanlineimage) not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
-        raise DataError(f"{path}: OpenEXR storage is {header['type']}; expected flat scan lines or tiles")
-    (low, high), (full_low, full_high) = header["dataWindow"], header["displayWindow"]
-    if not (np.array_equal(low, full_low) and np.array_equal(high, full_high)):
+            parts = len(file.parts)
+            header = dict(file.parts[0].header)  # the file's own is emptied when it closes
+            low, high, full_low, full_high = ([int(v) for v in c] for w in ("dataWindow", "displayWindow") for c in header[w])
+            channels = {c.name: c for c in header["channels"]}
+            flat = header.get("type", OpenEXR.scanlineimage) in (OpenEXR.scanlineimage, OpenEXR.tiledimage)
+    except Exception as error:  # also KeyError and UnicodeDecodeError, from damaged attributes
+        raise DataError(f"{path}: OpenEXR header is truncated or corrupt ({type(error).__name__}: {error})") from None
+    if parts != 1 or not flat:
+        raise DataError(f"{path}: OpenEXR file has {parts} parts of type {header.get('type')}; expected 1 part of flat scan lines or tiles")
+    if (low, high) != (full_low, full_high):
         raise DataError(
             f"{path}: OpenEXR data window {low}..{high} is not its display window {full_low}..{full_high}; expected equal windows"
         )
-    width, height = (int(high[i]) - int(low[i]) + 1 for i in (0, 1))
+    width, height = high[0] - low[0] + 1, high[1] - low[1] + 1
     _check_pixels(path, width, height)
-    channels = {c.name: c for c in header["channels"]}
     if width * height * len(channels) > _MAX_FLOATS:
         raise DataError(
             f"{path}: header claims {len(channels)} channels of {width}x{height} pixels; at most {_MAX_FLOATS} values are accepted"
@@ -246,6 +245,8 @@ def _read_exr(path: Path, names: list[str], width: int, height: int) -> Tensor:
         raise DataError(f"{path}: OpenEXR data is truncated or corrupt ({error}); expected a complete {width}x{height} image") from None
     if any(p.dtype not in (np.float16, np.float32) for p in planes):
         raise DataError(f"{path}: OpenEXR colour channels are {', '.join(str(p.dtype) for p in planes)}; expected half or float")
+    if any(p.shape != (height, width) for p in planes):
+        raise DataError(f"{path}: OpenEXR data is {planes[0].shape[1]}x{planes[0].shape[0]}; expected {width}x{height} as in its header")
     pixels = np.stack(planes, axis=-1)
     _check_finite(path, pixels)
     return torch.from_numpy(pixels)

@@ -1,0 +1,280 @@
+"""Image files: what is read is what was written, and everything else is refused by name."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+from PIL import Image
+
+from neuprim.core import images
+from neuprim.core.errors import DataError
+
+
+def noise(*shape: int) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+
+
+def refuse(path: Path, *words: str, size: tuple[int, int] | None = None) -> None:
+    """Reading fails with the file's name and all of ``words``."""
+    with pytest.raises(DataError) as caught:
+        images.read_image(path, size)
+    for word in (str(path), *words):
+        assert word in str(caught.value)
+
+
+def png(width: int, height: int, depth: int, kind: int, rows: bytes) -> bytes:
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    header = struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_png_keeps_every_value(tmp_path: Path, channels: int) -> None:
+    pixels = noise(5, 7, channels)
+    images.write_png(tmp_path / "a.png", torch.from_numpy(pixels))
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), pixels)
+    read = images.read_image(tmp_path / "a.png", (7, 5))
+    assert read.dtype == torch.uint8 and np.array_equal(read.numpy(), pixels)
+    assert images.image_info(tmp_path / "a.png") == images.ImageInfo(7, 5, channels, False)
+
+
+def test_floats_are_rounded_and_clamped(tmp_path: Path) -> None:
+    values = torch.tensor([[[-1.0, 0.0, 0.4 / 255], [0.6 / 255, 1.0, 2.0]]])
+    images.write_png(tmp_path / "a.png", values)
+    assert images.read_image(tmp_path / "a.png").flatten().tolist() == [0, 0, 0, 1, 255, 255]
+
+
+def test_jpeg_by_content_not_by_name(tmp_path: Path) -> None:
+    Image.fromarray(np.full((8, 8, 3), 100, np.uint8)).save(tmp_path / "a.png", format="JPEG")
+    assert (images.read_image(tmp_path / "a.png").int() - 100).abs().max() <= 2
+
+
+@pytest.mark.parametrize(("half", "dtype"), [(True, torch.float16), (False, torch.float32)])
+def test_exr_is_linear_and_never_clamped(tmp_path: Path, half: bool, dtype: torch.dtype) -> None:
+    values = torch.tensor([[[-2.0, 0.5, 1000.0, 0.25], [0.0, 1.5, 60000.0, 1.0]]])
+    images.write_exr(tmp_path / "a.exr", values, half=half, extra={"Z": torch.tensor([[1.0, float("inf")]])})
+    read = images.read_image(tmp_path / "a.exr", (2, 1))
+    assert read.dtype == dtype and torch.equal(read.float(), values)
+    assert images.image_info(tmp_path / "a.exr") == images.ImageInfo(2, 1, 4, True)
+    assert OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True).channels()["Z"].pixels.tolist() == [[1.0, float("inf")]]
+
+
+def test_exr_of_one_named_layer(tmp_path: Path) -> None:
+    planes = {f"View.{c}": np.full((2, 3), i, np.float32) for i, c in enumerate("RGB")}
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, planes).write(str(tmp_path / "a.exr"))
+    assert images.read_image(tmp_path / "a.exr")[0, 0].tolist() == [0.0, 1.0, 2.0]
+
+
+def test_missing_empty_foreign_and_folder(tmp_path: Path) -> None:
+    refuse(tmp_path / "none.png", "not found")
+    (tmp_path / "empty.png").touch()
+    refuse(tmp_path / "empty.png", "empty")
+    (tmp_path / "text.png").write_text("no image")
+    refuse(tmp_path / "text.png", "expected PNG, JPEG or OpenEXR")
+    Image.fromarray(noise(4, 4, 3)).save(tmp_path / "a.bmp")
+    refuse(tmp_path / "a.bmp", "expected PNG, JPEG or OpenEXR")
+    refuse(tmp_path, "cannot be read")
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG"])
+@pytest.mark.parametrize("part", [0.05, 0.5, 0.9])
+def test_truncated(tmp_path: Path, kind: str, part: float) -> None:
+    Image.fromarray(noise(40, 40, 3)).save(tmp_path / "full", format=kind)
+    data = (tmp_path / "full").read_bytes()
+    (tmp_path / "a.png").write_bytes(data[: int(len(data) * part)])
+    refuse(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("part", [0.01, 0.5, 0.95])
+def test_truncated_exr(tmp_path: Path, part: float) -> None:
+    images.write_exr(tmp_path / "full.exr", torch.rand(40, 40, 3))
+    data = (tmp_path / "full.exr").read_bytes()
+    (tmp_path / "a.exr").write_bytes(data[: int(len(data) * part)])
+    refuse(tmp_path / "a.exr", "truncated or corrupt")
+
+
+def test_corrupt_png_data(tmp_path: Path) -> None:
+    images.write_png(tmp_path / "a.png", torch.from_numpy(noise(40, 40, 3)))
+    data = bytearray((tmp_path / "a.png").read_bytes())
+    data[60:2000] = bytes(1940)
+    (tmp_path / "a.png").write_bytes(data)
+    refuse(tmp_path / "a.png", "truncated or corrupt")
+
+
+def test_corrupt_exr_never_escapes_as_another_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    images.write_exr(tmp_path / "full.exr", torch.rand(16, 16, 3))
+    data = (tmp_path / "full.exr").read_bytes()
+    random = np.random.default_rng(1)
+    for _ in range(60):
+        damaged = bytearray(data)
+        for at in random.integers(4, len(data), 4):
+            damaged[at] = random.integers(256)
+        (tmp_path / "a.exr").write_bytes(damaged)
+        try:
+            images.read_image(tmp_path / "a.exr")
+        except DataError as error:
+            assert "a.exr" in str(error)
+
+
+@pytest.mark.parametrize("mode", ["L", "P", "LA", "1"])
+def test_grey_and_palette_png(tmp_path: Path, mode: str) -> None:
+    Image.fromarray(noise(4, 4, 3)).convert(mode).save(tmp_path / "a.png")
+    refuse(tmp_path / "a.png", "palette" if mode == "P" else "grey", "expected 8-bit RGB or RGBA")
+
+
+@pytest.mark.parametrize(("kind", "bytes_per_pixel"), [(0, 2), (2, 6), (6, 8)])
+def test_16_bit_png(tmp_path: Path, kind: int, bytes_per_pixel: int) -> None:
+    (tmp_path / "a.png").write_bytes(png(2, 2, 16, kind, (b"\0" + bytes(2 * bytes_per_pixel)) * 2))
+    refuse(tmp_path / "a.png", "16-bit", "expected 8-bit")
+
+
+def test_grey_and_cmyk_jpeg(tmp_path: Path) -> None:
+    for mode, word in (("L", "grey"), ("CMYK", "CMYK")):
+        Image.fromarray(noise(4, 4, 3)).convert(mode).save(tmp_path / "a.jpg")
+        refuse(tmp_path / "a.jpg", word)
+
+
+def test_colour_key_is_not_dropped(tmp_path: Path) -> None:
+    Image.fromarray(noise(4, 4, 3)).save(tmp_path / "a.png", transparency=(1, 2, 3))
+    refuse(tmp_path / "a.png", "colour key")
+
+
+def test_wrong_size(tmp_path: Path) -> None:
+    images.write_png(tmp_path / "a.png", torch.zeros(4, 6, 3))
+    images.write_exr(tmp_path / "a.exr", torch.zeros(4, 6, 3))
+    refuse(tmp_path / "a.png", "6x4", "expected 4x6", size=(4, 6))
+    refuse(tmp_path / "a.exr", "6x4", "expected 4x6", size=(4, 6))
+
+
+@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
+@pytest.mark.parametrize("side", [8200, 30_000, 2**31 - 1])
+def test_bombs_are_refused_from_the_header(tmp_path: Path, side: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(images, "_decode", lambda *a: pytest.fail("decoded"))
+    (tmp_path / "a.png").write_bytes(png(side, side, 8, 2, b""))
+    refuse(tmp_path / "a.png", "pixels")
+    images.write_exr(tmp_path / "a.exr", torch.zeros(2, 2, 3))
+    data = bytearray((tmp_path / "a.exr").read_bytes())
+    for name in (b"dataWindow", b"displayWindow"):
+        at = data.index(name + b"\0box2i\0") + len(name) + 11
+        data[at : at + 16] = struct.pack("<4i", 0, 0, side - 1, side - 1)
+    (tmp_path / "a.exr").write_bytes(data)
+    refuse(tmp_path / "a.exr")
+
+
+def test_exr_refusals(tmp_path: Path) -> None:
+    def write(planes: dict[str, np.ndarray], **header: object) -> Path:
+        OpenEXR.File({"type": OpenEXR.scanlineimage, **header}, planes).write(str(tmp_path / "a.exr"))
+        return tmp_path / "a.exr"
+
+    plane = np.ones((4, 4), np.float32)
+    refuse(write({"Y": plane}), "channels are Y", "expected R, G, B")
+    refuse(write({"R": plane, "G": plane}), "expected R, G, B")
+    refuse(write({f"{layer}.{c}": plane for layer in "ab" for c in "RGB"}), "of one layer")
+    refuse(write({c: plane.astype(np.uint32) for c in "RGB"}), "uint32", "expected half or float")
+    window = (np.array([0, 0], np.int32), np.array([9, 9], np.int32))
+    refuse(write(dict.fromkeys("RGB", plane), displayWindow=window), "display window")
+    bad = plane.copy()
+    bad[2, 3] = np.nan
+    refuse(write({"R": plane, "G": bad, "B": plane}), "nan", "row 2, column 3, channel 1")
+
+
+def test_masks(tmp_path: Path) -> None:
+    grey = np.array([[0, 1], [128, 255]], np.uint8)
+    for mode in ("L", "RGB"):
+        Image.fromarray(grey).convert(mode).save(tmp_path / "m.png")
+        assert images.read_mask(tmp_path / "m.png", (2, 2)).tolist() == [[False, True], [True, True]]
+    Image.fromarray(np.array([[0, 255, 0, 255]], np.uint8).reshape(1, 1, 4)[:, :, :4]).save(tmp_path / "m.png")
+    assert images.read_mask(tmp_path / "m.png").tolist() == [[True]]
+    Image.fromarray(np.array([[[0, 0, 0, 255]]], np.uint8)).save(tmp_path / "m.png")
+    assert images.read_mask(tmp_path / "m.png").tolist() == [[False]], "alpha is no mask"
+    Image.fromarray(np.array([[True, False]])).save(tmp_path / "m.png")
+    assert images.read_mask(tmp_path / "m.png").tolist() == [[True, False]]
+    (tmp_path / "m.png").write_bytes(png(2, 2, 16, 0, (b"\0" + bytes(4)) * 2))
+    with pytest.raises(DataError, match="16-bit"):
+        images.read_mask(tmp_path / "m.png")
+    with pytest.raises(DataError, match="not found"):
+        images.read_mask(tmp_path / "none.png")
+
+
+def test_failed_writes_leave_the_old_file_and_no_rubbish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.png"
+    images.write_png(path, torch.ones(2, 2, 3))
+    before = path.read_bytes()
+    with pytest.raises(DataError, match="NaN"):
+        images.write_png(path, torch.full((2, 2, 3), float("nan")))
+    with pytest.raises(DataError, match=r"shape \(2, 2\)"):
+        images.write_png(path, torch.ones(2, 2))
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", fail)
+        for write in (images.write_png, images.write_exr, images.write_webp):
+            with pytest.raises(DataError, match="No space left"):
+                write(path, torch.zeros(2, 2, 3))
+    assert path.read_bytes() == before and os.listdir(tmp_path) == ["a.png"]
+    for write in (images.write_png, images.write_exr):
+        with pytest.raises(DataError, match="cannot be written"):
+            write(tmp_path / "no" / "a", torch.zeros(2, 2, 3))
+
+
+def test_exr_write_refuses_what_it_cannot_hold(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    with pytest.raises(DataError, match="half=False"):
+        images.write_exr(path, torch.full((1, 1, 3), 1e6))
+    with pytest.raises(DataError, match="row 0, column 0, channel 0"):
+        images.write_exr(path, torch.full((1, 1, 3), float("inf")))
+    with pytest.raises(DataError, match="'Z'"):
+        images.write_exr(path, torch.zeros(1, 1, 3), extra={"Z": torch.zeros(2, 1)})
+    assert not os.listdir(tmp_path)
+
+
+def test_webp_and_animations(tmp_path: Path) -> None:
+    frames = [torch.full((8, 6, 3), v) for v in (0.0, 0.5, 1.0)]
+    images.write_webp(tmp_path / "a.webp", torch.from_numpy(noise(8, 6, 4)), lossless=True)
+    with Image.open(tmp_path / "a.webp") as still:
+        assert still.format == "WEBP" and still.size == (6, 8)
+    for name in ("b.webp", "b.gif"):
+        images.write_animation(tmp_path / name, frames, fps=10)
+        with Image.open(tmp_path / name) as film:
+            assert film.n_frames == 3 and film.size == (6, 8)
+            levels = []
+            for i in range(3):
+                film.seek(i)
+                levels.append(int(np.asarray(film.convert("RGB")).mean()))
+            assert film.info["duration"] == 100 and film.info.get("loop") == 0
+        assert np.allclose(levels, [0, 128, 255], atol=4)
+
+
+def test_animation_refusals(tmp_path: Path) -> None:
+    one = torch.zeros(2, 2, 3)
+    for name, frames, fps, words in (
+        ("a.mp4", [one], 10.0, "expected .webp or .gif"),
+        ("a.gif", [], 10.0, "at least one frame"),
+        ("a.gif", [one], 0.0, "positive rate"),
+        ("a.gif", [one, torch.zeros(3, 2, 3)], 10.0, "expected one shape"),
+    ):
+        with pytest.raises(DataError, match=words):
+            images.write_animation(tmp_path / name, frames, fps)
+
+
+def test_transfer_curve() -> None:
+    # IEC 61966-2-1: mid-grey 0.5 is 0.21404 of linear light; the linear part ends at 0.04045 / 0.0031308
+    srgb = torch.tensor([0.0, 0.04045, 0.5, 1.0], dtype=torch.float64)
+    linear = torch.tensor([0.0, 0.0031308, 0.21404114, 1.0], dtype=torch.float64)
+    assert torch.allclose(images.srgb_to_linear(srgb), linear, atol=1e-7)
+    values = torch.linspace(-0.5, 4.0, 1001, dtype=torch.float64)
+    assert torch.allclose(images.srgb_to_linear(images.linear_to_srgb(values)), values, atol=1e-6)
+    x = torch.tensor([-0.1, 0.0, 0.002, 0.5, 3.0], dtype=torch.float64, requires_grad=True)
+    for curve in (images.srgb_to_linear, images.linear_to_srgb):
+        assert torch.autograd.gradcheck(curve, (x,))

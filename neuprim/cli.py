@@ -19,6 +19,7 @@ from neuprim.core.errors import ConfigError, NeuprimError, nearest
 
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
+    from neuprim.core.task import TaskSpec
 
 __all__ = ["main"]
 
@@ -107,7 +108,10 @@ def _parsers(with_tasks: bool) -> tuple[Parser, dict[str, argparse.ArgumentParse
     evaluate.add_argument("run_dir", type=Path, metavar="RUN_DIR")
 
     render = command(
-        "render", _render, "draw images of a run", "Each condition of the run's task (time, light, ...) is a flag: --NAME TEXT."
+        "render",
+        _render,
+        "draw images of a run",
+        "Each condition of the run's task (time, light, ...) is a flag, given after RUN_DIR: --NAME TEXT.",
     )
     render.add_argument("run_dir", type=Path, metavar="RUN_DIR")
     render.add_argument("--camera", required=True, metavar="orbit|test|FILE.json", help="which cameras")
@@ -153,9 +157,10 @@ def _fit(config: RunConfig) -> Path:
 
 
 def _eval(args: argparse.Namespace) -> int:
+    run_dir = _run_directory(args.run_dir)
     from neuprim.evaluate import evaluate_run
 
-    _print_metrics(evaluate_run(_run_directory(args.run_dir)))
+    _print_metrics(evaluate_run(run_dir))
     return 0
 
 
@@ -175,29 +180,32 @@ def _render(args: argparse.Namespace) -> int:
 
 
 def _tasks(args: argparse.Namespace) -> int:
-    from neuprim.config import check_groups, presets
     from neuprim.plugins.registry import survey
 
     for report in survey():
-        spec, error = report.spec, report.error
         try:
-            names = presets(spec) if spec else []
-            if spec:
-                check_groups(spec)
+            if report.spec is None:
+                raise ConfigError(report.error or "cannot be loaded")
+            lines = _describe(report.spec)
+            print(f"{report.info.name}  ({report.info.origin})  {report.spec.summary}")
         except ConfigError as broken:
-            spec, error = None, str(broken)
-        if spec is None:
-            print(f"{report.info.name}  ({report.info.origin})  BROKEN\n  {error}\n")
-            continue
-        width = max([len(s.name) for s in spec.scenes], default=0)
-        print(f"{spec.name}  ({report.info.origin})  {spec.summary}")
-        for i, scene in enumerate(spec.scenes):
-            print(f"  {'scenes' if i == 0 else '':10}{scene.name:{width}}  {scene.summary}")
-        print(f"  {'presets':10}{', '.join(names)}")
-        if spec.conditions:
-            print(f"  {'conditions':10} " + ", ".join(f"{c.name} [{c.unit}]" for c in spec.conditions))
-        print()
+            lines = [str(broken)]
+            print(f"{report.info.name}  ({report.info.origin})  BROKEN")
+        print(*(f"  {line}" for line in lines), sep="\n", end="\n\n")
     return 0
+
+
+def _describe(spec: TaskSpec) -> list[str]:
+    from neuprim.config import check_groups, presets, task_choices
+
+    check_groups(spec)
+    default = task_choices(spec)
+    width = max(len(scene.name) for scene in spec.scenes)
+    rows = [("scenes", f"{s.name:{width}}  {s.summary}{' (default)' if s.name == default.scene else ''}") for s in spec.scenes]
+    rows.append(("presets", ", ".join(name + " (default)" * (name == default.preset) for name in presets(spec))))
+    if spec.conditions:
+        rows.append(("conditions", ", ".join(f"{c.name} [{c.unit}]" for c in spec.conditions)))
+    return [f"{title if i == 0 or title != rows[i - 1][0] else '':10}  {text}" for i, (title, text) in enumerate(rows)]
 
 
 def _doctor(args: argparse.Namespace) -> int:

@@ -173,5 +173,7 @@ def _probe(name: str) -> str | None:
 def _caches() -> Rows:
     from numba.core import config
 
-    place = config.CACHE_DIR or "in __pycache__ beside each module, or in the user's cache directory where that is read-only"
+    place = (
+        getattr(config, "CACHE_DIR", "") or "in __pycache__ beside each module, or in the user's cache directory where that is read-only"
+    )
     return [("numba", f"{place} (set by NUMBA_CACHE_DIR)")]

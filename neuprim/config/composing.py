@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuprim.config.groups import check_groups, presets
+from neuprim.config.groups import check_groups, presets, task_choices
 from neuprim.config.outputs import output_directory
 from neuprim.config.overrides import Assignment, expand_sweep, parse, sweep_names, swept_keys
 from neuprim.config.record import RunConfig, RunSettings
@@ -26,11 +26,13 @@ if TYPE_CHECKING:
 __all__ = ["compose", "compose_all"]
 
 DEFAULT_TASK = "static"
-DEFAULT_PRESET = "quick"
 CHOICES = ("task", "scene", "preset")
 PRESET_KEYS = ("model", "train", "renderer")
 PATHS = "_paths_"
 """Key of a scene's YAML that lists which of its settings are paths: ``~`` is expanded and they are made absolute."""
+
+Files = dict[tuple[str, ...], Any]
+"""Hydra's compositions by package and groups, so that a sweep reads each file once."""
 
 
 def compose(overrides: Sequence[str], check_output: bool = True) -> RunConfig:
@@ -43,19 +45,22 @@ def compose(overrides: Sequence[str], check_output: bool = True) -> RunConfig:
     Raises:
         ConfigError: one line that names the key, what was found and what was expected.
     """
+    return _compose(overrides, check_output, {})
+
+
+def _compose(overrides: Sequence[str], check_output: bool, files: Files) -> RunConfig:
     assignments = parse(overrides)
     chosen = {key: _choice(assignments, key) for key in CHOICES}
     values = [a for a in assignments if a.key not in CHOICES]
     spec = load_task(chosen["task"] or DEFAULT_TASK)
     check_groups(spec)
-    task_node = _task_node(spec)
-    scene_name = chosen["scene"] or task_node["scene"] or spec.scenes[0].name
-    default_preset = task_node["preset"] or DEFAULT_PRESET
-    preset = chosen["preset"] or default_preset
+    own = task_choices(spec)
+    scene_name = chosen["scene"] or own.scene
+    preset = chosen["preset"] or own.preset
     _check_name("scene", scene_name, [s.name for s in spec.scenes], spec)
     _check_name("preset", preset, presets(spec), spec)
 
-    base, declared_paths = _base(spec, scene_name, preset, task_node["options"])
+    base, declared_paths = _base(spec, scene_name, preset, own.options, files)
     for assignment in values:
         _check_key(assignment, base, scene_name)
     plain, full = _merge(base, values)
@@ -63,7 +68,7 @@ def compose(overrides: Sequence[str], check_output: bool = True) -> RunConfig:
     scene = _scene(full["scene"], base["scene"], declared_paths)
     directory = output_directory(settings.output_dir, f"{spec.name}-{scene_name}", settings.resume, check_output)
     full["scene"] = scene
-    changed = {"preset": (default_preset, preset)} if preset != default_preset else {}
+    changed = {"preset": (own.preset, preset)} if preset != own.preset else {}
     return RunConfig(
         task=spec.name,
         scene_name=scene_name,
@@ -87,11 +92,12 @@ def compose_all(overrides: Sequence[str], check_output: bool = True) -> list[Run
     if not swept:
         return [compose(overrides, check_output)]
     combinations = expand_sweep(overrides)
-    configs = [compose([*c, "output_dir=null"], check_output=False) for c in combinations]
+    files: Files = {}
+    configs = [_compose([*c, "output_dir=null"], False, files) for c in combinations]
     first = configs[0]
     fixed = [word for key, word in (("task", first.task), ("scene", first.scene_name)) if not swept & {key, "task"}]
     asked = [a.value for a in parse(combinations[0]) if a.key == "output_dir"]
-    explicit = str(compose(combinations[0], check_output=False).output_dir) if asked and asked[-1] is not None else None
+    explicit = str(_compose(combinations[0], False, files).output_dir) if asked and asked[-1] is not None else None
     base = output_directory(explicit, "-".join([*fixed, "sweep"]), first.resume, check_output)
     names = sweep_names(overrides, combinations)
     return [
@@ -121,45 +127,41 @@ def _check_name(kind: str, name: str, names: Sequence[str], spec: TaskSpec) -> N
 # ---------------------------------------------------------------- Hydra
 
 
-def _hydra(spec: TaskSpec, groups: Sequence[str]) -> Any:
+def _hydra(spec: TaskSpec, groups: tuple[str, ...], files: Files) -> Any:
+    key = (spec.config_package, *groups)
+    if key not in files:
+        files[key] = _hydra_compose(spec, groups)
+    return files[key]
+
+
+def _hydra_compose(spec: TaskSpec, groups: Sequence[str]) -> Any:
     from hydra import compose as hydra_compose
     from hydra import initialize_config_module
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
 
     try:
         with initialize_config_module("neuprim.conf", version_base="1.3"):
             return hydra_compose("config", [f"hydra.searchpath=[pkg://{spec.config_package}]", *groups])
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise ConfigError(f"task {spec.name!r}: its YAML files do not compose ({' '.join(str(error).split())})") from error
 
 
-def _task_node(spec: TaskSpec) -> dict[str, Any]:
-    node = _plain(_hydra(spec, [f"+task@from_task={spec.name}"]).get("from_task") or {}, resolve=False)
-    known = ("scene", "preset", "options")
-    for key in node:
-        if key not in known:
-            raise ConfigError(f"task/{spec.name}.yaml: {key}: no such setting" + nearest(str(key), known))
-    options = node.get("options") or {}
-    if not isinstance(options, dict):
-        raise ConfigError(f"task/{spec.name}.yaml: options: expected a mapping")
-    return {"scene": node.get("scene"), "preset": node.get("preset"), "options": options}
-
-
-def _base(spec: TaskSpec, scene: str, preset: str, options: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+def _base(spec: TaskSpec, scene: str, preset: str, options: dict[str, Any], files: Files) -> tuple[dict[str, Any], list[str]]:
     """Everything but the user's words, unresolved, and the names of the scene's settings that are paths."""
     from omegaconf import OmegaConf
 
-    composed = _hydra(spec, [f"+scene/{spec.name}@from_scene={scene}", f"+preset/{spec.name}@from_preset={preset}"])
-    scene_node = _plain(composed.get("from_scene") or {}, resolve=False)
-    preset_node = _plain(composed.get("from_preset") or {}, resolve=False)
-    place = f"preset/{spec.name}/{preset}.yaml"
+    composed = _hydra(spec, (f"+scene/{spec.name}@from_scene={scene}", f"+preset/{spec.name}@from_preset={preset}"), files)
+    place, scene_place = f"preset/{spec.name}/{preset}.yaml", f"scene/{spec.name}/{scene}.yaml"
+    scene_node = _plain(composed.get("from_scene"), resolve=False, place=scene_place)
+    preset_node = _plain(composed.get("from_preset"), resolve=False, place=place)
     for key in preset_node:
         if key not in PRESET_KEYS:
             raise ConfigError(f"{place}: {key}: a preset may only set {', '.join(PRESET_KEYS)}")
     declared = scene_node.pop(PATHS, None) or []
     if not isinstance(declared, list) or any(name not in scene_node for name in declared) or "name" in scene_node:
-        raise ConfigError(f"scene/{spec.name}/{scene}.yaml: {PATHS} must list keys of the file, and name is no setting")
+        raise ConfigError(f"{scene_place}: {PATHS} must list keys of the file, and name is no setting")
     common = {k: v for k, v in _plain(composed, resolve=False).items() if not k.startswith("from_")}
     merged = OmegaConf.merge(defaults(RunSettings), common, preset_node)
     base = {**_plain(merged, resolve=False), "scene": scene_node, "task": {"options": options}}
@@ -184,19 +186,19 @@ def _merge(base: Mapping[str, Any], values: Sequence[Assignment]) -> tuple[dict[
     return _plain(OmegaConf.create(dict(base))), _plain(tree)
 
 
-def _plain(node: Any, resolve: bool = True) -> dict[str, Any]:
+def _plain(node: Any, resolve: bool = True, place: str = "configuration") -> dict[str, Any]:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    if isinstance(node, dict):
-        return node
+    if node is None:
+        return {}  # an empty file
     try:
         plain = OmegaConf.to_container(node, resolve=resolve)
     except OmegaConfBaseException as error:
         text = str(error).strip().splitlines()[0]
-        raise ConfigError(f"{getattr(error, 'full_key', None) or 'configuration'}: {text}") from error
+        raise ConfigError(f"{getattr(error, 'full_key', None) or place}: {text}") from error
     if not isinstance(plain, dict):
-        raise ConfigError(f"expected a mapping of settings, found {type(plain).__name__}")
+        raise ConfigError(f"{place}: expected a mapping of settings, found {type(plain).__name__}")
     return {str(k): v for k, v in plain.items()}
 
 
@@ -222,7 +224,7 @@ def _check_key(assignment: Assignment, base: Mapping[str, Any], scene_name: str)
         if whole and not isinstance(value, dict):
             raise ConfigError(f"{assignment.text}: {head} is a group of settings; set one of them as {head}.KEY=VALUE")
         return
-    names = [*CHOICES, *setting_names(RunSettings), *(f"scene.{k}" for k in scene)]
+    names = [*CHOICES, "task.options", *setting_names(RunSettings), *(f"scene.{k}" for k in scene)]
     if head == "scene" and rest:
         own = sorted(f"scene.{k}" for k in scene)
         hint = nearest(key, own) if own else "; it has none"

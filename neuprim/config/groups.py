@@ -6,16 +6,59 @@ under the task's name because several tasks have a scene of the same name with o
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from neuprim.core.errors import ConfigError
+from neuprim.core.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
 
-__all__ = ["check_groups", "presets"]
+__all__ = ["TaskChoices", "check_groups", "presets", "task_choices"]
+
+DEFAULT_PRESET = "quick"
+
+
+@dataclass(frozen=True)
+class TaskChoices:
+    """What ``task/NAME.yaml`` says: the scene and preset of a run that names none, and the task's own free settings."""
+
+    scene: str
+    preset: str
+    options: dict[str, Any]
+
+
+def task_choices(spec: TaskSpec) -> TaskChoices:
+    """Reads ``task/NAME.yaml``, which is a plain file without a defaults list.
+
+    Raises:
+        ConfigError: it is not YAML, or has a key other than ``scene``, ``preset`` and ``options``.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
+
+    file = f"task/{spec.name}.yaml"
+    try:
+        node = OmegaConf.to_container(OmegaConf.create((_root(spec) / file).read_text(encoding="utf-8")))
+    except (OSError, UnicodeDecodeError, OmegaConfBaseException, YAMLError) as error:
+        raise ConfigError(f"task {spec.name!r}: {file} cannot be read ({' '.join(str(error).split())})") from error
+    if not isinstance(node, dict):
+        raise ConfigError(f"task {spec.name!r}: {file}: expected a mapping")
+    known = ("scene", "preset", "options")
+    for key in node:
+        if key not in known:
+            raise ConfigError(f"task {spec.name!r}: {file}: {key!s}: no such setting" + nearest(str(key), known))
+    scene, preset = node.get("scene") or spec.scenes[0].name, node.get("preset") or DEFAULT_PRESET
+    options = node.get("options") or {}
+    for key, value, names in (("scene", scene, [s.name for s in spec.scenes]), ("preset", preset, presets(spec))):
+        if value not in names:
+            raise ConfigError(f"task {spec.name!r}: {file}: {key}={value}: no such {key}" + nearest(str(value), names))
+    if not isinstance(options, dict):
+        raise ConfigError(f"task {spec.name!r}: {file}: options: expected a mapping")
+    return TaskChoices(scene, preset, {str(k): v for k, v in options.items()})
 
 
 def presets(spec: TaskSpec) -> list[str]:
@@ -24,10 +67,12 @@ def presets(spec: TaskSpec) -> list[str]:
 
 
 def check_groups(spec: TaskSpec) -> None:
-    """Raises ConfigError when the configuration package cannot be used or lacks the file of a scene."""
+    """Raises ConfigError when the configuration package cannot be used or lacks a file that a run would need."""
     root = _root(spec)
     if not (root / "task" / f"{spec.name}.yaml").is_file():
         raise ConfigError(f"task {spec.name!r}: {spec.config_package} has no task/{spec.name}.yaml")
+    if not spec.scenes:
+        raise ConfigError(f"task {spec.name!r}: its TaskSpec has no scenes")
     have = _names(spec, "scene")
     for scene in spec.scenes:
         if scene.name not in have:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -40,8 +41,6 @@ def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
 
     The last key varies fastest. ``["a=1,2", "b=3"]`` gives ``[["a=1", "b=3"], ["a=2", "b=3"]]``.
     """
-    import itertools
-
     choices: list[list[str]] = []
     count = 1
     for override, text in zip(_read(overrides), overrides, strict=True):
@@ -52,7 +51,7 @@ def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
         if key.lstrip("+") in NOT_SWEPT:
             raise ConfigError(f"{text}: {key} cannot be swept; quote a value that contains commas: {_quoted(text)}")
         try:
-            values = [f"{key}={value}" for value in override.sweep_string_iterator()]
+            values = [f"{key}={v}" for v in itertools.islice(override.sweep_string_iterator(), MAX_RUNS + 1)]
         except Exception as error:  # interval() and glob() have no list of values; range() may divide by a zero step
             raise ConfigError(f"{text}: cannot be swept ({_line(error)}); list the values: {key}=A,B,C") from error
         if not values:
@@ -60,7 +59,7 @@ def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
         choices.append(values)
         count *= len(values)
         if count > MAX_RUNS:
-            raise ConfigError(f"{text}: {count} runs in one sweep; at most {MAX_RUNS}")
+            raise ConfigError(f"{text}: more than {MAX_RUNS} runs in one sweep")
     return [list(combination) for combination in itertools.product(*choices)]
 
 
@@ -91,7 +90,7 @@ def _read(overrides: Sequence[str]) -> list[Any]:
     result = []
     for text in overrides:
         key, equals, _ = text.partition("=")
-        if not equals or not re.fullmatch(r"\+{0,2}[\w.@/-]+", key.strip()) or "\n" in text:
+        if not equals or not re.fullmatch(r"\+{0,2}[\w@/-]+(\.[\w@/-]+)*", key.strip()) or "\n" in text:
             if text.startswith("~"):
                 raise ConfigError(f"{text}: settings cannot be deleted; KEY=null unsets one")
             raise ConfigError(f"{' '.join(text.split())!r}: expected KEY=VALUE")

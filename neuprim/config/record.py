@@ -85,7 +85,7 @@ class RunConfig:
 
     def to_yaml(self) -> str:
         """The resolved configuration as YAML; :meth:`from_yaml` reads it back unchanged."""
-        return yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True, width=120)
+        return yaml.dump(self.to_dict(), Dumper=_PlainDumper, sort_keys=False, allow_unicode=True, width=120)
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> RunConfig:
@@ -139,6 +139,13 @@ class RunConfig:
             overrides=overrides,
             non_default={str(key): (pair[0], pair[1]) for key, pair in non_default.items()},
         )
+
+
+class _PlainDumper(yaml.SafeDumper):
+    """Writes a value that occurs twice twice, instead of as an anchor and an alias."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
 
 
 def _read(file: Path) -> Mapping[str, Any]:

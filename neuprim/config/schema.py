@@ -34,7 +34,9 @@ def build(cls: type[T], values: object, where: str = "") -> T:
     names = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
     for key in values:
         if key not in names:
-            raise ConfigError(f"{_join(where, str(key))}: no such setting" + nearest(str(key), names))
+            raise ConfigError(
+                f"{_join(where, str(key))}: no such setting" + nearest(_join(where, str(key)), [_join(where, n) for n in names])
+            )
     made = cls(**{name: convert(values[name], hints[name], _join(where, name)) for name in names if name in values})
     check = getattr(made, "check", None)
     if check is not None:
@@ -67,7 +69,7 @@ def convert(value: Any, hint: Any, where: str) -> Any:
 
 def like(value: Any, default: Any, where: str) -> Any:
     """``value`` as the type of a scene's ``default``; a null or required default accepts anything."""
-    if default is None or default == REQUIRED or value == default:
+    if default is None or default == REQUIRED:
         return value
     if isinstance(default, Mapping):
         return convert(value, dict[str, Any], where)

@@ -124,5 +124,5 @@ def _load(info: TaskInfo, entry: metadata.EntryPoint) -> TaskSpec:
 
 
 def _clash(name: str, claims: Sequence[TaskInfo]) -> str:
-    origins = " and ".join(f"{info.origin} ({info.target})" for info in claims)
+    origins = " and ".join(sorted(f"{info.origin} ({info.target})" for info in claims))
     return f"task {name!r} is registered by {origins}; uninstall one of them"

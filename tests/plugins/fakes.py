@@ -1,0 +1,72 @@
+"""Third-party packages made on the spot: files and a ``.dist-info`` in a directory on ``sys.path``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import pytest
+
+from neuprim.plugins import registry
+
+TOY = """
+from neuprim.core.fields import ConditionSpec
+from neuprim.core.task import SceneSpec, TaskSpec
+
+TASK = TaskSpec(
+    api=1,
+    name="toy",
+    summary="a toy",
+    config_package="toytask.conf",
+    scenes=(SceneSpec("ball", "one ball", lambda s, c: None), SceneSpec("files", "from files", lambda s, c: None)),
+    build=lambda m, d: None,
+    loss=lambda s: None,
+    conditions=(ConditionSpec("time", (), "1", (0.0, 1.0), lambda t: []), ConditionSpec("light_pos", (3,), "m", (0.0, 1.0), lambda t: [])),
+)
+"""
+
+TOY_FILES = {
+    "toytask/__init__.py": TOY,
+    "toytask/conf/__init__.py": "",
+    "toytask/conf/task/toy.yaml": "scene: ball\noptions: {gain: 1.0}\n",
+    "toytask/conf/scene/toy/ball.yaml": "size: 20\nsmooth: false\nlook: auto\nratio: 0.5\nsteps: [1, 2]\n",
+    "toytask/conf/scene/toy/files.yaml": "_paths_: [path]\npath: ???\ndownsample: 1\n",
+    "toytask/conf/preset/toy/quick.yaml": "train: {iterations: 7, rates: {means: 1e-3}}\n",
+    "toytask/conf/preset/toy/long.yaml": "model: {primitives: 9}\ntrain: {iterations: 700}\nrenderer: {near: 0.5}\n",
+}
+
+
+def install(root: Path, distribution: str, tasks: Mapping[str, str], files: Mapping[str, str], version: str = "0.3") -> None:
+    """Puts a distribution with entry points ``tasks`` and source ``files`` under ``root``."""
+    info = root / f"{distribution.replace('-', '_')}-{version}.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n")
+    lines = "\n".join(f"{name} = {target}" for name, target in tasks.items())
+    (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\n{lines}\n")
+    for name, text in files.items():
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An empty directory on ``sys.path``; what was imported from it is forgotten afterwards."""
+    root = tmp_path / "site"
+    root.mkdir()
+    monkeypatch.syspath_prepend(str(root))
+    yield root
+    ours = {entry.stem for entry in root.iterdir()}
+    for name in [n for n in sys.modules if n.partition(".")[0] in ours]:
+        del sys.modules[name]
+
+
+@pytest.fixture
+def toy(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The task ``toy`` of the distribution ``neuprim-toy``, with an empty working directory; returns its package's folder."""
+    install(site, "neuprim-toy", {"toy": "toytask:TASK"}, TOY_FILES)
+    work = tmp_path / "work"
+    work.mkdir()
+    monkeypatch.chdir(work)
+    return site / "toytask"

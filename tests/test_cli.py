@@ -1,0 +1,232 @@
+import subprocess
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import neuprim
+from neuprim.cli import main
+from neuprim.config import RunConfig
+from neuprim.core.errors import DataError, NonFiniteError
+from tests.plugins.fakes import install, site, toy
+
+__all__ = ["site", "toy"]
+
+
+@pytest.fixture
+def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Stand-ins for the modules that do the work; they record what they were asked."""
+    made: list[Any] = []
+
+    def run(config: RunConfig) -> Path:
+        made.append(config)
+        config.output_dir.mkdir(parents=True)
+        (config.output_dir / "config.yaml").write_text(config.to_yaml())
+        return config.output_dir
+
+    def evaluate_run(run_dir: Path) -> dict[str, Any]:
+        made.append(run_dir)
+        return {"psnr": 31.23456, "views": 20, "worst": {"name": "r_3", "psnr": 27.0}}
+
+    def render_run(*args: Any) -> list[Path]:
+        made.append(args)
+        return [Path("a.png"), Path("b.png")]
+
+    for name, functions in (("run", {"run": run}), ("evaluate", {"evaluate_run": evaluate_run, "render_run": render_run})):
+        module = types.ModuleType(f"neuprim.{name}")
+        for key, function in functions.items():
+            setattr(module, key, function)
+        monkeypatch.setitem(sys.modules, f"neuprim.{name}", module)
+        monkeypatch.setattr(neuprim, name, module, raising=False)
+    return made
+
+
+def error_line(capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line on standard error."""
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("neuprim: error: ")
+    assert err.count("\n") == 1
+    assert "Traceback" not in err
+    return err
+
+
+# ---------------------------------------------------------------- run
+
+
+def test_run(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "task=toy", "train.iterations=3", "output_dir=out"]) == 0
+    assert calls[0].train.iterations == 3
+    assert capsys.readouterr().out == "out\n"
+
+
+def test_cfg_prints_and_stops(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    Path("full").mkdir()
+    Path("full/x").touch()
+    assert main(["run", "--cfg", "task=toy", "output_dir=full"]) == 0
+    Path("config.yaml").write_text(capsys.readouterr().out)
+    assert RunConfig.from_yaml("config.yaml").train.iterations == 7
+    assert calls == []
+
+
+def test_sweep_with_the_flag_anywhere(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "task=toy", "-m", "model.primitives=2,3", "seed=1,2"]) == 0
+    assert [(c.model.primitives, c.seed) for c in calls] == [(2, 1), (2, 2), (3, 1), (3, 2)]
+    assert Path("outputs/toy-ball-sweep/model.primitives-3_seed-2/config.yaml").is_file()
+    assert "[4/4]" in capsys.readouterr().out
+
+
+def test_a_failing_combination_does_not_lose_the_others(
+    calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran = []
+
+    def run(config: RunConfig) -> Path:
+        ran.append(config.seed)
+        if config.seed == 1:
+            raise NonFiniteError("w2 of primitive 3")
+        return config.output_dir
+
+    monkeypatch.setattr(sys.modules["neuprim.run"], "run", run)
+    assert main(["run", "task=toy", "-m", "seed=1,2"]) == 2
+    assert ran == [1, 2]
+    assert capsys.readouterr().err == "neuprim: error: outputs/toy-ball-sweep/seed-1: w2 of primitive 3\n"
+
+
+@pytest.mark.parametrize(
+    ("argv", "text"),
+    [
+        (["rn"], "rn: no such command; did you mean 'run'"),
+        (["--versoin"], "--help"),
+        (["run", "--cfgg"], "--cfgg: no such argument of `neuprim run`; did you mean '--cfg'"),
+        (["run", "task=toi"], "did you mean 'toy'"),
+        (["run", "task=toy", "scene=bll"], "did you mean 'ball'"),
+        (["run", "task=toy", "preset=qick"], "did you mean 'quick'"),
+        (["run", "task=toy", "train.iteration=1"], "did you mean 'train.iterations'"),
+        (["run", "task=toy", "train.iterations=x"], "expected a whole number"),
+        (["run", "task=toy", "train"], "expected KEY=VALUE"),
+        (["run", "task=toy", "seed=1,2"], "add -m"),
+        (["eval"], "RUN_DIR"),
+        (["eval", "nowhere"], "nowhere: no such run directory"),
+        (["eval", ".", "x"], "x: no such argument"),
+        (["render", "nowhere", "--camera", "orbit"], "nowhere: no such run directory"),
+        (["render", "."], "--camera"),
+        (["render", ".", "--camera", "spiral"], "expected orbit, test or a .json file"),
+        (["render", ".", "--camera", "no.json"], "no.json: no such file"),
+        (["render", ".", "--camera", "orbit", "--size", "640"], "expected WIDTHxHEIGHT"),
+        (["render", ".", "--camera", "orbit", "--size", "0x5"], "expected WIDTHxHEIGHT"),
+        (["render", ".", "--camera", "orbit", "--format", "gif"], "gif"),
+        (["render", ".", "--camera", "orbit", "--frames", "0"], "expected a positive count"),
+        (["render", ".", "--camera", "orbit", "--time", "0"], "config.yaml: missing"),
+        (["tasks", "more"], "more: no such argument of `neuprim tasks`"),
+    ],
+)
+def test_one_line_and_status_2(calls: list[Any], capsys: pytest.CaptureFixture[str], argv: list[str], text: str) -> None:
+    assert main(argv) == 2
+    assert text in error_line(capsys)
+    assert calls == []
+
+
+def test_errors_of_many_lines_become_one(calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(config: RunConfig) -> Path:
+        raise DataError("missing images:\n  a.png\n  b.png")
+
+    monkeypatch.setattr(sys.modules["neuprim.run"], "run", run)
+    assert main(["run", "task=toy"]) == 2
+    assert error_line(capsys) == "neuprim: error: missing images: a.png b.png\n"
+
+
+def test_interrupt_is_130_and_a_bug_keeps_its_traceback(calls: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(config: RunConfig) -> Path:
+        raise KeyboardInterrupt
+
+    def bug(config: RunConfig) -> Path:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(sys.modules["neuprim.run"], "run", stop)
+    assert main(["run", "task=toy"]) == 130
+    monkeypatch.setattr(sys.modules["neuprim.run"], "run", bug)
+    with pytest.raises(ZeroDivisionError):
+        main(["run", "task=toy"])
+
+
+# ---------------------------------------------------------------- eval, render
+
+
+def test_eval_prints_metrics(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    Path("r").mkdir()
+    assert main(["eval", "r"]) == 0
+    assert calls == [Path("r")]
+    assert capsys.readouterr().out.splitlines() == ["psnr        31.2346", "views       20", "worst.name  r_3", "worst.psnr  27.0000"]
+
+
+def test_render(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    main(["run", "task=toy", "output_dir=r"])
+    capsys.readouterr()
+    assert main(["render", "r", "--camera", "test"]) == 0
+    assert calls[-1] == (Path("r"), "test", None, "png", None, 60, {})
+    assert capsys.readouterr().out == "a.png\nb.png\n"
+    Path("cams.json").touch()
+    flags = ["--camera", "cams.json", "--size", "640x480", "--format", "exr", "--out", "o", "--frames", "3"]
+    assert main(["render", "r", *flags, "--time", "0:1", "--light-pos=-1,0,2"]) == 0
+    assert calls[-1] == (Path("r"), "cams.json", (640, 480), "exr", Path("o"), 3, {"time": "0:1", "light_pos": "-1,0,2"})
+
+
+def test_render_knows_the_conditions_of_the_runs_task(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    main(["run", "task=toy", "output_dir=r"])
+    capsys.readouterr()
+    assert main(["render", "r", "--camera", "orbit", "--tiem", "0"]) == 2
+    assert "--tiem: no such argument of `neuprim render` for task 'toy'; did you mean '--time'" in error_line(capsys)
+    assert main(["render", "r", "--camera", "orbit", "--time"]) == 2
+    assert "--time" in error_line(capsys)
+
+
+# ---------------------------------------------------------------- tasks, help
+
+
+def test_tasks_lists_all_and_the_broken_ones(toy: Path, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    install(site, "neuprim-bad", {"bad": "fake_bad:TASK"}, {"fake_bad.py": "raise ImportError('no such luck')"}, version="2")
+    assert main(["tasks"]) == 0
+    out = capsys.readouterr().out
+    assert "toy  (neuprim-toy 0.3)  a toy" in out
+    assert "one ball" in out
+    assert "long, quick (default)" in out
+    assert "bad  (neuprim-bad 2)  BROKEN" in out
+    assert "ImportError: no such luck" in out
+    assert "(neuprim 0.1.0)" in out
+
+
+def test_tasks_reports_a_plugin_whose_yaml_is_missing(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (toy / "conf/scene/toy/files.yaml").unlink()
+    assert main(["tasks"]) == 0
+    out = capsys.readouterr().out
+    assert "toy  (neuprim-toy 0.3)  BROKEN" in out
+    assert "has no scene/toy/files.yaml" in out
+
+
+def test_help_and_version(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"neuprim {neuprim.__version__}\n"
+    assert main(["--help"]) == 0
+    assert "doctor" in capsys.readouterr().out
+    assert main([]) == 0
+    capsys.readouterr()
+    assert main(["run", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert "train.iterations=N" in out
+    assert "toy  (neuprim-toy 0.3)" in out
+    assert "neuprim run task=static scene=solids" in out
+
+
+def test_help_is_light() -> None:
+    heavy = "{'torch', 'numpy', 'hydra', 'omegaconf', 'rich', 'numba'}"
+    code = f"import sys, neuprim.cli as c; c.main(['run', '--help']); bad = {heavy} & set(sys.modules); sys.exit(str(bad) if bad else 0)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_python_dash_m() -> None:
+    done = subprocess.run([sys.executable, "-m", "neuprim", "--version"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, f"neuprim {neuprim.__version__}\n")

@@ -1,0 +1,54 @@
+import io
+from importlib import metadata
+
+import pytest
+from rich.console import Console
+
+from neuprim import doctor
+
+
+def report() -> tuple[int, str]:
+    console = Console(file=io.StringIO(), width=200)
+    status = doctor.doctor(console)
+    return status, console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_probe", lambda name: None if name == "reference" else "no such luck")
+    status, text = report()
+    assert status == 0
+    for word in ("python", "simd", "memory", "hydra-core", metadata.version("torch"), "pycolmap", "triton", "CUDA", "numba", "works"):
+        assert word in text
+    assert "does not work: no such luck" in text
+    assert "pytest" not in text, "extras for developers are not shown"
+
+
+def test_status_1_when_nothing_works(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_probe", lambda name: "broken")
+    status, text = report()
+    assert status == 1
+    assert "no renderer backend works" in text
+
+
+def test_what_is_missing_or_too_old_says_how_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    needs = ["numpy>=999", "not-there>=1", "also-not>=2; extra == 'colmap'", "skipped; extra == 'dev'", "skipped; sys_platform == 'none'"]
+    monkeypatch.setattr(metadata, "requires", lambda name: needs)
+    rows = dict(doctor._packages())
+    assert "needs >=999: pip install 'numpy>=999'" in rows["numpy"]
+    assert rows["not-there"] == "not installed: pip install 'not-there>=1'"
+    assert rows["also-not"] == "not installed: pip install 'neuprim[colmap]'"
+    assert "skipped" not in rows
+
+
+def test_a_backend_that_raises_is_shown_not_fatal(monkeypatch: pytest.MonkeyPatch) -> None:
+    import neuprim.core.render
+
+    def explode(name: str) -> str:
+        raise RuntimeError(f"{name} has\nno llvm")
+
+    monkeypatch.setattr(neuprim.core.render, "probe", explode)
+    assert doctor._probe("cpu") == "RuntimeError: cpu has no llvm"
+
+
+def test_the_oracle_works_here() -> None:
+    assert doctor._probe("reference") is None

@@ -18,12 +18,14 @@ class ModelSettings:
         primitives: primitives at the start (and throughout, unless population control grows them).
         neurons: hidden width K of the cosine density, 0..16; 0 is a constant density.
         sh_degree: spherical-harmonics degree of the colour, 0..3.
+        sh_every: fraction of the budget after which one more SH band is unlocked; 0 unlocks all at once.
         init: free settings of the fields' initialisers, see the preset files.
     """
 
     primitives: int = 2000
     neurons: int = 8
     sh_degree: int = 3
+    sh_every: float = 0.1
     init: dict[str, Any] = field(default_factory=dict)
 
     def check(self) -> None:
@@ -31,6 +33,7 @@ class ModelSettings:
             ("primitives", self.primitives >= 1, "at least 1"),
             ("neurons", 0 <= self.neurons <= 16, "0 to 16"),
             ("sh_degree", 0 <= self.sh_degree <= 3, "0 to 3"),
+            ("sh_every", self.sh_every >= 0, "a fraction of the budget, 0 for all bands at once"),
         ):
             if not ok:
                 raise ConfigError(f"model.{name}={getattr(self, name)}: expected {expected}")
@@ -75,7 +78,6 @@ class TrainSettings:
         warmup_steps: steps over which the rates rise linearly from zero.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
         anisotropy_weight, anisotropy_from: weight of mean(std over axes of s / min s), and the step it starts at.
-        sh_every: fraction of the budget after which one more SH band is unlocked; 0 unlocks all at once.
         background: "white", "black", "random" or "auto" (the data set's own choice).
         checkpoint_every_seconds: a checkpoint is written at the first step after this many seconds, and at the end.
         log_every: steps between two lines of metrics.jsonl.
@@ -90,7 +92,6 @@ class TrainSettings:
     ssim_weight: float = 0.2
     anisotropy_weight: float = 0.0
     anisotropy_from: int = 100
-    sh_every: float = 0.1
     background: str = "auto"
     checkpoint_every_seconds: float = 60.0
     log_every: int = 20

@@ -1,0 +1,134 @@
+"""Models and checkpoints on disk: safetensors with one JSON header. Nothing in a file is ever executed.
+
+A *model* holds what rendering needs and nothing else; a *checkpoint* holds the exact training state.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from neuprim.core.errors import CheckpointError, nearest
+from neuprim.core.fields import ColourField, DensityField
+from neuprim.core.files import atomic_path
+from neuprim.core.primitives import Primitives
+from neuprim.core.task import TaskSpec
+
+__all__ = ["FORMAT", "load_model", "read", "read_header", "save_model", "write"]
+
+FORMAT = 1
+_KEY = "neuprim"
+
+
+def write(path: Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
+    """Write tensors and a JSON header atomically; a full disk or a kill leaves the previous file untouched.
+
+    Raises:
+        CheckpointError: the file could not be written; names it and the reason.
+    """
+    text = json.dumps({"format": FORMAT, "kind": kind, **header}, allow_nan=False)
+    compact = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    try:
+        with atomic_path(path) as temporary:
+            save_file(compact, str(temporary), metadata={_KEY: text})
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(f"{path}: could not write the {kind}: {error}; the previous one, if any, is untouched") from error
+
+
+def read_header(path: Path, kind: str) -> dict[str, Any]:
+    """The JSON header of a file of this kind; reads no tensor.
+
+    Raises:
+        CheckpointError: missing, truncated, foreign or of another format version.
+    """
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            metadata = file.metadata() or {}
+    except FileNotFoundError:
+        raise CheckpointError(f"{path}: no such {kind}") from None
+    except (OSError, SafetensorError, ValueError) as error:
+        raise CheckpointError(f"{path}: not a readable {kind} (safetensors: {error}); the file is damaged or of another kind") from error
+    if _KEY not in metadata:
+        raise CheckpointError(f"{path}: no {_KEY!r} header found; expected a {kind} written by neuprim")
+    try:
+        header = json.loads(metadata[_KEY])
+    except (ValueError, RecursionError) as error:
+        raise CheckpointError(f"{path}: the {_KEY!r} header is not valid JSON ({error})") from error
+    if not isinstance(header, dict) or header.get("kind") != kind:
+        found = header.get("kind") if isinstance(header, dict) else type(header).__name__
+        raise CheckpointError(f"{path}: kind is {found!r}; expected {kind!r}")
+    if header.get("format") != FORMAT:
+        raise CheckpointError(f"{path}: format version is {header.get('format')!r}; this neuprim reads {FORMAT}")
+    return header
+
+
+def read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Header and tensors. Memory is bounded by the file's true size: a header that claims more is refused.
+
+    Raises:
+        CheckpointError: see :func:`read_header`.
+    """
+    header = read_header(path, kind)
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+    except (OSError, SafetensorError, ValueError) as error:
+        raise CheckpointError(f"{path}: tensors of the {kind} are unreadable: {error}") from error
+    return header, tensors
+
+
+def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any]) -> None:
+    """Write what rendering needs. ``extra`` (JSON-able) joins the header: background, colour space, data source."""
+    fields = {
+        kind: {"class": type(field).__name__, "settings": field.settings()}
+        for kind, field in (("density", model.density), ("colour", model.colour))
+    }
+    write(path, "model", model.params, {"task": task, "primitives": model.count, **fields, **extra})
+
+
+def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
+    """The model in ``path`` and its header.
+
+    Raises:
+        CheckpointError: damaged, written for another task, with fields this task does not have, or tensors that do not fit them.
+    """
+    header = read_header(path, "model")
+    if header.get("task") != task.name:
+        raise CheckpointError(f"{path}: written for task {header.get('task')!r}; expected {task.name!r}")
+    density, colour = (_field(path, header, task, kind) for kind in ("density", "colour"))
+    _, tensors = read(path, "model")
+    if not isinstance(density, DensityField) or not isinstance(colour, ColourField):
+        raise CheckpointError(f"{path}: density and colour fields are {type(density).__name__} and {type(colour).__name__}; expected one of each")
+    try:
+        model = Primitives(density, colour, tensors)
+    except (ValueError, KeyError) as error:
+        raise CheckpointError(f"{path}: {error}") from error
+    for name, value in tensors.items():
+        if value.dtype != torch.float32:
+            raise CheckpointError(f"{path}: {name} is {value.dtype}; expected torch.float32")
+        if not bool(torch.isfinite(value).all()):
+            raise CheckpointError(f"{path}: {name} has NaN or infinite values")
+    return model, header
+
+
+def _field(path: Path, header: Mapping[str, Any], task: TaskSpec, kind: str) -> Any:
+    entry = header.get(kind)
+    if not isinstance(entry, dict) or not isinstance(entry.get("class"), str) or not isinstance(entry.get("settings"), dict):
+        raise CheckpointError(f"{path}: header field {kind!r} is {entry!r}; expected {{'class': ..., 'settings': {{...}}}}")
+    known = task.fields or {}
+    if entry["class"] not in known:
+        raise CheckpointError(f"{path}: unknown {kind} field {entry['class']!r} for task {task.name!r}{nearest(entry['class'], known)}")
+    for name, value in entry["settings"].items():
+        if not isinstance(value, (int, float, str, bool, type(None), list)) or (isinstance(value, int) and abs(value) > 10_000):
+            raise CheckpointError(f"{path}: {kind} setting {name}={value!r} is not plausible")
+    try:
+        return known[entry["class"]](**entry["settings"])
+    except (TypeError, ValueError) as error:
+        raise CheckpointError(f"{path}: {kind} field {entry['class']!r} refused its settings {entry['settings']}: {error}") from error

@@ -1,0 +1,233 @@
+"""The training loop, for every task, in one sitting.
+
+A step: draw a view, render it, compare, go back, move the parameters, let the population react. Everything that shapes
+the next step is in :meth:`Trainer.state`, so that 2N steps equal N steps, a kill, a resume and N more, bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from neuprim.core.data import Dataset
+from neuprim.core.errors import CheckpointError, DataError, NonFiniteError
+from neuprim.core.fields import ColourField, DensityField
+from neuprim.core.primitives import Primitives
+from neuprim.core.render import RenderSettings, render
+from neuprim.core.schema import InitContext
+from neuprim.core.task import Loss
+from neuprim.core.train.losses import scale_anisotropy
+from neuprim.core.train.optimizer import RowAdam
+from neuprim.core.train.population import Change, make_population
+from neuprim.core.train.settings import ModelSettings, TrainSettings
+
+__all__ = ["StepReport", "Trainer", "initial_model"]
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What one step did. ``psnr`` is of the training view just seen; ``change`` says what the population did, if anything."""
+
+    step: int
+    seconds: float
+    loss: float
+    parts: dict[str, float]
+    psnr: float
+    primitives: int
+    view: str
+    change: str | None
+
+
+def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, settings: ModelSettings, seed: int) -> Primitives:
+    """Primitives on the data set's starting points, as large as their neighbours are far (RMS distance to the 3 nearest).
+
+    Raises:
+        DataError: the data set offers no starting point.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    cloud = dataset.initial_points(settings.primitives, generator)
+    if len(cloud.means) == 0:
+        raise DataError(f"{dataset.name}: no starting points found; expected points or images with visible content")
+    if len(cloud.means) == 1:
+        scales = torch.full((1,), 0.1 * dataset.extent)
+    else:
+        neighbours = min(3, len(cloud.means) - 1)
+        distance = torch.from_numpy(cKDTree(cloud.means.numpy()).query(cloud.means.numpy(), k=neighbours + 1)[0][:, 1:])
+        scales = distance.square().mean(dim=1).sqrt().clamp_min(1e-6 * dataset.extent).float()
+    scales = scales * float(settings.init.get("scale", 1.0))
+    return Primitives.initialise(density, colour, InitContext(cloud.means.float(), scales, cloud.colors.float(), generator, settings.init))
+
+
+class Trainer:
+    """Fits a model to the training views of a data set.
+
+    Attributes:
+        step, elapsed: steps done and seconds of training they took (held-out evaluations and file writes not counted).
+    """
+
+    def __init__(
+        self, model: Primitives, dataset: Dataset, loss: Loss, settings: TrainSettings, renderer: RenderSettings, seed: int
+    ) -> None:
+        if len(dataset.train) == 0:
+            raise DataError(f"{dataset.name}: the training split is empty")
+        self.model, self.dataset, self.loss = model, dataset, loss
+        self.settings, self.renderer = settings, replace(renderer, depth=False)
+        self.optimizer = RowAdam(model.specs, model.params)
+        self.population = make_population(settings.population)
+        self.generator = torch.Generator().manual_seed(seed + 1)
+        self.order = torch.empty(0, dtype=torch.int64)
+        self.step = 0
+        self.elapsed = 0.0
+        self._watch()
+
+    # ------------------------------------------------------------ the budget
+
+    @property
+    def progress(self) -> float:
+        """Used fraction of the budget: the larger of steps and seconds. Every schedule runs on it."""
+        done = self.step / self.settings.iterations if self.settings.iterations else 1.0
+        if self.settings.max_seconds is not None:
+            done = max(done, self.elapsed / self.settings.max_seconds)
+        return min(done, 1.0)
+
+    @property
+    def finished(self) -> bool:
+        return self.progress >= 1.0
+
+    def rates(self) -> dict[str, float]:
+        """Learning rate of every parameter now: warm-up, then exponential decay to ``final_rate`` at the end of the budget."""
+        s = self.settings
+        factor = s.final_rate**self.progress
+        if self.step < s.warmup_steps:
+            factor *= (self.step + 1) / s.warmup_steps
+        unit = {"absolute": 1.0, "extent": self.dataset.extent}
+        return {spec.name: s.rates.get(spec.name, spec.lr) * unit[spec.lr_unit] * factor for spec in self.model.specs}
+
+    # ------------------------------------------------------------ the loop
+
+    def run(self) -> Iterator[StepReport]:
+        """Step until the budget is used. Between two steps the state may be saved or the loop left."""
+        while not self.finished:
+            yield self.train_step()
+
+    def train_step(self) -> StepReport:
+        """One view, one update.
+
+        Raises:
+            NonFiniteError: a loss, gradient or parameter is NaN or infinite; nothing was updated by this step.
+        """
+        start = time.perf_counter()
+        model, progress = self.model, self.progress
+        model.density.set_progress(progress)
+        model.colour.set_progress(progress)
+        for value in model.params.values():
+            value.grad = None
+
+        index = self._next_view()
+        view, pixels = self.dataset.train.view(index), self.dataset.train.pixels(index)
+        background = self._background()
+        truth = pixels.over(background)
+        output = render(model, view.camera, view.conditions, self.renderer, background)
+        rgb = output.rgb if pixels.mask is None else torch.where(pixels.mask[..., None], output.rgb, truth)
+        loss, parts = self.loss(rgb, truth)
+        if self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from:
+            loss = loss + self.settings.anisotropy_weight * scale_anisotropy(model.params["log_scales"])
+        if not math.isfinite(loss.item()):
+            model.check_finite()
+            raise NonFiniteError(f"loss is {loss.item()} at step {self.step} on view {view.name}")
+        with torch.no_grad():
+            difference = rgb - truth
+            output.stats.pixel_error = difference.abs().mean(dim=-1)
+            mse = difference.square().mean().item()
+        loss.backward()
+
+        self.population.observe(model, output.stats)
+        self.optimizer.step(model.params, self.rates())
+        self.step += 1
+        change = None
+        if self.population.due(self.step, progress):
+            change = self.population.intervene(model, self.dataset.extent)
+            if change is not None:
+                self._apply(change)
+        self.elapsed += time.perf_counter() - start
+        psnr = -10 * math.log10(max(mse, 1e-20))
+        return StepReport(self.step, self.elapsed, loss.item(), parts, psnr, model.count, view.name, change.text if change else None)
+
+    def _next_view(self) -> int:
+        """Random order without replacement."""
+        if len(self.order) == 0:
+            self.order = torch.randperm(len(self.dataset.train), generator=self.generator)
+        index, self.order = int(self.order[0]), self.order[1:]
+        return index
+
+    def _background(self) -> Tensor:
+        choice, channels = self.settings.background, self.dataset.channels
+        if choice == "random" or (choice == "auto" and self.dataset.random_background):
+            return torch.rand(channels, generator=self.generator)
+        if choice == "auto":
+            return self.dataset.background.float()
+        return torch.full((channels,), 1.0 if choice == "white" else 0.0)
+
+    def _apply(self, change: Change) -> None:
+        self.model.params = {spec.name: change.params[spec.name].contiguous() for spec in self.model.specs}
+        self.optimizer.select(change.origin, change.fresh)
+        self._watch()
+
+    def _watch(self) -> None:
+        for name, value in self.model.params.items():
+            self.model.params[name] = value.detach().requires_grad_()
+
+    # ------------------------------------------------------------ exact state
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Tensors and JSON-able numbers from which :meth:`load_state` goes on exactly."""
+        tensors = {f"params.{k}": v.detach() for k, v in self.model.params.items()}
+        tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
+        tensors |= {f"population.{k}": v for k, v in self.population.state().items()}
+        tensors |= {"generator": self.generator.get_state(), "order": self.order}
+        return tensors, {"step": self.step, "elapsed": self.elapsed, "views": len(self.dataset.train)}
+
+    def load_state(self, tensors: dict[str, Tensor], header: dict[str, Any], where: str) -> None:
+        """Continue from :meth:`state`.
+
+        Raises:
+            CheckpointError: the state belongs to other settings or data; names what differs. The trainer is unchanged.
+        """
+
+        def part(prefix: str) -> dict[str, Tensor]:
+            return {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}
+
+        step, elapsed, views = header.get("step"), header.get("elapsed"), header.get("views")
+        if not isinstance(step, int) or not isinstance(elapsed, (int, float)) or step < 0 or not math.isfinite(elapsed):
+            raise CheckpointError(f"{where}: step {step!r}, elapsed {elapsed!r}; expected numbers")
+        if views != len(self.dataset.train):
+            raise CheckpointError(f"{where}: trained on {views} views, the data set now has {len(self.dataset.train)}")
+        try:
+            model = Primitives(self.model.density, self.model.colour, part("params."))
+            optimizer = RowAdam(model.specs, model.params)
+            optimizer.load_state(part("adam."))
+            for name, moments in (*optimizer.m.items(), *optimizer.v.items()):
+                if moments.shape != model.params[name].shape:
+                    raise ValueError(f"moments of {name} have shape {tuple(moments.shape)}")
+            if optimizer.age.shape != (model.count,):
+                raise ValueError(f"ages have shape {tuple(optimizer.age.shape)}")
+            order = tensors["order"]
+            if order.dim() != 1 or (len(order) and (int(order.min()) < 0 or int(order.max()) >= views)):
+                raise ValueError("the order of views is out of range")
+            generator = torch.Generator()
+            generator.set_state(tensors["generator"])
+            population = part("population.")
+        except (ValueError, KeyError, RuntimeError, TypeError) as error:
+            raise CheckpointError(f"{where}: does not fit this run's settings ({error})") from error
+        self.model.params = model.params
+        self.optimizer, self.order, self.generator = optimizer, order.clone(), generator
+        self.population.load_state(population)
+        self.step, self.elapsed = step, float(elapsed)
+        self._watch()

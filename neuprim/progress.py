@@ -1,0 +1,76 @@
+"""What a run shows while it works: a bar with ETA, PSNR and primitive count on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from neuprim.core.train.trainer import StepReport
+
+__all__ = ["RunProgress"]
+
+
+class RunProgress:
+    """Context manager around one run."""
+
+    def __init__(self, console: Console, title: str) -> None:
+        self.console, self.title = console, title
+        self.live = console.is_terminal
+        self.bar = Progress(
+            TextColumn("[bold]{task.description}"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f}%"),
+            TimeElapsedColumn(),
+            TextColumn("eta"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[info]}"),
+            console=console,
+            disable=not self.live,
+        )
+        self.task: TaskID = self.bar.add_task(title, total=1.0, info="")
+        self._stage = ""
+        self._printed = -1.0
+        self._smooth: float | None = None
+        self._held_out = ""
+
+    def __enter__(self) -> RunProgress:
+        self.bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.bar.stop()
+
+    def note(self, text: str) -> None:
+        """A line that stays."""
+        self.console.print(f"{self.title}: {text}", highlight=False)
+
+    def preparing(self, text: str, fraction: float) -> None:
+        """Work before the training loop."""
+        self.bar.update(self.task, description=self.title, completed=fraction, info=text)
+        if not self.live and text != self._stage:
+            self.note(text)
+        self._stage = text
+
+    def step(self, report: StepReport, progress: float) -> None:
+        """One training step."""
+        self._smooth = report.psnr if self._smooth is None else 0.98 * self._smooth + 0.02 * report.psnr
+        if self._stage != "training":
+            self._stage = "training"
+            self.bar.reset(self.task)
+        info = f"step {report.step}  train {self._smooth:.2f} dB{self._held_out}  {report.primitives} primitives"
+        self.bar.update(self.task, completed=progress, info=info)
+        if not self.live and progress >= self._printed + 0.1:
+            self._printed = progress
+            self.note(f"{progress:4.0%}  {report.seconds:6.1f} s  {info}")
+
+    def held_out(self, psnr: float) -> None:
+        """A new point of the held-out curve."""
+        self._held_out = f"  held-out {psnr:.2f} dB"
+
+    def finishing(self, text: str) -> None:
+        """Work after the training loop."""
+        self.bar.update(self.task, completed=1.0, info=text)
+        if not self.live:
+            self.note(text)

@@ -1,0 +1,208 @@
+"""One run: data, model, training, evaluation, pictures, report, all in one directory."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+from rich.console import Console
+
+from neuprim.config import RunConfig
+from neuprim.core import checkpoint, images
+from neuprim.core.data import Dataset, View
+from neuprim.core.errors import DataError
+from neuprim.core.files import write_json, write_text
+from neuprim.core.primitives import Primitives
+from neuprim.core.train.trainer import Trainer, initial_model
+from neuprim.evaluate import display, draw, load_dataset, measure, summary
+from neuprim.plugins.registry import load_task
+from neuprim.progress import RunProgress
+from neuprim.report import error_map, write_report
+
+__all__ = ["run"]
+
+_CURVE_VIEWS = 5  # held-out views behind the curve's eval_psnr
+_SHOWN_VIEWS = 8  # held-out views in renders/ and the report
+_ORBIT_FRAMES = 36
+
+
+def run(config: RunConfig, console: Console | None = None) -> Path:
+    """Fit, measure and report; returns the run directory.
+
+    Ctrl-C finishes the step, writes a checkpoint and a report, and raises KeyboardInterrupt; a second one stops at once.
+
+    Raises:
+        NeuprimError: the input's fault, or numbers that left the finite; whatever was on disk before is intact.
+    """
+    console = console or Console(stderr=True)
+    task = load_task(config.task)
+    directory = config.output_dir
+    with RunProgress(console, f"{config.task}/{config.scene_name}") as progress:
+        dataset = load_dataset(config, task, progress.preparing)
+        if len(dataset.test) == 0:
+            raise DataError(f"{dataset.name}: the test split is empty")
+        density, colour = task.build(vars(config.model), dataset)
+        progress.preparing("starting points", 0.0)
+        model = initial_model(density, colour, dataset, config.model, config.seed)
+        trainer = Trainer(model, dataset, task.loss(vars(config.train)), config.train, config.renderer, config.seed)
+        saved = directory / "checkpoint.safetensors"
+        if config.resume and saved.exists():
+            header, tensors = checkpoint.read(saved, "checkpoint")
+            trainer.load_state(tensors, header, str(saved))
+            progress.note(f"resumed at step {trainer.step}")
+        directory.mkdir(parents=True, exist_ok=True)
+        write_text(directory / "config.yaml", config.to_yaml())
+        interrupted = _train(trainer, config, dataset, progress)
+        progress.finishing("measuring held-out views")
+        _finish(trainer, config, dataset, directory)
+    if interrupted:
+        raise KeyboardInterrupt
+    return directory
+
+
+def _train(trainer: Trainer, config: RunConfig, dataset: Dataset, progress: RunProgress) -> bool:
+    """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
+    directory = config.output_dir
+    _warm_up(trainer, progress)
+    curve = _open_curve(directory / "metrics.jsonl", trainer.step)
+    last_saved, next_eval = time.monotonic(), _next_evaluation(trainer)
+    interrupted = False
+    with _interruptible() as stop, curve:
+        for report in trainer.run():
+            progress.step(report, trainer.progress)
+            line: dict[str, Any] = {}
+            if trainer.progress >= next_eval:
+                line["eval_psnr"] = _curve_psnr(trainer)
+                progress.held_out(line["eval_psnr"])
+                next_eval = _next_evaluation(trainer)
+            if report.change:
+                line["change"] = report.change
+            if line or report.step % config.train.log_every == 0 or trainer.finished:
+                line = {"step": report.step, "seconds": round(report.seconds, 4), "loss": report.loss, **report.parts, "psnr": report.psnr, "primitives": report.primitives, **line}  # fmt: skip
+                curve.write(json.dumps(line) + "\n")
+                curve.flush()
+            if time.monotonic() - last_saved > config.train.checkpoint_every_seconds:
+                _save(trainer, config, dataset)
+                last_saved = time.monotonic()
+            if stop.is_set():
+                interrupted = True
+                break
+    _save(trainer, config, dataset)
+    return interrupted
+
+
+def _save(trainer: Trainer, config: RunConfig, dataset: Dataset) -> None:
+    tensors, header = trainer.state()
+    checkpoint.write(config.output_dir / "checkpoint.safetensors", "checkpoint", tensors, {"task": config.task, **header})
+    extra = {
+        "background": [float(x) for x in dataset.background],
+        "color_space": dataset.color_space,
+        "data_source": dataset.data_source,
+        "iterations": trainer.step,
+        "train_seconds": trainer.elapsed,
+    }
+    checkpoint.save_model(config.output_dir / "model.safetensors", trainer.model, config.task, extra)
+
+
+def _finish(trainer: Trainer, config: RunConfig, dataset: Dataset, directory: Path) -> None:
+    """Metrics, pictures and report of the last checkpoint, from the same tensors that lie on disk."""
+    model = trainer.model
+    for field in (model.density, model.colour):
+        field.set_progress(1.0)
+    count = len(dataset.test)
+    shown = {round(i * (count - 1) / max(min(count, _SHOWN_VIEWS) - 1, 1)) for i in range(min(count, _SHOWN_VIEWS))}
+    folder = directory / "renders"
+    folder.mkdir(exist_ok=True)
+
+    def keep(index: int, view: View, rendered: torch.Tensor, truth: torch.Tensor) -> None:
+        if index in shown:
+            stem = f"test_{index:03d}_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in view.name)
+            images.write_png(folder / f"{stem}.png", display(rendered, dataset.color_space))
+            images.write_png(folder / f"{stem}_truth.png", display(truth, dataset.color_space))
+            images.write_png(folder / f"{stem}_error.png", torch.from_numpy(error_map(rendered, truth)))
+
+    views = measure(model, dataset.test, config.renderer, dataset.background, keep)
+    size = (directory / "model.safetensors").stat().st_size
+    training = {"iterations": trainer.step, "train_seconds": trainer.elapsed}
+    write_json(directory / "metrics.json", summary(config, model, dataset, views, size, training))
+    frames = [display(draw(model, v, config.renderer, dataset.background), dataset.color_space) for v in dataset.orbit(_ORBIT_FRAMES)]
+    images.write_animation(folder / "orbit.webp", frames, fps=12.0)
+    write_report(directory)
+
+
+# ---------------------------------------------------------------- the curve
+
+
+def _open_curve(path: Path, step: int) -> Any:
+    """metrics.jsonl, cut back to what the checkpoint knows."""
+    kept = []
+    if step and path.exists():
+        for text in path.read_text(encoding="utf-8").splitlines():
+            try:
+                if json.loads(text)["step"] <= step:
+                    kept.append(text)
+            except (ValueError, KeyError, TypeError):
+                continue  # a line that a kill cut short
+    write_text(path, "".join(f"{text}\n" for text in kept))
+    return open(path, "a", encoding="utf-8")  # noqa: SIM115 - the caller closes it
+
+
+def _next_evaluation(trainer: Trainer) -> float:
+    every = trainer.settings.eval_every
+    return (int(trainer.progress / every + 1e-9) + 1) * every if every > 0 else float("inf")
+
+
+def _curve_psnr(trainer: Trainer) -> float:
+    """Mean PSNR of a few held-out views; does not touch the training state."""
+    views = trainer.dataset.test
+    picks = sorted({i * len(views) // _CURVE_VIEWS for i in range(_CURVE_VIEWS)})
+    total = 0.0
+    for i in picks:
+        truth = views.pixels(i).over(trainer.dataset.background)
+        rendered = draw(trainer.model, views.view(i), trainer.renderer, trainer.dataset.background)
+        total += -10 * torch.log10((rendered - truth).square().mean().clamp_min(1e-20)).item()
+    return total / len(picks)
+
+
+# ---------------------------------------------------------------- before and around the loop
+
+
+def _warm_up(trainer: Trainer, progress: RunProgress) -> None:
+    """Compile the kernels outside the training clock: one throw-away step on a copy of a few primitives."""
+    from neuprim.core.render.cpu.compile import cache_directory as kernels
+
+    if not any(kernels().rglob("*.nbc")):
+        progress.preparing("compiling kernels, once per installation (about a minute)", 0.0)
+    model = trainer.model
+    rows = torch.arange(min(4, model.count))
+    few = Primitives(model.density, model.colour, model.rows(rows))
+    Trainer(few, trainer.dataset, trainer.loss, trainer.settings, trainer.renderer, 0).train_step()
+
+
+@contextmanager
+def _interruptible() -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets; the second interrupts at once. Outside the main thread Ctrl-C is not ours."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    previous = signal.getsignal(signal.SIGINT)
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    signal.signal(signal.SIGINT, handler)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, previous)

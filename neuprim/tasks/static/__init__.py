@@ -1,0 +1,63 @@
+"""The static task: a scene that does not change, from posed images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from neuprim.core.cosine import CosineDensity
+from neuprim.core.data import Dataset
+from neuprim.core.fields import ColourField, DensityField
+from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
+from neuprim.core.train.losses import photometric
+from neuprim.tasks.static.fields import SphericalHarmonics
+
+__all__ = ["TASK"]
+
+
+def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
+    return CosineDensity(model["neurons"]), SphericalHarmonics(model["sh_degree"], dataset.channels, model["sh_every"])
+
+
+# Loaders are imported when used: each pulls in a library of its own.
+
+
+def _solids(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    from neuprim.tasks.static.solids import load
+
+    return load(settings, context)
+
+
+def _blender(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    from neuprim.tasks.static.datasets.blender import load
+
+    return load(settings, context)
+
+
+def _nerfstudio(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    from neuprim.tasks.static.datasets.nerfstudio import load
+
+    return load(settings, context)
+
+
+def _colmap(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    from neuprim.tasks.static.datasets.colmap import load
+
+    return load(settings, context)
+
+
+TASK = TaskSpec(
+    api=API_VERSION,
+    name="static",
+    summary="A scene that does not change, from posed images (spherical-harmonics colour)",
+    config_package="neuprim.tasks.static.conf",
+    scenes=(
+        SceneSpec("solids", "built in: sharp edges, thin rods, a curved handle; generated in seconds", _solids),
+        SceneSpec("blender", "NeRF-synthetic layout: transforms_train.json, RGBA images", _blender),
+        SceneSpec("nerfstudio", "instant-ngp / nerfstudio transforms.json", _nerfstudio),
+        SceneSpec("colmap", "COLMAP sparse/0 and images (needs neuprim[colmap])", _colmap),
+    ),
+    build=_build,
+    loss=photometric,
+    fields={"CosineDensity": CosineDensity, "SphericalHarmonics": SphericalHarmonics},
+)

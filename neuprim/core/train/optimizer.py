@@ -33,17 +33,26 @@ def adam_step_reference(value: Tensor, grad: Tensor, m: Tensor, v: Tensor, rate:
 
 
 @exact_kernel
-def _adam_rows(start, stop, value, grad, m, v, step, root):  # type: ignore[no-untyped-def]
-    """The same on float32 rows; step = rate / c1 and root = sqrt(1 / c2) per row."""
+def _adam_rows(start, stop, width, value, grad, m, v, step, root):  # type: ignore[no-untyped-def]
+    """The same on flat float32 arrays of ``width`` numbers per row; step = rate / c1 and root = sqrt(1 / c2) per row.
+
+    Rows of one age stand together nearly everywhere, so they are taken in runs: long loops that vectorise.
+    """
     one, b1, b2, eps = np.float32(1), np.float32(BETA1), np.float32(BETA2), np.float32(EPS)
-    for i in range(start, stop):
+    i = start
+    while i < stop:
+        j = i + 1
+        while j < stop and step[j] == step[i]:
+            j += 1
         a, r = step[i], root[i]
-        x, g, mi, vi = value[i], grad[i], m[i], v[i]
-        for j in range(x.shape[0]):
-            mj = b1 * mi[j] + (one - b1) * g[j]
-            vj = b2 * vi[j] + (one - b2) * g[j] * g[j]
-            mi[j], vi[j] = mj, vj
-            x[j] -= a * mj / (np.sqrt(vj) * r + eps)
+        x, g, mi, vi = value[i * width : j * width], grad[i * width : j * width], m[i * width : j * width], v[i * width : j * width]
+        for k in range(x.shape[0]):
+            mk = b1 * mi[k] + (one - b1) * g[k]
+            vk = b2 * vi[k] + (one - b2) * g[k] * g[k]
+            mi[k] = mk
+            vi[k] = vk
+            x[k] -= a * mk / (np.sqrt(vk) * r + eps)
+        i = j
 
 
 class RowAdam:
@@ -74,20 +83,18 @@ class RowAdam:
                     row = int(bad.nonzero()[0])
                     raise NonFiniteError(f"gradient of {name} of primitive {row} is not finite: {grad[row].flatten()[:8].tolist()}")
         self.age += 1
-        # rows live long: the powers vanish after some thousand steps, so float64 here costs nothing
-        age = self.age.double()
+        age = self.age.numpy().astype(np.float64)
         c1, c2 = 1 - BETA1**age, 1 - BETA2**age
+        root = np.sqrt(1 / c2).astype(np.float32)
         with torch.no_grad():
             for spec in self.specs:
                 value, grad = params[spec.name], grads[spec.name]
                 if grad is None or value.numel() == 0:
                     continue
                 if value.device.type == "cpu" and value.dtype == torch.float32:
-                    n = value.shape[0]
-                    step = (rates[spec.name] / c1).float().numpy()
-                    root = c2.rsqrt().float().numpy()
-                    arrays = [x.detach().reshape(n, -1).numpy() for x in (value, grad.contiguous(), self.m[spec.name], self.v[spec.name])]
-                    parallel_for(_adam_rows, n, 4096, 0, *arrays, step, root)
+                    step = (rates[spec.name] / c1).astype(np.float32)
+                    arrays = [x.detach().reshape(-1).numpy() for x in (value, grad.contiguous(), self.m[spec.name], self.v[spec.name])]
+                    parallel_for(_adam_rows, value.shape[0], 4096, 0, spec.size, *arrays, step, root)
                 else:
                     adam_step_reference(value, grad, self.m[spec.name], self.v[spec.name], rates[spec.name], self.age)
 

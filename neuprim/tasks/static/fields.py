@@ -40,7 +40,12 @@ class SphericalHarmonics(ColourField):
         return specs
 
     def lower(self, params: Params, geometry: Geometry, camera: Camera, conditions: Conditions) -> Constant:
-        color = params["sh_dc"] * sh.C0 + 0.5
+        dc = params["sh_dc"]
+        if self.active and dc.device.type == "cpu" and dc.dtype == geometry.means.dtype == torch.float32:
+            from neuprim.core.sh_cpu import fused_colors  # numba, loaded when first needed
+
+            return Constant(fused_colors(geometry.means, dc, params["sh_rest"], camera.position, self.active))
+        color = dc * sh.C0 + 0.5
         if self.active:
             offset = geometry.means - camera.position.to(geometry.means)
             direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-30)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -67,14 +68,18 @@ def _array(tensor: Tensor) -> Array:
     return np.ascontiguousarray(tensor.detach().numpy())
 
 
-def _norms(camera: Camera) -> Array:
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+@lru_cache(maxsize=4)
+def _norms(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Array:
+    """(H, W) length of each pixel's ray direction whose camera-z is 1."""
+    x = (np.arange(width) + 0.5 - cx) / fx
+    y = (np.arange(height) + 0.5 - cy) / fy
     result: Array = np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2).astype(np.float32)
     return result
 
 
-def _prepare(tensors: dict[str, Array], camera: Camera, view: Array, omega0: float, background: Array, settings: RenderSettings, stats: RenderStats) -> _Frame:
+def _prepare(
+    tensors: dict[str, Array], camera: Camera, view: Array, omega0: float, background: Array, settings: RenderSettings, stats: RenderStats
+) -> _Frame:
     count, K = tensors["W1"].shape[:2]
     neurons = K + K % 2  # the backward kernel takes neurons in pairs; a padded one has amplitude 0
     rows = np.empty((count, row_width(neurons)), np.float32)
@@ -94,7 +99,23 @@ def _prepare(tensors: dict[str, Array], camera: Camera, view: Array, omega0: flo
     lists = bin_primitives(rows, spans, boxes, depth, status, camera.width, camera.height, settings.threads)
     stats.pairs = lists.pairs
     limits = np.array([settings.alpha_min, settings.alpha_max, settings.transmittance_min, settings.depth_floor], np.float32)
-    return _Frame(camera, settings, omega0, background, stats, R, t, neurons, rows, spans, simple, boxes, _norms(camera), limits, lists)
+    return _Frame(
+        camera,
+        settings,
+        omega0,
+        background,
+        stats,
+        R,
+        t,
+        neurons,
+        rows,
+        spans,
+        simple,
+        boxes,
+        _norms(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy),
+        limits,
+        lists,
+    )
 
 
 def _non_finite(tensors: dict[str, Array], row: int) -> NonFiniteError:
@@ -156,7 +177,18 @@ class _Rasterize(torch.autograd.Function):
         )  # fmt: skip
         frame.stats.extra["backward_lanes"] = sum(lanes)
         grads, touched = np.empty((count, width), np.float32), np.empty(count, np.bool_)
-        parallel_for(sum_rows, count, _PRIMITIVES_PER_CHUNK, s.threads, frame.lists.order, frame.lists.first, frame.lists.slots, pair_rows, grads, touched)
+        parallel_for(
+            sum_rows,
+            count,
+            _PRIMITIVES_PER_CHUNK,
+            s.threads,
+            frame.lists.order,
+            frame.lists.first,
+            frame.lists.slots,
+            pair_rows,
+            grads,
+            touched,
+        )
         out = [np.zeros(t[n].shape, np.float32) for n in ("means", "log_scales", "quats", "W1", "b1", "w2")]
         g_b2 = np.zeros(count, np.float32)
         want_view = bool(ctx.needs_input_grad[8])

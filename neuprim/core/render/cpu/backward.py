@@ -10,10 +10,11 @@ import numpy as np
 
 from neuprim.core.render.cpu.compile import exact_kernel, inline, kernel
 from neuprim.core.render.cpu.layout import (
+    ALPHA,
     AMPLITUDE,
-    B_LAST,
-    B_NORM,
+    ANCHOR_Z,
     BACKWARD_SCRATCH,
+    BEHIND,
     DH,
     DU,
     DV,
@@ -41,6 +42,7 @@ from neuprim.core.render.cpu.layout import (
     GZ,
     HALF,
     IA,
+    LAST,
     MID,
     MX,
     MY,
@@ -50,21 +52,23 @@ from neuprim.core.render.cpu.layout import (
     N_SIN,
     NEURON_SCRATCH,
     NEURONS,
+    NORM,
+    NORM_L,
     OFFSET,
+    OVER,
     PER_NEURON,
     PHASE,
     PIXELS,
     QX,
     QY,
     QZ,
-    S_,
+    SLOPE,
     T_,
     TC,
     TILE,
     TM,
     UNCUT,
     UNIT,
-    ANCHOR_Z,
     UX,
     UY,
     WX,
@@ -82,26 +86,41 @@ _STEPS = np.arange(TILE).astype(np.float32)
 
 
 @inline
-def _neuron_simple(S, V, n, wx, wy, wz, phase, amplitude):  # type: ignore[no-untyped-def]
-    """Forward value, and the three products the gradients need, for a rate below half a turn per half chord."""
+def _neurons_simple(S, V0, V1, n, p, o):  # type: ignore[no-untyped-def]
+    """Forward value of two neurons, and the three products of each that the gradients need; rates below half a turn per half chord."""
+    ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
+    o2 = o + PER_NEURON
+    bx, by, bz, bb, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + PHASE], p[o2 + AMPLITUDE]
     for k in range(n):
-        v = (S[EXL + k] * wx + S[EYL + k] * wy + S[EZL + k] * wz) * S[HALF + k]
-        u = S[QX + k] * wx + S[QY + k] * wy + S[QZ + k] * wz + phase
+        half = S[HALF + k]
+        ex, ey, ez = S[EXL + k], S[EYL + k], S[EZL + k]
+        qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
+        v = (ex * ax + ey * ay + ez * az) * half
+        u = qx * ax + qy * ay + qz * az + ab
         r = u - np.rint(u)
         z, zv = r * r, v * v
         c, si = cos_turns(z), sinc_turns(zv)
-        V[N_COS + k] = c * si
-        V[N_SIN + k] = -TAU * TAU * r * sinc_turns(z) * si
-        V[N_DSINC + k] = c * dsinc_turns(zv) * f(2) * v
-        S[FIELD + k] += c * si * amplitude
+        V0[N_COS + k] = c * si
+        V0[N_SIN + k] = -TAU * TAU * r * sinc_turns(z) * si
+        V0[N_DSINC + k] = c * dsinc_turns(zv) * f(2) * v
+        v1 = (ex * bx + ey * by + ez * bz) * half
+        u1 = qx * bx + qy * by + qz * bz + bb
+        r1 = u1 - np.rint(u1)
+        z1, zv1 = r1 * r1, v1 * v1
+        c1, si1 = cos_turns(z1), sinc_turns(zv1)
+        V1[N_COS + k] = c1 * si1
+        V1[N_SIN + k] = -TAU * TAU * r1 * sinc_turns(z1) * si1
+        V1[N_DSINC + k] = c1 * dsinc_turns(zv1) * f(2) * v1
+        S[FIELD + k] += c * si * aa + c1 * si1 * ba
 
 
 @inline
-def _neuron(S, V, n, wx, wy, wz, phase, amplitude):  # type: ignore[no-untyped-def]
-    """The same for any rate; d sinc/dv = (cos - sinc)/v beyond half a turn."""
+def _neuron(S, V, n, p, o):  # type: ignore[no-untyped-def]
+    """One neuron of any rate; d sinc/dv = (cos - sinc)/v beyond half a turn."""
+    ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
     for k in range(n):
-        v = (S[EXL + k] * wx + S[EYL + k] * wy + S[EZL + k] * wz) * S[HALF + k]
-        u = S[QX + k] * wx + S[QY + k] * wy + S[QZ + k] * wz + phase
+        v = (S[EXL + k] * ax + S[EYL + k] * ay + S[EZL + k] * az) * S[HALF + k]
+        u = S[QX + k] * ax + S[QY + k] * ay + S[QZ + k] * az + ab
         r = u - np.rint(u)
         z = r * r
         turns = np.rint(v)
@@ -116,51 +135,87 @@ def _neuron(S, V, n, wx, wy, wz, phase, amplitude):  # type: ignore[no-untyped-d
         V[N_COS + k] = c * si
         V[N_SIN + k] = -TAU * TAU * r * sinc_turns(z) * si
         V[N_DSINC + k] = c * ds
-        S[FIELD + k] += c * si * amplitude
+        S[FIELD + k] += c * si * aa
 
 
 @inline
-def _uncomposite_row(state, tau, grad, cg, w, base, at, a, b, amin, amax, rank):  # type: ignore[no-untyped-def]
-    """One pixel row: recover T before this primitive, dL/d(optical depth), and the weights.
-
-    ``cg`` holds sum_c color_c dL/drgb_c (+ z dL/dz) on entry. S accumulates what lies behind: dL/dT_after x T_after.
-    """
-    st = state[base:]
-    tr, gr = tau[at : at + TILE], grad[at : at + TILE]
-    a, b = f(a), f(b)
-    sw, se = f(0), f(0)
-    for k in range(TILE):
-        step = _STEPS[k]
-        norm = st[k + B_NORM]
-        depth = tr[k] * norm
+def _opacity(S, n, amin, amax):  # type: ignore[no-untyped-def]
+    """ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF) of every lane, with exactly the forward pass's clamp and cut."""
+    for k in range(n):
+        norm = S[NORM_L + k]
+        depth = S[FIELD + k] * S[HALF + k] * norm * f(2)
         raw = one_minus_exp(depth)
         alpha = min(raw, amax)
-        inside = (step >= a) & (step < b)
-        use = inside & (alpha >= amin) & (depth > f(0)) & (st[k + B_LAST] >= rank)
-        T, behind = st[k + T_], st[k + S_]
-        over = f(1) / (f(1) - alpha)
-        before = T * over
-        weight = alpha * before if use else f(0)
-        w[k] = weight
-        g_alpha = before * cg[k] - behind * over
-        st[k + S_] = behind + weight * cg[k]
-        st[k + T_] = before if use else T
-        g = g_alpha * (f(1) - raw) * norm
-        g = g if use & (raw < amax) else f(0)
-        gr[k] = g if inside else gr[k]
-        sw += weight
-        se += weight * st[k + ERR]
-    return sw, se
+        alpha = alpha if alpha >= amin else f(0)
+        alpha = alpha if depth > f(0) else f(0)
+        slope = (f(1) - raw) * norm
+        slope = slope if raw < amax else f(0)
+        S[ALPHA + k], S[OVER + k] = alpha, f(1) / (f(1) - alpha)
+        S[SLOPE + k] = slope if alpha > f(0) else f(0)
 
 
 @inline
-def _field_gradient(S, grad, n, out):  # type: ignore[no-untyped-def]
-    """From dL/d tau (per unit |d|) to dL/d FIELD, and the sums for b2 and log m."""
+def _uncomposite_row(st, lanes, cg, w, a, b, rank):  # type: ignore[no-untyped-def]
+    """One pixel row: recover T before this primitive; weights and dL/d(2 FIELD HALF).
+
+    ``cg`` holds sum_c color_c dL/drgb_c (+ z dL/dz). ``lanes`` starts at ALPHA of the row's first pixel.
+    """
+    a, b = f(a), f(b)
+    for k in range(TILE):
+        step, alpha = _STEPS[k], lanes[k]
+        inside = (step >= a) & (step < b)
+        use = inside & (alpha > f(0)) & (st[k + LAST] >= rank)
+        alpha = alpha if use else f(0)
+        over = lanes[k + OVER - ALPHA] if use else f(1)
+        behind = st[k + BEHIND]
+        before = st[k + T_] * over
+        weight = alpha * before
+        g = (before * cg[k] - behind * over) * lanes[k + SLOPE - ALPHA]
+        w[k] = weight
+        st[k + BEHIND] = behind + weight * cg[k]
+        st[k + T_] = before
+        g = g if use else f(0)
+        lanes[k + GRAD - ALPHA] = g if inside else lanes[k + GRAD - ALPHA]
+
+
+@inline
+def _color_dot(st, cg, c0, c1, c2):  # type: ignore[no-untyped-def]
+    for k in range(TILE):
+        cg[k] = st[k] * c0 + st[k + PIXELS] * c1 + st[k + 2 * PIXELS] * c2
+
+
+@inline
+def _tally(st, w, sums):  # type: ignore[no-untyped-def]
+    """Add w and w x error of one row to 16-wide sums; they are reduced once per pair."""
+    for k in range(TILE):
+        sums[k] += w[k]
+        sums[k + TILE] += w[k] * st[k + ERR]
+
+
+@inline
+def _tally_color(st, w, sums):  # type: ignore[no-untyped-def]
+    for k in range(TILE):
+        sums[k + 2 * TILE] += w[k] * st[k]
+        sums[k + 3 * TILE] += w[k] * st[k + PIXELS]
+        sums[k + 4 * TILE] += w[k] * st[k + 2 * PIXELS]
+
+
+@inline
+def _total(sums, first):  # type: ignore[no-untyped-def]
+    total = f(0)
+    for k in range(TILE):
+        total += sums[first + k]
+    return total
+
+
+@inline
+def _field_gradient(S, n, out):  # type: ignore[no-untyped-def]
+    """From dL/d(2 FIELD HALF) to dL/d FIELD, and the sums for b2 and log m."""
     offset, log_m = f(0), f(0)
     for k in range(n):
-        g, half = grad[TILE + k], S[HALF + k]
-        gf = f(2) * g * half
-        S[GRAD + k], S[GF + k] = f(2) * g, gf
+        g = f(2) * S[GRAD + k]
+        gf = g * S[HALF + k]
+        S[GRAD + k], S[GF + k] = g, gf
         offset += gf
         log_m += gf * S[FIELD + k]
         S[GQX + k], S[GQY + k], S[GQZ + k] = f(0), f(0), f(0)
@@ -267,30 +322,31 @@ def backward_tiles(  # type: ignore[no-untyped-def]
     amin, amax, floor = limits[0], limits[1], limits[3]
     S = np.zeros(BACKWARD_SCRATCH + 1024, np.float32)
     V = np.zeros((neurons, NEURON_SCRATCH), np.float32)
-    state = np.zeros((6 + C) * PIXELS + TILE, np.float32)
-    tau, grad = np.zeros(PIXELS + 4 * TILE, np.float32), np.zeros(PIXELS + 4 * TILE, np.float32)
-    w, cg = np.zeros(TILE, np.float32), np.zeros(TILE, np.float32)
+    state = np.zeros((6 + C) * PIXELS + 2 * TILE, np.float32)
+    w, cg, sums = np.zeros(TILE, np.float32), np.zeros(TILE, np.float32), np.zeros((2 + C) * TILE, np.float32)
     left, right, offset = np.zeros(TILE, np.int32), np.zeros(TILE, np.int32), np.zeros(TILE, np.int32)
-    rows_live = np.zeros(TILE, np.float32)
-    lanes = 0
+    rows_live, reach = np.zeros(TILE, np.float32), np.zeros(TILE, np.float32)
+    evaluated = 0
     for t in range(start, stop):
         tx, ty = (t % across) * TILE, (t // across) * TILE
         state[:] = f(0)
         deepest = 0
         for y in range(TILE):
+            reach[y] = f(0)
             for x in range(TILE):
                 j, Y, X = y * TILE + x, ty + y, tx + x
                 state[j + T_] = f(1)
                 if X < width and Y < height:
                     T = transmittance[Y, X]
-                    state[j + T_], state[j + B_NORM] = T, norms[Y, X]
-                    state[j + S_] = T * g_transmittance[Y, X]
-                    state[j + B_LAST], state[j + ERR] = f(last[Y, X]), error[Y, X]
+                    state[j + T_], state[j + NORM] = T, norms[Y, X]
+                    state[j + BEHIND] = T * g_transmittance[Y, X]
+                    state[j + LAST], state[j + ERR] = f(last[Y, X]), error[Y, X]
                     if with_depth:
                         state[j + GZ] = g_z[Y, X]
                     for c in range(C):
                         state[j + G_COLOR + c * PIXELS] = g_rgb[Y, X, c]
                     deepest = max(deepest, last[Y, X])
+                    reach[y] = max(reach[y], f(last[Y, X]))
         first = starts[t]
         for q in range(first + deepest, starts[t + 1]):
             pair_rows[q, :] = f(0)
@@ -304,63 +360,64 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             fx0, fy0 = f(tx) + f(0.5) - p[UX], f(ty) + f(0.5) - p[UY]
             row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, left, right)
             for y in range(y0, y1):
-                reach = f(0)
-                for k in range(TILE):
-                    reach = max(reach, state[B_LAST + y * TILE + k])
-                rows_live[y] = f(1) if reach >= rank else f(0)
-            n = compact(S, offset, left, right, y0, y1, rows_live, fx0, fy0)
+                rows_live[y] = f(1) if reach[y] >= rank else f(0)
+            n = compact(S, state, offset, left, right, y0, y1, rows_live, fx0, fy0)
             out[:] = f(0)
             if n == 0:
                 continue
             n16 = ((n + 15) // 16) * 16
-            lanes += n16
+            evaluated += n16
             chords(S, n16, p, floor, True)
-            for m in range(neurons):
+            for m in range(0, neurons, 2):
                 o = NEURONS + PER_NEURON * m
-                if simple[i, m]:
-                    _neuron_simple(S, V[m], n16, p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE])
+                if simple[i, m] and simple[i, m + 1]:
+                    _neurons_simple(S, V[m], V[m + 1], n16, p, o)
                 else:
-                    _neuron(S, V[m], n16, p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE])
-            for k in range(n16):
-                tau[TILE + k] = S[k + FIELD] * S[k + HALF] * f(2)
+                    _neuron(S, V[m], n16, p, o)
+                    _neuron(S, V[m + 1], n16, p, o + PER_NEURON)
+            _opacity(S, n16, amin, amax)
             for k in range(n, n16):
-                grad[TILE + k] = f(0)
+                S[GRAD + k] = f(0)
             for k in range(n16):
                 S[GMID + k] = f(0)
-            weight, weighted_error = f(0), f(0)
+            sums[:] = f(0)
             for y in range(y0, y1):
                 a, b = left[y], right[y]
                 if b > a:
                     at = offset[y] - a
-                    for k in range(TILE):
-                        cg[k] = f(0)
-                    for c in range(C):
-                        st, color = state[G_COLOR + c * PIXELS + y * TILE :], colors[i, c]
-                        for k in range(TILE):
-                            cg[k] += color * st[k]
+                    if C == 3:
+                        _color_dot(state[G_COLOR + y * TILE :], cg, colors[i, 0], colors[i, 1], colors[i, 2])
+                    else:
+                        cg[:] = f(0)
+                        for c in range(C):
+                            st, color = state[G_COLOR + c * PIXELS + y * TILE :], colors[i, c]
+                            for k in range(TILE):
+                                cg[k] += color * st[k]
                     if with_depth:
                         st = state[GZ + y * TILE :]
                         for k in range(a, b):
                             cg[k] += st[k] * (p[ANCHOR_Z] + p[UNIT] * S[MID + at + k])
-                    sw, se = _uncomposite_row(state, tau, grad, cg, w, y * TILE, TILE + at, a, b, amin, amax, rank)
-                    weight += sw
-                    weighted_error += se
-                    for c in range(C):
-                        st = state[G_COLOR + c * PIXELS + y * TILE :]
-                        total = f(0)
-                        for k in range(TILE):
-                            total += w[k] * st[k]
-                        out[color_at + c] += total
+                    _uncomposite_row(state[y * TILE :], S[ALPHA + at :], cg, w, a, b, rank)
+                    _tally(state[y * TILE :], w, sums)
+                    if C == 3:
+                        _tally_color(state[G_COLOR + y * TILE :], w, sums)
+                    else:
+                        for c in range(C):
+                            st = state[G_COLOR + c * PIXELS + y * TILE :]
+                            for k in range(TILE):
+                                sums[(2 + c) * TILE + k] += w[k] * st[k]
                     if with_depth:
                         st = state[GZ + y * TILE :]
                         for k in range(a, b):
                             S[GMID + at + k] = w[k] * st[k] * p[UNIT]
-            out[G_WEIGHT], out[G_ERROR] = weight, weighted_error
-            _field_gradient(S, grad, n16, out)
+            out[G_WEIGHT], out[G_ERROR] = _total(sums, 0), _total(sums, TILE)
+            for c in range(C):
+                out[color_at + c] = _total(sums, (2 + c) * TILE)
+            _field_gradient(S, n16, out)
             for m in range(0, neurons, 2):
                 _two_neurons(S, V[m], V[m + 1], n16, p, NEURONS + PER_NEURON * m, out)
             _chord_gradient(S, n16, p, out)
-    return lanes
+    return evaluated
 
 
 @exact_kernel

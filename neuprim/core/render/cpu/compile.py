@@ -22,6 +22,7 @@ from neuprim.core import files
 
 __all__ = ["FAST", "cache_directory", "exact_kernel", "inline", "kernel"]
 
+
 def _prefer_wide_vectors() -> None:
     """Ask LLVM for 512-bit vectors where the processor has them; it avoids them by default, at 1.3-1.8 times the time here.
 
@@ -44,7 +45,7 @@ def cache_directory() -> Path:
         return Path(os.environ["NUMBA_CACHE_DIR"])
     digest = hashlib.sha256()
     core = Path(__file__).parents[2]
-    for source in sorted([*core.glob("render/cpu/*.py"), *core.glob("train/*.py")]):
+    for source in sorted([*core.glob("render/cpu/*.py"), *core.glob("**/*_cpu.py"), core / "train" / "optimizer.py"]):
         digest.update(source.read_bytes())
     return files.cache_directory() / "kernels" / f"{neuprim.__version__}-{digest.hexdigest()[:12]}"
 

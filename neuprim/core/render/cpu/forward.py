@@ -6,6 +6,7 @@ import numpy as np
 
 from neuprim.core.render.cpu.compile import inline, kernel
 from neuprim.core.render.cpu.layout import (
+    ALPHA,
     AMPLITUDE,
     ANCHOR_Z,
     COLOR,
@@ -16,10 +17,10 @@ from neuprim.core.render.cpu.layout import (
     FORWARD_SCRATCH,
     HALF,
     LAST,
-    LIVE,
     MID,
     NEURONS,
     NORM,
+    NORM_L,
     PER_NEURON,
     PHASE,
     PIXELS,
@@ -43,52 +44,73 @@ __all__ = ["composite_tiles"]
 
 f = np.float32
 _STEPS = np.arange(TILE).astype(np.float32)
+_LIVE_EVERY = 4  # pairs between two counts of live pixels: a dead row costs a few lanes, a count costs a reduction per row
 
 
 @inline
-def _neuron_simple(S, n, wx, wy, wz, phase, amplitude):  # type: ignore[no-untyped-def]
-    """FIELD += w2 cos(phase at the middle) sinc(rate x half chord); the half-chord phase stays within half a turn."""
+def _neurons_simple(S, n, p, o):  # type: ignore[no-untyped-def]
+    """FIELD += w2 cos(phase at the middle) sinc(rate x half chord), for two neurons whose half-chord phase stays within half a turn."""
+    ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
+    o2 = o + PER_NEURON
+    bx, by, bz, bb, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + PHASE], p[o2 + AMPLITUDE]
     for k in range(n):
-        v = (S[EXL + k] * wx + S[EYL + k] * wy + S[EZL + k] * wz) * S[HALF + k]
-        u = S[QX + k] * wx + S[QY + k] * wy + S[QZ + k] * wz + phase
+        half = S[HALF + k]
+        ex, ey, ez = S[EXL + k], S[EYL + k], S[EZL + k]
+        qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
+        v = (ex * ax + ey * ay + ez * az) * half
+        u = qx * ax + qy * ay + qz * az + ab
         r = u - np.rint(u)
-        S[FIELD + k] += cos_turns(r * r) * sinc_turns(v * v) * amplitude
+        v1 = (ex * bx + ey * by + ez * bz) * half
+        u1 = qx * bx + qy * by + qz * bz + bb
+        r1 = u1 - np.rint(u1)
+        S[FIELD + k] += cos_turns(r * r) * sinc_turns(v * v) * aa + cos_turns(r1 * r1) * sinc_turns(v1 * v1) * ba
 
 
 @inline
-def _neuron(S, n, wx, wy, wz, phase, amplitude):  # type: ignore[no-untyped-def]
-    """The same for any rate: sinc(2 pi v) = sinc(2 pi r) r/v with r = v - rint(v), exactly reduced."""
+def _neuron(S, n, p, o):  # type: ignore[no-untyped-def]
+    """One neuron of any rate: sinc(2 pi v) = sinc(2 pi r) r/v with r = v - rint(v), exactly reduced."""
+    ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
     for k in range(n):
-        v = (S[EXL + k] * wx + S[EYL + k] * wy + S[EZL + k] * wz) * S[HALF + k]
-        u = S[QX + k] * wx + S[QY + k] * wy + S[QZ + k] * wz + phase
+        v = (S[EXL + k] * ax + S[EYL + k] * ay + S[EZL + k] * az) * S[HALF + k]
+        u = S[QX + k] * ax + S[QY + k] * ay + S[QZ + k] * az + ab
         r = u - np.rint(u)
         turns = np.rint(v)
         rv = v - turns
         ratio = rv / v
         ratio = f(1) if turns == f(0) else ratio
-        S[FIELD + k] += cos_turns(r * r) * sinc_turns(rv * rv) * ratio * amplitude
+        S[FIELD + k] += cos_turns(r * r) * sinc_turns(rv * rv) * ratio * aa
 
 
 @inline
-def _composite_row(state, tau, w, base, at, a, b, amin, amax, tmin, rank):  # type: ignore[no-untyped-def]
-    """One pixel row: opacity, weights w = alpha T, new transmittance; returns how many pixels are still live."""
-    st, tr = state[base:], tau[at : at + TILE]
-    a, b = f(a), f(b)
-    live_count = f(0)
-    for k in range(TILE):
-        step = _STEPS[k]
-        depth = tr[k] * st[k + NORM]
+def _opacity(S, n, amin, amax):  # type: ignore[no-untyped-def]
+    """ALPHA of every lane: 0 below alpha_min and where the integral is not positive, at most alpha_max."""
+    for k in range(n):
+        depth = S[FIELD + k] * S[HALF + k] * S[NORM_L + k] * f(2)
         alpha = min(one_minus_exp(depth), amax)
-        T, live = st[k + T_], st[k + LIVE]
-        use = (step >= a) & (step < b) & (alpha >= amin) & (depth > f(0)) & (live > f(0))
-        after = T * (f(1) - alpha)
-        w[k] = alpha * T if use else f(0)
-        st[k + T_] = after if use else T
-        st[k + LAST] = rank if use else st[k + LAST]
-        live = f(0) if use & (after < tmin) else live
-        st[k + LIVE] = live
-        live_count += live
-    return live_count
+        alpha = alpha if alpha >= amin else f(0)
+        S[ALPHA + k] = alpha if depth > f(0) else f(0)
+
+
+@inline
+def _composite_row(st, lanes, w, a, b, tmin, rank):  # type: ignore[no-untyped-def]
+    """One pixel row: weights w = alpha T and the new transmittance; a pixel is live while T >= T_min."""
+    a, b = f(a), f(b)
+    for k in range(TILE):
+        step, T = _STEPS[k], st[k + T_]
+        use = (step >= a) & (step < b) & (T >= tmin)
+        alpha = lanes[k] if use else f(0)
+        weight = alpha * T
+        w[k] = weight
+        st[k + T_] = T - weight
+        st[k + LAST] = rank if alpha > f(0) else st[k + LAST]
+
+
+@inline
+def _add_color(st, w, c0, c1, c2):  # type: ignore[no-untyped-def]
+    for k in range(TILE):
+        st[k] += w[k] * c0
+        st[k + PIXELS] += w[k] * c1
+        st[k + 2 * PIXELS] += w[k] * c2
 
 
 @kernel
@@ -106,23 +128,21 @@ def composite_tiles(  # type: ignore[no-untyped-def]
     C = colors.shape[1]
     amin, amax, tmin, floor = limits[0], limits[1], limits[2], limits[3]
     S = np.zeros(FORWARD_SCRATCH + 1024, np.float32)
-    state = np.zeros((5 + C) * PIXELS + TILE, np.float32)
-    tau = np.zeros(PIXELS + 4 * TILE, np.float32)
+    state = np.zeros((4 + C) * PIXELS + 2 * TILE, np.float32)
     w = np.zeros(TILE, np.float32)
     left, right, offset = np.zeros(TILE, np.int32), np.zeros(TILE, np.int32), np.zeros(TILE, np.int32)
     rows_live = np.zeros(TILE, np.float32)
-    lanes = 0
+    evaluated = 0
     for t in range(start, stop):
         tx, ty = (t % across) * TILE, (t // across) * TILE
         state[:] = f(0)
         for y in range(TILE):
-            rows_live[y] = f(0)
+            rows_live[y] = f(1) if ty + y < height else f(0)
             for x in range(TILE):
                 j = y * TILE + x
-                state[j + T_] = f(1)
+                state[j + T_] = f(-1)  # outside the image: never live
                 if tx + x < width and ty + y < height:
-                    state[j + LIVE], state[j + NORM] = f(1), norms[ty + y, tx + x]
-                    rows_live[y] += f(1)
+                    state[j + T_], state[j + NORM] = f(1), norms[ty + y, tx + x]
         for q in range(starts[t], starts[t + 1]):
             i = ids[q]
             p = rows[i]
@@ -130,39 +150,48 @@ def composite_tiles(  # type: ignore[no-untyped-def]
             x0, x1 = max(boxes[i, 0] - tx, 0), min(boxes[i, 2] - tx, TILE)
             fx0, fy0 = f(tx) + f(0.5) - p[UX], f(ty) + f(0.5) - p[UY]
             row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, left, right)
-            n = compact(S, offset, left, right, y0, y1, rows_live, fx0, fy0)
-            if n == 0:
-                continue
-            n16 = ((n + 15) // 16) * 16
-            lanes += n16
-            chords(S, n16, p, floor, False)
-            for m in range(neurons):
-                o = NEURONS + PER_NEURON * m
-                if simple[i, m]:
-                    _neuron_simple(S, n16, p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE])
-                else:
-                    _neuron(S, n16, p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE])
-            for k in range(n16):
-                tau[TILE + k] = S[k + FIELD] * S[k + HALF] * f(2)
-            rank = f(q - starts[t] + 1)
-            any_live = f(0)
-            for y in range(y0, y1):
-                a, b = left[y], right[y]
-                if b > a:
-                    rows_live[y] = _composite_row(state, tau, w, y * TILE, TILE + offset[y] - a, a, b, amin, amax, tmin, rank)
-                    for c in range(C):
-                        st, color = state[COLOR + c * PIXELS + y * TILE :], colors[i, c]
+            n = compact(S, state, offset, left, right, y0, y1, rows_live, fx0, fy0)
+            if n > 0:
+                n16 = ((n + 15) // 16) * 16
+                evaluated += n16
+                chords(S, n16, p, floor, False)
+                for m in range(0, neurons, 2):
+                    o = NEURONS + PER_NEURON * m
+                    if simple[i, m] and simple[i, m + 1]:
+                        _neurons_simple(S, n16, p, o)
+                    else:
+                        _neuron(S, n16, p, o)
+                        _neuron(S, n16, p, o + PER_NEURON)
+                _opacity(S, n16, amin, amax)
+                rank = f(q - starts[t] + 1)
+                for y in range(y0, y1):
+                    a, b = left[y], right[y]
+                    if b > a:
+                        at = offset[y] - a
+                        # lanes of this row start at `offset[y]`, its pixels at `a`: shift so that both run with k
+                        _composite_row(state[y * TILE :], S[ALPHA + at : ALPHA + at + TILE], w, a, b, tmin, rank)
+                        if C == 3:
+                            _add_color(state[COLOR + y * TILE :], w, colors[i, 0], colors[i, 1], colors[i, 2])
+                        else:
+                            for c in range(C):
+                                st, color = state[COLOR + c * PIXELS + y * TILE :], colors[i, c]
+                                for k in range(TILE):
+                                    st[k] += w[k] * color
+                        if with_depth:
+                            st = state[ZSUM + y * TILE :]
+                            for k in range(a, b):
+                                st[k] += w[k] * (p[ANCHOR_Z] + p[UNIT] * S[MID + at + k])
+            if (q - starts[t]) % _LIVE_EVERY == _LIVE_EVERY - 1:
+                any_live = f(0)
+                for y in range(TILE):
+                    if rows_live[y] > f(0):
+                        top = f(-1)
                         for k in range(TILE):
-                            st[k] += w[k] * color
-                    if with_depth:
-                        at = MID + offset[y] - a
-                        st = state[ZSUM + y * TILE :]
-                        for k in range(a, b):
-                            st[k] += w[k] * (p[ANCHOR_Z] + p[UNIT] * S[at + k])
-            for y in range(TILE):
-                any_live += rows_live[y]
-            if any_live == f(0):
-                break
+                            top = max(top, state[T_ + y * TILE + k])
+                        rows_live[y] = f(1) if top >= tmin else f(0)
+                        any_live += rows_live[y]
+                if any_live == f(0):
+                    break
         for y in range(min(TILE, height - ty)):
             for x in range(min(TILE, width - tx)):
                 j = y * TILE + x
@@ -172,4 +201,4 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                 last[ty + y, tx + x] = np.int32(state[j + LAST])
                 if with_depth:
                     zsum[ty + y, tx + x] = state[j + ZSUM]
-    return lanes
+    return evaluated

@@ -54,21 +54,26 @@ MX, MY, MZ = lane(10), lane(11), lane(12)  # ray point at the anchor depth
 MID, TM, IA = lane(13), lane(14), lane(15)  # chord middle, closest approach (both t), 1/(e.e)
 DH = lane(16)  # dh/dD with the floor on D
 UNCUT = lane(17)  # 1 where the near plane does not cut the chord
-GRAD = lane(18)  # dL/d(optical depth per unit |d|)
-GF = lane(19)  # dL/d FIELD
-GQX, GQY, GQZ = lane(20), lane(21), lane(22)  # dL/d chord middle
-GEX, GEY, GEZ = lane(23), lane(24), lane(25)  # dL/d (half e)
-GMID = lane(26)  # dL/d MID from the depth image
-FORWARD_SCRATCH = lane(16)
-BACKWARD_SCRATCH = lane(27)
+NORM_L = lane(18)  # length of the ray direction whose camera-z is 1
+ALPHA = lane(19)  # opacity after clamp and cut
+OVER = lane(20)  # 1/(1 - alpha)
+SLOPE = lane(21)  # d alpha / d(FIELD HALF 2), 0 where clamped or cut
+GRAD = lane(22)  # dL/d(FIELD HALF 2)
+GF = lane(23)  # dL/d FIELD
+GQX, GQY, GQZ = lane(24), lane(25), lane(26)  # dL/d chord middle
+GEX, GEY, GEZ = lane(27), lane(28), lane(29)  # dL/d (half e)
+GMID = lane(30)  # dL/d MID from the depth image
+FORWARD_SCRATCH = lane(20)
+BACKWARD_SCRATCH = lane(31)
 # per neuron in the backward pass: cos sinc, -2 pi sin sinc, cos dsinc
 N_COS, N_SIN, N_DSINC = lane(0), lane(1), lane(2)
 NEURON_SCRATCH = lane(3)
 
 # ---- per-tile pixel state
 PIXELS = TILE * TILE
-T_, LIVE, NORM, LAST, ZSUM = 0, PIXELS, 2 * PIXELS, 3 * PIXELS, 4 * PIXELS
-COLOR = 5 * PIXELS  # then C arrays
-# backward only
-S_, B_NORM, B_LAST, ERR, GZ = PIXELS, 2 * PIXELS, 3 * PIXELS, 4 * PIXELS, 5 * PIXELS
-G_COLOR = 6 * PIXELS  # then C arrays
+T_, NORM, LAST = 0, PIXELS, 2 * PIXELS  # transmittance, ray norm, rank + 1 of the last contributor
+ZSUM = 3 * PIXELS  # forward: sum of w z
+COLOR = 4 * PIXELS  # forward: then C arrays of accumulated colour
+BEHIND = 3 * PIXELS  # backward: dL/dT_after x T_after, what lies behind
+ERR, GZ = 4 * PIXELS, 5 * PIXELS
+G_COLOR = 6 * PIXELS  # backward: then C arrays of dL/drgb

@@ -29,6 +29,8 @@ from neuprim.core.render.cpu.layout import (
     MY,
     MZ,
     NEAR,
+    NORM,
+    NORM_L,
     OFFSET,
     QX,
     QY,
@@ -68,8 +70,8 @@ def row_spans(span, fx0, fy0, y0, y1, x0, x1, left, right):  # type: ignore[no-u
 
 
 @inline
-def compact(S, offset, left, right, y0, y1, rows_live, fx0, fy0):  # type: ignore[no-untyped-def]
-    """Gather pixel offsets of live rows into lanes; ``offset[y]`` is where row y starts. Returns the lane count.
+def compact(S, state, offset, left, right, y0, y1, rows_live, fx0, fy0):  # type: ignore[no-untyped-def]
+    """Gather pixel offsets and ray norms of live rows into lanes; ``offset[y]`` is where row y starts. Returns the lane count.
 
     Every row writes a whole vector; the next row, or the final padding, overwrites what stands over, so tail lanes
     always hold finite numbers.
@@ -81,19 +83,23 @@ def compact(S, offset, left, right, y0, y1, rows_live, fx0, fy0):  # type: ignor
         m = right[y] - a
         if m > 0 and rows_live[y] > f(0):
             x0, dv = fx0 + f(a), fy0 + f(y)
-            v = S[n : n + DV + 32]
+            v, w = S[n : n + NORM_L + 32], state[NORM + y * TILE + a :]
             for k in range(TILE):
                 v[k] = x0 + _STEPS[k]
             for k in range(TILE):
                 v[k + DV] = dv
+            for k in range(TILE):
+                v[k + NORM_L] = w[k]
             n += m
         else:
             right[y] = a
-    v = S[n : n + DV + 32]
+    v = S[n : n + NORM_L + 32]
     for k in range(TILE):
         v[k] = f(0)
     for k in range(TILE):
         v[k + DV] = f(0)
+    for k in range(TILE):
+        v[k + NORM_L] = f(0)
     return n
 
 

@@ -46,7 +46,9 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     train = _read_split(folder, values["train_split"])
     if values["hold_out"]:
         if len(train) < 2:
-            raise ConfigError(f"scene.hold_out is {values['hold_out']}, but {folder} has only {len(train)} training view; expected at least 2")
+            raise ConfigError(
+                f"scene.hold_out is {values['hold_out']}, but {folder} has only {len(train)} training view; expected at least 2"
+            )
         train, test = every_nth(train, values["hold_out"])
     else:
         test = _read_split(folder, values["test_split"])

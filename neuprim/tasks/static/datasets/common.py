@@ -15,7 +15,8 @@ from neuprim.core.data import Dataset, PointCloud, camera_extent
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.task import SceneContext
 from neuprim.tasks.static.datasets.views import Frame, ImageViews
-from neuprim.tasks.static.initial import focus_point, initial_points
+from neuprim.tasks.static.focus import focus_point
+from neuprim.tasks.static.initial import initial_points
 
 __all__ = ["IMAGE_SUFFIXES", "PosedImages", "every_nth", "find_image", "missing_files", "posed_images", "unique_names"]
 
@@ -25,9 +26,11 @@ _LISTED = 10
 
 def find_image(folder: Path, text: str) -> Path | None:
     """The image that ``text`` names below ``folder``: as written, else with the usual suffixes added; None if there is none."""
-    path = folder / text.replace("\\", "/")
-    candidates = (path, *(path.with_name(path.name + s) for s in IMAGE_SUFFIXES))
-    return next((c for c in candidates if c.is_file()), None)
+    text = str(folder / text.replace("\\", "/"))
+    try:
+        return next((Path(text + s) for s in ("", *IMAGE_SUFFIXES) if Path(text + s).is_file()), None)
+    except OSError:  # a name longer than the file system can hold
+        return None
 
 
 def missing_files(where: str, names: Sequence[str], hint: str = "") -> DataError:

@@ -1,0 +1,167 @@
+"""COLMAP reconstructions: ``sparse/0`` and an image folder; needs the extra ``neuprim[colmap]``.
+
+Sizes may differ from image to image. Distorted models are undistorted to a pinhole of the same focal lengths; what a
+photograph does not show is masked out. Reduced copies (``images_4``) scale the cameras to the files' actual sizes.
+
+Settings beside the common ones: ``images`` (folder, default "images"), ``model`` (default "sparse/0"), ``test_every``
+(default 8: every 8th image by name, from the first, is a test view) and ``skip_missing`` (default false).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neuprim.core.cameras import Camera
+from neuprim.core.data import Dataset, PointCloud
+from neuprim.core.errors import BackendUnavailable, DataError
+from neuprim.core.images import ImageInfo, image_info
+from neuprim.core.task import SceneContext
+from neuprim.tasks.static.datasets.colmap_files import check_binary_model
+from neuprim.tasks.static.datasets.common import every_nth, missing_files, posed_images, unique_names
+from neuprim.tasks.static.datasets.distortion import Distortion
+from neuprim.tasks.static.datasets.settings import count, data_folder, flag, read_settings, text
+from neuprim.tasks.static.datasets.views import Frame
+
+__all__ = ["load"]
+
+_SETTINGS = {
+    "images": text("images", "the image folder's name, e.g. images_4"),
+    "model": text("sparse/0", "the model's folder"),
+    "test_every": count(8, 2, "a whole number of at least 2"),
+    "skip_missing": flag(False),
+}
+_PINHOLE = ("SIMPLE_PINHOLE", "PINHOLE")
+
+
+def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """The reconstruction in the folder ``settings["path"]``; its 3-D points are the initial points.
+
+    Raises:
+        BackendUnavailable: pycolmap is not installed.
+        ConfigError: unknown or impossible settings.
+        DataError: missing or damaged files, unsupported or impossible cameras, image sizes that are no reduction of the
+            model's, no posed images, empty splits.
+    """
+    values = read_settings(settings, _SETTINGS)
+    folder = data_folder(values["path"])
+    model = folder / values["model"]
+    reconstruction = _read_model(model)
+    frames = _read_frames(model, folder / values["images"], reconstruction, values["skip_missing"])
+    train, test = every_nth(frames, values["test_every"])
+    prefix = "" if values["images"] == "images" else values["images"]
+    points = _read_points(reconstruction)
+    return posed_images(str(model), folder.resolve().name, train, test, values, context, points=points, prefix=prefix)
+
+
+def _pycolmap() -> Any:
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise BackendUnavailable(f"COLMAP scenes need the package pycolmap ({error}): pip install 'neuprim[colmap]'") from None
+    return pycolmap
+
+
+def _read_model(folder: Path) -> Any:
+    pycolmap = _pycolmap()
+    kind = next((s for s in (".bin", ".txt") if (folder / f"cameras{s}").is_file()), None)
+    if kind is None:
+        raise DataError(f"{folder}: no cameras.bin or cameras.txt; expected a COLMAP model (scene.model)")
+    absent = [name + kind for name in ("images", "points3D") if not (folder / (name + kind)).is_file()]
+    if absent:
+        raise missing_files(str(folder), absent)
+    if kind == ".bin":
+        check_binary_model(folder, _parameter_count)
+    try:
+        return pycolmap.Reconstruction(str(folder))
+    except Exception as error:  # pycolmap raises many types for inconsistent models
+        raise DataError(f"{folder}: not a readable COLMAP model ({type(error).__name__}: {error})") from None
+
+
+def _parameter_count(model: int) -> int:
+    pycolmap = _pycolmap()
+    try:
+        return len(pycolmap.Camera(model=pycolmap.CameraModelId(model), width=1, height=1).params_info.split(","))
+    except Exception:  # unknown numbers raise different types in different versions
+        return -1
+
+
+def _read_frames(model: Path, folder: Path, reconstruction: Any, skip_missing: bool) -> list[Frame]:
+    images = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
+    if not images:
+        raise DataError(f"{model}: has no images with a pose; expected at least two")
+    if not folder.is_dir():
+        raise DataError(f"{folder}: does not exist; expected the folder of images (scene.images)")
+    absent = [i.name for i in images if not (folder / i.name).is_file()]
+    if absent and (not skip_missing or len(absent) == len(images)):
+        raise missing_files(str(folder), absent, "" if skip_missing else "; scene.skip_missing=true leaves such images out")
+    images = [i for i in images if i.name not in set(absent)]
+    frames = []
+    for image, name in zip(images, unique_names([i.name for i in images], str(model)), strict=True):
+        file = folder / image.name
+        info = image_info(file)
+        where = f"{model}: camera {image.camera_id} of image {image.name}"
+        camera = _camera(where, image, file, info)
+        lens = reconstruction.cameras[image.camera_id]
+        distortion = None if lens.model_name in _PINHOLE else _Lens.of(lens, info)
+        frames.append(Frame(name, file, camera.validate(where), info, None, distortion))
+    return frames
+
+
+def _camera(where: str, image: Any, file: Path, info: ImageInfo) -> Camera:
+    lens = image.camera
+    if lens.width <= 0 or lens.height <= 0 or not np.isfinite(lens.params).all():
+        raise DataError(f"{where}: size {lens.width}x{lens.height}, parameters {lens.params}; expected a positive size, finite numbers")
+    # a reduced copy keeps its shape to within the rounding of its sides to whole pixels
+    scale = max(info.width / lens.width, info.height / lens.height)
+    if abs(lens.width * scale - info.width) > 1.0 or abs(lens.height * scale - info.height) > 1.0:
+        raise DataError(f"{file}: image is {info.width}x{info.height}; expected {lens.width}x{lens.height} ({where}) or a reduction of it")
+    # asking a panorama for its focal length ends the process, so the parameters are taken by their names
+    named: dict[str, float | None] = dict(zip((n.strip() for n in lens.params_info.split(",")), map(float, lens.params), strict=False))
+    named = {"fx": named.get("f"), "fy": named.get("f"), **named}
+    fx, fy, cx, cy = (named.get(key) for key in ("fx", "fy", "cx", "cy"))
+    if fx is None or fy is None or cx is None or cy is None:
+        raise DataError(f"{where}: model is {lens.model_name}; expected a model with focal lengths, which a pinhole can replace")
+    pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3] = torch.from_numpy(np.asarray(pose.matrix(), dtype=np.float64))
+    return Camera(viewmat, fx, fy, cx, cy, int(lens.width), int(lens.height)).resized(info.width, info.height)
+
+
+@dataclass(frozen=True)
+class _Lens(Distortion):
+    """Any COLMAP camera model, scaled to the files' size; the projection is COLMAP's own."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+    scale: tuple[float, float]
+
+    @staticmethod
+    def of(lens: Any, info: ImageInfo) -> _Lens:
+        scale = (info.width / lens.width, info.height / lens.height)
+        return _Lens(lens.model_name, int(lens.width), int(lens.height), tuple(map(float, lens.params)), scale)
+
+    def project(self, points: np.ndarray, camera: Camera) -> np.ndarray:
+        lens = _pycolmap().Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
+        rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+        return np.asarray(lens.img_from_cam(rays), dtype=np.float64) * self.scale
+
+
+def _read_points(reconstruction: Any) -> PointCloud | None:
+    """The model's points, in order of their numbers; None where it has none."""
+    points = [p for _, p in sorted(reconstruction.points3D.items())]
+    if not points:
+        return None
+    means = np.array([p.xyz for p in points], dtype=np.float64)
+    colors = np.array([p.color for p in points], dtype=np.float64) / 255.0
+    keep = np.isfinite(means).all(axis=1)
+    if not keep.all():
+        raise DataError(f"points3D: {int((~keep).sum())} of {len(points)} points are not finite; expected finite coordinates")
+    return PointCloud(torch.from_numpy(means).float(), torch.from_numpy(colors).float())

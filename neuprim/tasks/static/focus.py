@@ -1,0 +1,28 @@
+"""What a set of cameras looks at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.data import camera_extent
+
+__all__ = ["focus_point"]
+
+
+def focus_point(cameras: Sequence[Camera]) -> Tensor:
+    """(3,) float64 point nearest to all optical axes in the least-squares sense, scene units.
+
+    A weak pull towards one extent in front of the mean camera decides what (nearly) parallel axes leave open.
+    """
+    positions = torch.stack([c.position.detach().double() for c in cameras])
+    forward = torch.stack([c.viewmat[2, :3].detach().double() for c in cameras])
+    eye = torch.eye(3, dtype=torch.float64)
+    planes = eye - forward[:, :, None] * forward[:, None, :]
+    pull = 1e-4 * len(cameras)
+    target = positions.mean(0) + forward.mean(0) * camera_extent(cameras)
+    right = (planes @ positions[:, :, None]).sum(0)[:, 0] + pull * target
+    return torch.linalg.solve(planes.sum(0) + pull * eye, right)

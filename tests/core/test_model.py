@@ -1,0 +1,138 @@
+"""A model's tensors: their count, their shapes, and values that are not numbers."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from neuprim.core.cosine import CosineDensity
+from neuprim.core.errors import NonFiniteError
+from neuprim.core.geometry import GEOMETRY_SPECS, Geometry, quaternion_to_matrix
+from neuprim.core.primitives import Primitives
+from neuprim.core.schema import InitContext
+from neuprim.tasks.static.fields import SphericalHarmonics
+
+
+def build(count: int = 4, neurons: int = 8, degree: int = 3, channels: int = 3) -> Primitives:
+    context = InitContext(
+        torch.arange(3.0 * count).reshape(count, 3), torch.full((count,), 0.2), torch.rand(count, channels), torch.Generator().manual_seed(0)
+    )
+    return Primitives.initialise(CosineDensity(neurons), SphericalHarmonics(degree, channels), context)
+
+
+def test_ninety_nine_parameters() -> None:
+    model = build()
+    assert model.parameters_per_primitive == 99
+    assert sum(s.size for s in GEOMETRY_SPECS) == 10
+    assert sum(s.size for s in model.density.parameters()) == 41
+    assert sum(s.size for s in model.colour.parameters()) == 48
+    assert sum(v.numel() for v in model.params.values()) == 99 * 4
+
+
+@pytest.mark.parametrize("neurons", range(17))
+def test_counts_for_every_width(neurons: int) -> None:
+    model = build(2, neurons, 0, 1)
+    assert sum(s.size for s in model.density.parameters()) == 5 * neurons + 1
+    assert sum(v.numel() for v in model.params.values()) == 2 * (10 + 5 * neurons + 1 + 1)
+
+
+@pytest.mark.parametrize(("degree", "channels", "expected"), [(0, 3, 3), (1, 3, 12), (2, 1, 9), (3, 5, 80)])
+def test_colour_counts(degree: int, channels: int, expected: int) -> None:
+    assert sum(s.size for s in build(2, 8, degree, channels).colour.parameters()) == expected
+
+
+def test_a_fresh_model_stands_on_its_points() -> None:
+    model = build()
+    assert torch.equal(model.params["means"], torch.arange(12.0).reshape(4, 3))
+    assert torch.allclose(model.geometry.scales, torch.tensor(0.2))
+    assert torch.equal(model.geometry.rotations, torch.eye(3).expand(4, 3, 3))
+    assert all(v.dtype == torch.float32 and v.is_contiguous() for v in model.params.values())
+    assert list(model.params) == [s.name for s in model.specs]
+
+
+def test_initialising_twice_gives_the_same_model() -> None:
+    torch.manual_seed(1)
+    first = build(channels=1)
+    torch.manual_seed(2)
+    second = build(channels=1)
+    assert torch.equal(first.params["W1"], second.params["W1"]), "only the context's generator draws"
+
+
+def test_a_missing_tensor() -> None:
+    model = build()
+    params = {k: v for k, v in model.params.items() if k != "w2"}
+    with pytest.raises(ValueError, match="do not match the specs"):
+        Primitives(model.density, model.colour, params)
+
+
+def test_a_tensor_too_many() -> None:
+    model = build()
+    with pytest.raises(ValueError, match="extra"):
+        Primitives(model.density, model.colour, {**model.params, "extra": torch.zeros(4)})
+
+
+@pytest.mark.parametrize(("name", "shape"), [("W1", (4, 7, 3)), ("b2", (4,)), ("quats", (4, 3)), ("sh_rest", (3, 15, 3)), ("log_scales", (4, 1))])
+def test_a_wrong_shape_is_named(name: str, shape: tuple[int, ...]) -> None:
+    model = build()
+    with pytest.raises(ValueError, match=rf"{name} has shape .*expected") as caught:
+        Primitives(model.density, model.colour, {**model.params, name: torch.zeros(shape)})
+    assert str(shape) in str(caught.value)
+
+
+def test_two_fields_may_not_share_a_name() -> None:
+    class Clash(SphericalHarmonics):
+        def parameters(self):  # type: ignore[no-untyped-def]
+            return [*super().parameters(), CosineDensity(8).parameters()[0]]
+
+    model = build()
+    with pytest.raises(ValueError, match="do not match"):
+        Primitives(model.density, Clash(), model.params)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("name", ["means", "log_scales", "quats", "W1", "b1", "w2", "b2", "sh_dc", "sh_rest"])
+def test_non_finite_values_are_named(name: str, value: float) -> None:
+    model = build()
+    model.check_finite()
+    model.params[name][2].view(-1)[-1] = value
+    with pytest.raises(NonFiniteError, match=rf"\b{name} of primitive 2\b"):
+        model.check_finite()
+
+
+def test_large_values_are_not_taken_for_infinite() -> None:
+    model = build()
+    model.params["means"].fill_(3e38)  # the sum overflows, no value does
+    model.check_finite()
+
+
+def test_rows_are_copies() -> None:
+    model = build()
+    rows = model.rows(torch.tensor([3, 1]))
+    assert torch.equal(rows["means"], model.params["means"][[3, 1]])
+    rows["means"].zero_()
+    assert model.params["means"][3].abs().sum() > 0
+
+
+def test_a_model_without_primitives() -> None:
+    model = build()
+    empty = Primitives(model.density, model.colour, model.rows(torch.empty(0, dtype=torch.int64)))
+    empty.check_finite()
+    assert empty.count == 0
+
+
+def test_quaternions_are_wxyz_and_normalised_on_use() -> None:
+    quarter_turn = torch.tensor([2.0, 0.0, 0.0, 2.0])  # about z
+    R = quaternion_to_matrix(quarter_turn)
+    assert torch.allclose(R @ torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]), atol=1e-6)
+    random = torch.randn(50, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    R = quaternion_to_matrix(random)
+    assert torch.allclose(R @ R.transpose(1, 2), torch.eye(3, dtype=torch.float64).expand(50, 3, 3))
+    assert torch.allclose(torch.linalg.det(R), torch.ones(50, dtype=torch.float64))
+    assert torch.allclose(quaternion_to_matrix(-3 * random), R)
+
+
+def test_a_tie_of_axes_sends_the_gradient_to_the_first() -> None:
+    log_scales = torch.zeros(1, 3, requires_grad=True)
+    g = Geometry(torch.zeros(1, 3), log_scales, torch.tensor([[1.0, 0, 0, 0]]))
+    g.length_scale.sum().backward()
+    assert log_scales.grad is not None and log_scales.grad.tolist() == [[1.0, 0.0, 0.0]]

@@ -1,0 +1,140 @@
+"""Spherical harmonics: the basis itself, and the colour field built on it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from neuprim.core import sh
+from neuprim.core.cosine import CosineDensity
+from neuprim.core.fields import Constant
+from neuprim.core.primitives import Primitives
+from neuprim.core.schema import InitContext
+from neuprim.tasks.static.fields import SphericalHarmonics
+from tests import scenes
+
+
+def sphere(polar: int = 12, around: int = 24) -> tuple[torch.Tensor, torch.Tensor]:
+    """Directions and weights of a product rule that is exact for polynomials of degree < 2 polar."""
+    z, wz = np.polynomial.legendre.leggauss(polar)
+    phi = 2 * np.pi * (np.arange(around) + 0.3) / around
+    s = np.sqrt(1 - z**2)
+    d = np.stack([s[:, None] * np.cos(phi), s[:, None] * np.sin(phi), np.broadcast_to(z[:, None], (polar, around))], -1)
+    return torch.from_numpy(d.reshape(-1, 3)), torch.from_numpy(np.repeat(wz, around) * 2 * np.pi / around)
+
+
+def test_orthonormal() -> None:
+    d, w = sphere()
+    values = sh.basis(d, 3)
+    gram = values.T @ (w[:, None] * values)
+    assert torch.allclose(gram, torch.eye(16, dtype=torch.float64), atol=1e-13)
+
+
+def test_bands_are_rotation_invariant() -> None:
+    """Each band's sum of squares is the same in every direction (the addition theorem)."""
+    d, _ = sphere()
+    values = sh.basis(d, 3)
+    for band in range(4):
+        power = values[:, band**2 : (band + 1) ** 2].square().sum(1)
+        assert torch.allclose(power, torch.full_like(power, (2 * band + 1) / (4 * math.pi)), atol=1e-13)
+
+
+def test_order_and_signs() -> None:
+    """Those of 3D Gaussian splatting: y, z, x with signs -, +, - in band 1."""
+    x, y, z = torch.eye(3, dtype=torch.float64)[:, None]
+    c1 = math.sqrt(3 / (4 * math.pi))
+    assert sh.basis(x, 1)[0].tolist() == pytest.approx([sh.C0, 0, 0, -c1])
+    assert sh.basis(y, 1)[0].tolist() == pytest.approx([sh.C0, -c1, 0, 0])
+    assert sh.basis(z, 1)[0].tolist() == pytest.approx([sh.C0, 0, c1, 0])
+    assert sh.basis(z, 2)[0, 6].item() == pytest.approx(0.6307831305050401)
+    assert sh.basis(x, 2)[0, 8].item() == pytest.approx(0.5462742152960396)
+    assert sh.basis(x, 3)[0, 15].item() == pytest.approx(-0.5900435899266435)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_degrees_nest(degree: int) -> None:
+    d, _ = sphere(4, 8)
+    values = sh.basis(d, degree)
+    assert values.shape == (32, sh.coefficient_count(degree)) == (32, (degree + 1) ** 2)
+    assert torch.equal(values, sh.basis(d, 3)[:, : values.shape[1]])
+
+
+@pytest.mark.parametrize("degree", [-1, 4])
+def test_degree_out_of_range(degree: int) -> None:
+    with pytest.raises(ValueError, match=rf"degree {degree}; expected 0..3"):
+        sh.basis(torch.zeros(1, 3), degree)
+
+
+def fresh(degree: int, channels: int, sh_every: float = 0.0) -> tuple[Primitives, SphericalHarmonics, torch.Tensor]:
+    colors = torch.rand(20, channels, generator=torch.Generator().manual_seed(1))
+    t = scenes.tensors(20, seed=2)
+    colour = SphericalHarmonics(degree, channels, sh_every)
+    context = InitContext(t["means"], torch.full((20,), 0.1), colors, torch.Generator().manual_seed(0))
+    return Primitives.initialise(CosineDensity(2), colour, context), colour, colors
+
+
+def seen(model: Primitives, distance: float = 3.0) -> torch.Tensor:
+    form = model.lower(scenes.camera(distance=distance), {}).colour
+    assert isinstance(form, Constant)
+    return form.rgb
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("channels", [1, 3, 5])
+def test_initial_colour_is_the_given_one(degree: int, channels: int) -> None:
+    model, _, colors = fresh(degree, channels)
+    assert torch.allclose(seen(model), colors, atol=1e-6)
+
+
+def test_colour_is_never_negative_and_depends_on_the_direction() -> None:
+    model, _, _ = fresh(3, 3)
+    model.params["sh_rest"].normal_(generator=torch.Generator().manual_seed(5))
+    first, second = seen(model), seen(model, distance=0.05)
+    assert first.min() == 0
+    assert (first - second).abs().max() > 0.05
+
+
+def test_colour_follows_the_direction_from_camera_to_centre() -> None:
+    model, _, _ = fresh(1, 3)
+    model.params["sh_dc"].zero_()
+    model.params["sh_rest"].zero_()
+    model.params["sh_rest"][:, 2, 0] = -0.3  # the coefficient of -x
+    camera = scenes.camera()
+    offset = model.params["means"] - camera.position.float()
+    x = offset[:, 0] / offset.norm(dim=1)
+    expected = 0.5 + 0.3 * math.sqrt(3 / (4 * math.pi)) * x
+    rgb = seen(model)
+    assert torch.allclose(rgb[:, 0], expected, atol=1e-6)
+    assert torch.allclose(rgb[:, 1:], torch.tensor(0.5))
+
+
+def test_bands_are_unlocked_one_by_one() -> None:
+    model, colour, _ = fresh(3, 3, sh_every=0.1)
+    assert colour.active == 3, "a loaded model uses all of its bands"
+    steps = []
+    for progress in (0.0, 0.05, 0.1, 0.19999, 0.2, 0.3, 0.31, 1.0):
+        colour.set_progress(progress)
+        steps.append(colour.active)
+    assert steps == [0, 0, 1, 1, 2, 3, 3, 3]
+
+    model.params["sh_rest"].normal_(generator=torch.Generator().manual_seed(5))
+    colour.set_progress(0.1)
+    first = seen(model)
+    model.params["sh_rest"][:, 3:] = 7.0
+    assert torch.equal(seen(model), first), "locked bands play no part"
+    model.params["sh_rest"][:, :3] = 7.0
+    assert not torch.equal(seen(model), first)
+
+
+def test_without_a_schedule_all_bands_are_open_at_once() -> None:
+    _, colour, _ = fresh(2, 3, sh_every=0.0)
+    colour.set_progress(0.0)
+    assert colour.active == 2
+
+
+def test_settings_rebuild_the_field() -> None:
+    again = SphericalHarmonics(**SphericalHarmonics(2, 4, 0.1).settings())
+    assert (again.degree, again.channels, again.active) == (2, 4, 2)

@@ -26,7 +26,7 @@ _VIEWS = 100
 _MASK_SIDE = 400
 _COARSE = 64
 _WRONG_VIEWS = 0.02
-_SEEN_VIEWS = 0.25
+_SEEN_VIEWS = 0.5
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class _Grid:
 def hull_surface(views: ViewSet, resolution: int) -> tuple[Tensor, float]:
     """Centres (M, 3) float32 of the hull's surface voxels, and the voxel side, scene units.
 
-    A voxel stays if at least a quarter of the views look at it and all but 2 % of those show matter (alpha > 0.5) there.
+    A voxel stays if at least half of the views look at it and all but 2 % of those show matter (alpha > 0.5) there.
 
     Raises:
         DataError: no voxel is left, so masks and cameras disagree.

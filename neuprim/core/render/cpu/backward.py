@@ -179,25 +179,38 @@ def _uncomposite_row(st, lanes, cg, w, a, b, rank):  # type: ignore[no-untyped-d
 
 
 @inline
-def _color_dot(st, cg, c0, c1, c2):  # type: ignore[no-untyped-def]
+def _uncomposite_rgb_row(st, lanes, sums, a, b, rank, c0, c1, c2):  # type: ignore[no-untyped-def]
+    """:func:`_uncomposite_row` and the tallies of three channels in one pass; ``sums`` are 16 wide and reduced once per pair."""
+    a, b = f(a), f(b)
     for k in range(TILE):
-        cg[k] = st[k] * c0 + st[k + PIXELS] * c1 + st[k + 2 * PIXELS] * c2
+        step, alpha = _STEPS[k], lanes[k]
+        inside = (step >= a) & (step < b)
+        use = inside & (alpha > f(0)) & (st[k + LAST] >= rank)
+        alpha = alpha if use else f(0)
+        over = lanes[k + OVER - ALPHA] if use else f(1)
+        g0, g1, g2 = st[k + G_COLOR], st[k + G_COLOR + PIXELS], st[k + G_COLOR + 2 * PIXELS]
+        cg = g0 * c0 + g1 * c1 + g2 * c2
+        behind = st[k + BEHIND]
+        before = st[k + T_] * over
+        weight = alpha * before
+        g = (before * cg - behind * over) * lanes[k + SLOPE - ALPHA]
+        st[k + BEHIND] = behind + weight * cg
+        st[k + T_] = before
+        g = g if use else f(0)
+        lanes[k + GRAD - ALPHA] = g if inside else lanes[k + GRAD - ALPHA]
+        sums[k] += weight
+        sums[k + TILE] += weight * st[k + ERR]
+        sums[k + 2 * TILE] += weight * g0
+        sums[k + 3 * TILE] += weight * g1
+        sums[k + 4 * TILE] += weight * g2
 
 
 @inline
 def _tally(st, w, sums):  # type: ignore[no-untyped-def]
-    """Add w and w x error of one row to 16-wide sums; they are reduced once per pair."""
+    """Add w and w x error of one row to the 16-wide sums."""
     for k in range(TILE):
         sums[k] += w[k]
         sums[k + TILE] += w[k] * st[k + ERR]
-
-
-@inline
-def _tally_color(st, w, sums):  # type: ignore[no-untyped-def]
-    for k in range(TILE):
-        sums[k + 2 * TILE] += w[k] * st[k]
-        sums[k + 3 * TILE] += w[k] * st[k + PIXELS]
-        sums[k + 4 * TILE] += w[k] * st[k + 2 * PIXELS]
 
 
 @inline
@@ -324,7 +337,7 @@ def backward_tiles(  # type: ignore[no-untyped-def]
     V = np.zeros((neurons, NEURON_SCRATCH), np.float32)
     state = np.zeros((6 + C) * PIXELS + 2 * TILE, np.float32)
     w, cg, sums = np.zeros(TILE, np.float32), np.zeros(TILE, np.float32), np.zeros((2 + C) * TILE, np.float32)
-    left, right, offset = np.zeros(TILE, np.int32), np.zeros(TILE, np.int32), np.zeros(TILE, np.int32)
+    bounds, offset = np.zeros(2 * TILE, np.int32), np.zeros(TILE, np.int32)
     rows_live, reach = np.zeros(TILE, np.float32), np.zeros(TILE, np.float32)
     evaluated = 0
     for t in range(start, stop):
@@ -358,10 +371,10 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             y0, y1 = max(boxes[i, 1] - ty, 0), min(boxes[i, 3] - ty, TILE)
             x0, x1 = max(boxes[i, 0] - tx, 0), min(boxes[i, 2] - tx, TILE)
             fx0, fy0 = f(tx) + f(0.5) - p[UX], f(ty) + f(0.5) - p[UY]
-            row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, left, right)
+            row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, bounds)
             for y in range(y0, y1):
                 rows_live[y] = f(1) if reach[y] >= rank else f(0)
-            n = compact(S, state, offset, left, right, y0, y1, rows_live, fx0, fy0)
+            n = compact(S, state, offset, bounds, y0, y1, rows_live, fx0, fy0)
             out[:] = f(0)
             if n == 0:
                 continue
@@ -382,30 +395,27 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                 S[GMID + k] = f(0)
             sums[:] = f(0)
             for y in range(y0, y1):
-                a, b = left[y], right[y]
+                a, b = bounds[y], bounds[y + TILE]
                 if b > a:
                     at = offset[y] - a
-                    if C == 3:
-                        _color_dot(state[G_COLOR + y * TILE :], cg, colors[i, 0], colors[i, 1], colors[i, 2])
-                    else:
-                        cg[:] = f(0)
-                        for c in range(C):
-                            st, color = state[G_COLOR + c * PIXELS + y * TILE :], colors[i, c]
-                            for k in range(TILE):
-                                cg[k] += color * st[k]
+                    if C == 3 and not with_depth:
+                        _uncomposite_rgb_row(state[y * TILE :], S[ALPHA + at :], sums, a, b, rank, colors[i, 0], colors[i, 1], colors[i, 2])
+                        continue
+                    cg[:] = f(0)
+                    for c in range(C):
+                        st, color = state[G_COLOR + c * PIXELS + y * TILE :], colors[i, c]
+                        for k in range(TILE):
+                            cg[k] += color * st[k]
                     if with_depth:
                         st = state[GZ + y * TILE :]
                         for k in range(a, b):
                             cg[k] += st[k] * (p[ANCHOR_Z] + p[UNIT] * S[MID + at + k])
                     _uncomposite_row(state[y * TILE :], S[ALPHA + at :], cg, w, a, b, rank)
                     _tally(state[y * TILE :], w, sums)
-                    if C == 3:
-                        _tally_color(state[G_COLOR + y * TILE :], w, sums)
-                    else:
-                        for c in range(C):
-                            st = state[G_COLOR + c * PIXELS + y * TILE :]
-                            for k in range(TILE):
-                                sums[(2 + c) * TILE + k] += w[k] * st[k]
+                    for c in range(C):
+                        st = state[G_COLOR + c * PIXELS + y * TILE :]
+                        for k in range(TILE):
+                            sums[(2 + c) * TILE + k] += w[k] * st[k]
                     if with_depth:
                         st = state[GZ + y * TILE :]
                         for k in range(a, b):

@@ -92,8 +92,24 @@ def _opacity(S, n, amin, amax):  # type: ignore[no-untyped-def]
 
 
 @inline
+def _composite_rgb_row(st, lanes, a, b, tmin, rank, c0, c1, c2):  # type: ignore[no-untyped-def]
+    """One pixel row of three channels: colour += alpha T c, then T; a pixel is live while T >= T_min."""
+    a, b = f(a), f(b)
+    for k in range(TILE):
+        step, T = _STEPS[k], st[k + T_]
+        use = (step >= a) & (step < b) & (T >= tmin)
+        alpha = lanes[k] if use else f(0)
+        weight = alpha * T
+        st[k + T_] = T - weight
+        st[k + LAST] = rank if alpha > f(0) else st[k + LAST]
+        st[k + COLOR] += weight * c0
+        st[k + COLOR + PIXELS] += weight * c1
+        st[k + COLOR + 2 * PIXELS] += weight * c2
+
+
+@inline
 def _composite_row(st, lanes, w, a, b, tmin, rank):  # type: ignore[no-untyped-def]
-    """One pixel row: weights w = alpha T and the new transmittance; a pixel is live while T >= T_min."""
+    """The same for any channels and depth: leaves the weights in ``w``."""
     a, b = f(a), f(b)
     for k in range(TILE):
         step, T = _STEPS[k], st[k + T_]
@@ -103,14 +119,6 @@ def _composite_row(st, lanes, w, a, b, tmin, rank):  # type: ignore[no-untyped-d
         w[k] = weight
         st[k + T_] = T - weight
         st[k + LAST] = rank if alpha > f(0) else st[k + LAST]
-
-
-@inline
-def _add_color(st, w, c0, c1, c2):  # type: ignore[no-untyped-def]
-    for k in range(TILE):
-        st[k] += w[k] * c0
-        st[k + PIXELS] += w[k] * c1
-        st[k + 2 * PIXELS] += w[k] * c2
 
 
 @kernel
@@ -130,7 +138,7 @@ def composite_tiles(  # type: ignore[no-untyped-def]
     S = np.zeros(FORWARD_SCRATCH + 1024, np.float32)
     state = np.zeros((4 + C) * PIXELS + 2 * TILE, np.float32)
     w = np.zeros(TILE, np.float32)
-    left, right, offset = np.zeros(TILE, np.int32), np.zeros(TILE, np.int32), np.zeros(TILE, np.int32)
+    bounds, offset = np.zeros(2 * TILE, np.int32), np.zeros(TILE, np.int32)
     rows_live = np.zeros(TILE, np.float32)
     evaluated = 0
     for t in range(start, stop):
@@ -149,8 +157,8 @@ def composite_tiles(  # type: ignore[no-untyped-def]
             y0, y1 = max(boxes[i, 1] - ty, 0), min(boxes[i, 3] - ty, TILE)
             x0, x1 = max(boxes[i, 0] - tx, 0), min(boxes[i, 2] - tx, TILE)
             fx0, fy0 = f(tx) + f(0.5) - p[UX], f(ty) + f(0.5) - p[UY]
-            row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, left, right)
-            n = compact(S, state, offset, left, right, y0, y1, rows_live, fx0, fy0)
+            row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, bounds)
+            n = compact(S, state, offset, bounds, y0, y1, rows_live, fx0, fy0)
             if n > 0:
                 n16 = ((n + 15) // 16) * 16
                 evaluated += n16
@@ -165,22 +173,23 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                 _opacity(S, n16, amin, amax)
                 rank = f(q - starts[t] + 1)
                 for y in range(y0, y1):
-                    a, b = left[y], right[y]
+                    a, b = bounds[y], bounds[y + TILE]
                     if b > a:
-                        at = offset[y] - a
-                        # lanes of this row start at `offset[y]`, its pixels at `a`: shift so that both run with k
-                        _composite_row(state[y * TILE :], S[ALPHA + at : ALPHA + at + TILE], w, a, b, tmin, rank)
-                        if C == 3:
-                            _add_color(state[COLOR + y * TILE :], w, colors[i, 0], colors[i, 1], colors[i, 2])
+                        at = offset[y] - a  # the row's lanes start at offset[y], its pixels at a: shift so that both run with k
+                        if C == 3 and not with_depth:
+                            _composite_rgb_row(
+                                state[y * TILE :], S[ALPHA + at :], a, b, tmin, rank, colors[i, 0], colors[i, 1], colors[i, 2]
+                            )
                         else:
+                            _composite_row(state[y * TILE :], S[ALPHA + at :], w, a, b, tmin, rank)
                             for c in range(C):
                                 st, color = state[COLOR + c * PIXELS + y * TILE :], colors[i, c]
                                 for k in range(TILE):
                                     st[k] += w[k] * color
-                        if with_depth:
-                            st = state[ZSUM + y * TILE :]
-                            for k in range(a, b):
-                                st[k] += w[k] * (p[ANCHOR_Z] + p[UNIT] * S[MID + at + k])
+                            if with_depth:
+                                st = state[ZSUM + y * TILE :]
+                                for k in range(a, b):
+                                    st[k] += w[k] * (p[ANCHOR_Z] + p[UNIT] * S[MID + at + k])
             if (q - starts[t]) % _LIVE_EVERY == _LIVE_EVERY - 1:
                 any_live = f(0)
                 for y in range(TILE):

@@ -53,24 +53,30 @@ _MARGIN = f(2e-3)  # pixels; a lane too many is rejected by its own D
 
 
 @inline
-def row_spans(span, fx0, fy0, y0, y1, x0, x1, left, right):  # type: ignore[no-untyped-def]
-    """Pixels [left, right) of tile rows y0:y1 inside the silhouette; fx0, fy0: tile corner's pixel centre from the anchor."""
+def row_spans(span, fx0, fy0, y0, y1, x0, x1, bounds):  # type: ignore[no-untyped-def]
+    """Pixels [bounds[y], bounds[y + 16]) of each tile row inside the silhouette, equal outside rows y0:y1.
+
+    fx0, fy0: the tile corner's pixel centre from the anchor. All 16 rows at once: one vector.
+    """
+    skew, xc, yc, hx = span[SKEW], span[XC] - fx0, span[YC] - fy0, span[HX]
     ihy = f(1) / span[HY]
-    for y in range(y0, y1):
-        dv = fy0 + f(y) - span[YC]
+    low, high, top, bottom = f(x0), f(x1), f(y0), f(y1)
+    for y in range(TILE):
+        row = _STEPS[y]
+        dv = row - yc
         k = dv * ihy
         s = f(1) - k * k
-        half = span[HX] * np.sqrt(max(s, f(0))) + _MARGIN
-        mid = span[XC] + span[SKEW] * dv - fx0
-        lo = max(np.ceil(mid - half), f(x0))
-        hi = min(np.floor(mid + half) + f(1), f(x1))
-        inside = s > f(-1e-2)
-        left[y] = np.int32(lo) if inside else np.int32(0)
-        right[y] = np.int32(hi) if inside else np.int32(0)
+        half = hx * np.sqrt(max(s, f(0))) + _MARGIN
+        mid = xc + skew * dv
+        lo = max(np.ceil(mid - half), low)
+        hi = min(np.floor(mid + half) + f(1), high)
+        inside = (s > f(-1e-2)) & (row >= top) & (row < bottom)
+        bounds[y] = np.int32(lo if inside else f(0))
+        bounds[y + TILE] = np.int32(hi if inside else f(0))
 
 
 @inline
-def compact(S, state, offset, left, right, y0, y1, rows_live, fx0, fy0):  # type: ignore[no-untyped-def]
+def compact(S, state, offset, bounds, y0, y1, rows_live, fx0, fy0):  # type: ignore[no-untyped-def]
     """Gather pixel offsets and ray norms of live rows into lanes; ``offset[y]`` is where row y starts. Returns the lane count.
 
     Every row writes a whole vector; the next row, or the final padding, overwrites what stands over, so tail lanes
@@ -79,26 +85,22 @@ def compact(S, state, offset, left, right, y0, y1, rows_live, fx0, fy0):  # type
     n = 0
     for y in range(y0, y1):
         offset[y] = n
-        a = left[y]
-        m = right[y] - a
+        a = bounds[y]
+        m = bounds[y + TILE] - a
         if m > 0 and rows_live[y] > f(0):
             x0, dv = fx0 + f(a), fy0 + f(y)
-            v, w = S[n : n + NORM_L + 32], state[NORM + y * TILE + a :]
+            v, w = S[n:], state[NORM + y * TILE + a :]
             for k in range(TILE):
                 v[k] = x0 + _STEPS[k]
-            for k in range(TILE):
                 v[k + DV] = dv
-            for k in range(TILE):
                 v[k + NORM_L] = w[k]
             n += m
         else:
-            right[y] = a
-    v = S[n : n + NORM_L + 32]
+            bounds[y + TILE] = a
+    v = S[n:]
     for k in range(TILE):
         v[k] = f(0)
-    for k in range(TILE):
         v[k + DV] = f(0)
-    for k in range(TILE):
         v[k + NORM_L] = f(0)
     return n
 

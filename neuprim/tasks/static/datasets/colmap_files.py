@@ -45,7 +45,9 @@ class _Bytes:
 
 
 def check_binary_model(folder: Path, parameter_count: Callable[[int], int]) -> None:
-    """Check ``cameras.bin``, ``images.bin`` and ``points3D.bin`` in ``folder`` from first to last record.
+    """Check all ``.bin`` files of the model in ``folder`` from first to last record.
+
+    Models of COLMAP before 3.12 have no ``rigs.bin`` and ``frames.bin``.
 
     Args:
         parameter_count: parameters of a COLMAP camera model by its number; -1 for an unknown one.
@@ -57,7 +59,11 @@ def check_binary_model(folder: Path, parameter_count: Callable[[int], int]) -> N
         ("cameras.bin", lambda f: _camera(f, parameter_count)),
         ("images.bin", _image),
         ("points3D.bin", _point),
+        ("rigs.bin", _rig),
+        ("frames.bin", _frame),
     ):
+        if record in (_rig, _frame) and not (folder / name).is_file():
+            continue
         file = _Bytes(folder / name)
         for _ in range(file.number("Q")):
             record(file)
@@ -83,3 +89,16 @@ def _image(file: _Bytes) -> None:
 def _point(file: _Bytes) -> None:
     file.skip(8 + 3 * 8 + 3 + 8)  # id, position, colour, error
     file.skip(8 * file.number("Q"))
+
+
+def _rig(file: _Bytes) -> None:
+    file.skip(4)
+    for sensor in range(file.number("I")):
+        file.skip(8)  # kind and number
+        if sensor and file.number("B"):  # the first is the reference and has no pose
+            file.skip(7 * 8)
+
+
+def _frame(file: _Bytes) -> None:
+    file.skip(4 + 4 + 7 * 8)  # id, rig, pose
+    file.skip(16 * file.number("I"))

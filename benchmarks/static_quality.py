@@ -1,0 +1,98 @@
+"""Quality of the static task on a NeRF-synthetic scene: PSNR by primitives and seconds, beside the K = 0 baseline.
+
+    python benchmarks/static_quality.py DIR [--seeds 3] [--rows 2000x60 5000x120 ...] [--readme]
+
+DIR holds the scene (transforms_train.json, ...). Every run is `neuprim run task=static scene=blender` with the preset
+`quick`; numbers are means over seeds +- half the spread, on the test views, of the last checkpoint. Results go to
+benchmarks/results/static_quality.json; --readme puts the table between the markers in README.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+RESULTS = HERE / "results" / "static_quality.json"
+ROWS = ("1000x60", "2000x60", "5000x120", "5000x300", "2000x60xK0", "5000x120xK0")
+MARKERS = ("<!-- static-quality -->", "<!-- /static-quality -->")
+
+
+def one_run(scene: Path, primitives: int, seconds: int, neurons: int, seed: int) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        words = [f"scene.path='{scene}'", f"model.primitives={primitives}", f"model.neurons={neurons}", f"train.max_seconds={seconds}"]
+        words += [f"seed={seed}", f"output_dir='{out}'", "train.iterations=1000000", "train.background=white", "train.eval_every=0"]
+        subprocess.run([sys.executable, "-m", "neuprim", "run", "task=static", "scene=blender", *words], check=True, stdout=subprocess.DEVNULL)
+        return json.loads((out / "metrics.json").read_text())  # type: ignore[no-any-return]
+
+
+def cpu_name() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        for line in info.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def spread(values: list[float], digits: int) -> str:
+    half = (max(values) - min(values)) / 2
+    return f"{statistics.mean(values):.{digits}f}" + (f" ± {half:.{digits}f}" if len(values) > 1 else "")
+
+
+def table(results: dict[str, Any]) -> str:
+    lines = ["| primitives | neurons | training | PSNR | worst view | SSIM | steps | model |", "| --- | --- | --- | --- | --- | --- | --- | --- |"]
+    for row in results["rows"]:
+        runs = row["runs"]
+        lines.append(
+            f"| {row['primitives']} | {row['neurons'] or '0 (constant density)'} | {row['seconds']} s | {spread([r['psnr'] for r in runs], 2)} dB "
+            f"| {spread([r['psnr_worst'] for r in runs], 1)} dB | {spread([r['ssim'] for r in runs], 4)} "
+            f"| {round(statistics.mean(r['iterations'] for r in runs))} | {runs[0]['model_bytes'] / 1e6:.2f} MB |"
+        )
+    note = f"\n{results['scene']}, {results['views']} test views, {results['seeds']} seed(s), {results['cores']} cores of {results['cpu']}."
+    return "\n".join(lines) + "\n" + note
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("scene", type=Path, nargs="?")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--rows", nargs="*", default=list(ROWS), help="PRIMITIVESxSECONDS[xKNEURONS]")
+    parser.add_argument("--readme", action="store_true", help="write the recorded table into README.md")
+    args = parser.parse_args()
+    if args.scene:
+        from neuprim.core.render.cpu.threads import core_count
+
+        results: dict[str, Any] = {"cpu": cpu_name(), "cores": core_count(), "seeds": args.seeds, "rows": []}
+        for text in args.rows:
+            parts = text.split("x")
+            primitives, seconds = int(parts[0]), int(parts[1])
+            neurons = int(parts[2].lstrip("K")) if len(parts) > 2 else 8
+            runs = [one_run(args.scene.resolve(), primitives, seconds, neurons, seed) for seed in range(args.seeds)]
+            keys = ("psnr", "psnr_worst", "ssim", "iterations", "train_seconds", "model_bytes", "parameters_per_primitive", "seed")
+            results["rows"].append({"primitives": primitives, "seconds": seconds, "neurons": neurons, "runs": [{k: r[k] for k in keys} for r in runs]})
+            results["scene"], results["views"], results["versions"] = runs[0]["dataset"], len(runs[0]["per_view"]), runs[0]["versions"]
+            RESULTS.parent.mkdir(exist_ok=True)
+            RESULTS.write_text(json.dumps(results, indent=1) + "\n")  # after every row: a long benchmark may be cut short
+            print(table(results), flush=True)
+    results = json.loads(RESULTS.read_text())
+    if args.readme:
+        readme = HERE.parent / "README.md"
+        text = readme.read_text()
+        head, rest = text.split(MARKERS[0], 1)
+        _, tail = rest.split(MARKERS[1], 1)
+        readme.write_text(f"{head}{MARKERS[0]}\n{table(results)}\n{MARKERS[1]}{tail}")
+    elif not args.scene:
+        print(table(results))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""Two backends on the same frame, and how far apart they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
+from tests import scenes
+
+
+@dataclass
+class Frame:
+    """A backend's images and its gradients of one fixed random functional of them."""
+
+    output: RenderOutput
+    grads: dict[str, Tensor]
+
+
+def weights(shape: tuple[int, ...], seed: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def undecided(t: dict[str, Tensor], camera: Camera, settings: RenderSettings) -> Tensor:
+    """(H, W) pixels on which float32 and float64 may rightly fall on different sides of a cut.
+
+    Those whose reference image jumps when alpha_min or transmittance_min moves by 1e-5 (of itself, for the latter 1e-3).
+    """
+    wide = scenes.lowered({k: v.detach().double() for k, v in t.items()})
+    images = []
+    with torch.no_grad():
+        for sign in (-1.0, 1.0):
+            low, stop = settings.alpha_min, settings.transmittance_min
+            moved = replace(settings, backend="reference", depth=False, alpha_min=max(low + sign * 1e-5, 0.0), transmittance_min=stop * (1 + sign * 1e-3))
+            images.append(render_lowered(wide, camera, moved).alpha)
+    return images[0] != images[1]
+
+
+def draw(
+    backend: str, t: dict[str, Tensor], camera: Camera, settings: RenderSettings, skip: Tensor | None = None, with_view: bool = True
+) -> Frame:
+    """Images and gradients; the reference gets the same numbers in float64. ``skip`` pixels carry no gradient."""
+    dtype = torch.float64 if backend == "reference" else torch.float32
+    leaves = {k: v.detach().to(dtype).requires_grad_() for k, v in t.items()}
+    view = camera.viewmat.detach().clone().requires_grad_(with_view)
+    background = torch.linspace(0.2, 0.9, t["colors"].shape[1]).to(dtype).requires_grad_()
+    output = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(settings, backend=backend), background)  # type: ignore[arg-type]
+    h, w, C = output.rgb.shape
+    keep = torch.ones(h, w, dtype=torch.float64) if skip is None else (~skip).double()
+    output.stats.pixel_error = (weights((h, w), 3).abs() * keep).float()
+    total = (output.rgb * (weights((h, w, C), 0) * keep[..., None]).to(dtype)).sum() + (output.alpha * (weights((h, w), 1) * keep).to(dtype)).sum()
+    if output.depth is not None:
+        # a depth is a quotient by alpha: near alpha_min its derivative is large and has few digits
+        solid = (output.alpha.detach() > 0.1).double() * keep
+        total = total + 0.1 * (output.depth * (weights((h, w), 2) * solid).to(dtype)).sum()
+    total.backward()
+    grads = {k: v.grad if v.grad is not None else torch.zeros_like(v) for k, v in leaves.items()}
+    grads["background"] = background.grad if background.grad is not None else torch.zeros_like(background)
+    if with_view and view.grad is not None:
+        grads["viewmat"] = view.grad
+    return Frame(output, {k: v.detach() for k, v in grads.items()})
+
+
+def row_errors(found: Tensor, expected: Tensor) -> Tensor:
+    """(N,) norm of each row's error over the row's own norm plus a thousandth of the mean row."""
+    if expected.numel() == 0:
+        return torch.zeros(1)
+    a, b = found.double().reshape(found.shape[0], -1), expected.double().reshape(expected.shape[0], -1)
+    norm = b.norm(dim=1)
+    scale = norm + 1e-3 * norm.mean()
+    return (a - b).norm(dim=1) / scale.clamp_min(1e-30)
+
+
+def assert_same_frame(t: dict[str, Tensor], camera: Camera, settings: RenderSettings, image_bound: float = 1e-5, grad_bound: float = 1e-3) -> tuple[Frame, Frame]:
+    """cpu within ``image_bound`` of the reference, gradients within ``grad_bound`` of each row's norm; returns (cpu, reference)."""
+    skip = undecided(t, camera, settings)
+    assert skip.float().mean() < 0.05, f"{int(skip.sum())} pixels are undecided: too many for the comparison to mean much"
+    fast, slow = (draw(b, t, camera, settings, skip) for b in ("cpu", "reference"))
+    keep = ~skip
+    report: dict[str, Any] = {}
+    report["rgb"] = (fast.output.rgb.double() - slow.output.rgb).abs().amax(-1)[keep].max().item()
+    report["alpha"] = (fast.output.alpha.double() - slow.output.alpha).abs()[keep].max().item()
+    if settings.depth:
+        assert fast.output.depth is not None and slow.output.depth is not None
+        distance = slow.output.depth.abs().max().clamp_min(1e-30)
+        error = (fast.output.depth.double() - slow.output.depth).abs() * slow.output.alpha / distance  # the sum of w z is what is drawn
+        report["depth"] = error[keep].max().item()
+    assert all(v <= image_bound for v in report.values()), report
+    found = {k: row_errors(fast.grads[k], slow.grads[k]).max().item() for k in t}
+    for k in ("background", "viewmat"):
+        found[k] = ((fast.grads[k].double() - slow.grads[k]).norm() / slow.grads[k].norm().clamp_min(1e-12)).item()
+    assert all(v <= grad_bound for v in found.values()), found
+    return fast, slow

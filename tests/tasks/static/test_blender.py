@@ -1,0 +1,299 @@
+"""NeRF-synthetic loader: conventions on marks of known place, and every kind of bad input."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from neuprim.core.errors import DataError
+from neuprim.core.images import write_exr
+from neuprim.core.task import SceneContext
+from neuprim.tasks.static.datasets.blender import load
+from neuprim.tasks.static.datasets.views import ImageViews
+
+W, H, ANGLE = 48, 36, 0.9
+
+
+@pytest.fixture
+def folder(tmp_path: Path, scenes: Any) -> Path:
+    """6 training and 2 test views of one mark, RGBA."""
+    path = tmp_path / "toy"
+    focal = 0.5 * W / math.tan(0.5 * ANGLE)
+    poses = scenes.ring(8)
+    for split, chosen in (("train", poses[:6]), ("test", poses[6:])):
+        frames = []
+        for i, pose in enumerate(chosen):
+            x, y = scenes.direction(pose, scenes.mark)
+            spot = scenes.blob(W, H, focal * x + W / 2, focal * y + H / 2)
+            scenes.save(path / split / f"r_{i}.png", np.stack([spot, spot, spot, np.ones_like(spot)], axis=-1))
+            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()})
+        scenes.write_json(path / f"transforms_{split}.json", {"camera_angle_x": ANGLE, "frames": frames})
+    return path
+
+
+def edit(path: Path, change: Any) -> None:
+    """Apply ``change`` to the JSON document in place."""
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+def test_marks_are_where_cameras_say(folder: Path, scenes: Any, context: Any) -> None:
+    data = load({"path": str(folder)}, context)
+    assert (len(data.train), len(data.test)) == (6, 2)
+    assert max(scenes.off_by(s, i) for s in (data.train, data.test) for i in range(len(s))) < 0.02
+    assert [data.train.view(i).name for i in range(6)] == [f"r_{i}" for i in range(6)]
+    assert (data.name, data.channels, data.color_space, data.data_source, data.downsampling) == ("toy", 3, "srgb", "real", "none")
+    assert data.background.tolist() == [1.0, 1.0, 1.0] and not data.random_background
+    assert data.center.norm() < 1e-3 and data.up.tolist() == [0.0, 0.0, 1.0]
+    assert 3.0 < data.extent < 4.0
+
+
+def test_down_sampling_keeps_marks_in_place(folder: Path, scenes: Any, context: Any) -> None:
+    for factor in (2, 5):  # 48 x 36 leaves remainders for 5
+        data = load({"path": folder, "downsample": factor}, context)
+        assert max(scenes.off_by(data.train, i) for i in range(6)) < 0.03
+        camera = data.train.view(0).camera
+        assert (camera.width, camera.height) == (W // factor, H // factor) == data.train.pixels(0).rgb.shape[1::-1]
+        assert data.downsampling == f"{W // factor}x{H // factor} from 48x36 by area"
+
+
+def test_straight_alpha_is_premultiplied_before_it_is_averaged(folder: Path, context: Any) -> None:
+    pixels = np.zeros((H, W, 4), np.uint8)
+    pixels[:, 0::2] = (200, 100, 50, 255)
+    pixels[:, 1::2] = (255, 255, 255, 0)  # transparent white must not bleed in
+    Image.fromarray(pixels).save(folder / "train" / "r_0.png")
+    full = load({"path": folder}, context).train.pixels(0)
+    assert full.alpha is not None and torch.allclose(full.rgb[0, 0], torch.tensor([200.0, 100.0, 50.0]) / 255)
+    assert full.rgb[0, 1].abs().max() == 0 and full.alpha[0, 1] == 0
+    half = load({"path": folder, "downsample": 2}, context).train.pixels(0)
+    assert half.alpha is not None and half.alpha.shape == (H // 2, W // 2)
+    assert torch.allclose(half.rgb[3, 3], torch.tensor([100.0, 50.0, 25.0]) / 255, atol=0.5 / 255)
+    assert half.alpha[3, 3].item() == pytest.approx(0.5, abs=0.51 / 255)
+    assert torch.allclose(half.over(torch.ones(3))[3, 3], torch.tensor([227.5, 177.5, 152.5]) / 255, atol=1 / 255)
+
+
+@pytest.mark.parametrize(
+    ("background", "color", "random"), [("auto", 1.0, False), ("white", 1.0, False), ("black", 0.0, False), ("random", 1.0, True)]
+)
+def test_backgrounds(folder: Path, context: Any, background: str, color: float, random: bool) -> None:
+    data = load({"path": folder, "background": background}, context)
+    assert data.background.tolist() == [color] * 3 and data.random_background is random
+
+
+def test_hold_out_leaves_the_test_split_unread(folder: Path, context: Any) -> None:
+    (folder / "transforms_test.json").unlink()
+    data = load({"path": folder, "hold_out": 3}, context)
+    assert [data.test.view(i).name for i in range(len(data.test))] == ["r_0", "r_3"]
+    assert [data.train.view(i).name for i in range(len(data.train))] == ["r_1", "r_2", "r_4", "r_5"]
+
+
+def test_other_splits_suffixes_and_field_of_view_per_frame(folder: Path, context: Any) -> None:
+    def change(document: Any) -> None:
+        del document["camera_angle_x"]
+        for frame in document["frames"]:
+            frame["file_path"] += ".png"
+            frame["camera_angle_x"] = 1.2
+
+    edit(folder / "transforms_test.json", change)
+    (folder / "transforms_test.json").rename(folder / "transforms_val.json")
+    data = load({"path": folder, "test_split": "val"}, context)
+    assert data.test.view(1).camera.fx == pytest.approx(24 / math.tan(0.6))
+
+
+def test_exr_is_linear_premultiplied_and_kept_above_one(folder: Path, context: Any) -> None:
+    for split, n in (("train", 6), ("test", 2)):
+        for i in range(n):
+            (folder / split / f"r_{i}.png").unlink()
+            write_exr(folder / split / f"r_{i}.exr", torch.tensor([8.0, 0.5, 0.25, 0.5]).expand(H, W, 4))
+    data = load({"path": folder, "downsample": 2}, context)
+    pixels = data.train.pixels(0)
+    assert data.color_space == "linear"
+    assert pixels.rgb[0, 0].tolist() == [8.0, 0.5, 0.25] and pixels.alpha is not None and pixels.alpha[0, 0] == 0.5
+
+
+def test_images_load_lazily_and_within_the_cache(folder: Path, context: Any) -> None:
+    data = load({"path": folder, "preload": False}, context)
+    (folder / "train" / "r_2.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    data.train.pixels(1)
+    with pytest.raises(DataError, match=r"r_2\.png"):
+        data.train.pixels(2)
+    small = ImageViews(data.train._frames[:2], cache_bytes=W * H * 4 + 1)  # type: ignore[attr-defined]
+    small.pixels(0), small.pixels(1)
+    assert len(small._stored) == 1
+    with pytest.raises(IndexError):
+        small.pixels(2)
+
+
+def test_progress_is_reported(folder: Path, tmp_path: Path, context: Any) -> None:
+    seen: list[tuple[str, float]] = []
+    load({"path": folder}, SceneContext(0, tmp_path, lambda text, fraction: seen.append((text, fraction))))
+    assert ("reading training images", 1.0) in seen and ("reading test images", 1.0) in seen
+
+
+def test_chair(chair: Path, context: Any) -> None:
+    data = load({"path": chair, "downsample": 4}, context)
+    assert (len(data.train), len(data.test)) == (100, 25)
+    assert data.downsampling == "50x50 from 200x200 by area"
+    assert data.center.norm() < 0.01 and data.extent == pytest.approx(5.25, abs=0.01)
+    pixels = data.train.pixels(0)
+    assert pixels.alpha is not None and 0.05 < pixels.alpha.mean() < 0.6 and bool((pixels.rgb <= pixels.alpha[..., None] + 0.01).all())
+
+
+# ---------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({}, ["scene.path is missing"]),
+        ({"path": 3}, ["scene.path is 3"]),
+        ({"path": "", "x": 1}, ["scene.x"]),
+        ({"back_ground": "white"}, ["scene.back_ground", "did you mean 'background'"]),
+        ({"background": "green"}, ["scene.background is 'green'", "auto, white, black, random"]),
+        ({"downsample": 0}, ["scene.downsample is 0", "at least 1"]),
+        ({"downsample": 1.5}, ["scene.downsample is 1.5"]),
+        ({"downsample": True}, ["scene.downsample is True"]),
+        ({"downsample": 100}, ["scene.downsample is 100", "48x36"]),
+        ({"hold_out": 1}, ["scene.hold_out is 1", "at least 2"]),
+        ({"hold_out": -2}, ["scene.hold_out is -2"]),
+        ({"test_split": ""}, ["scene.test_split is ''"]),
+        ({"test_split": "none"}, ["transforms_none.json", "not found"]),
+        ({"preload": "yes"}, ["scene.preload is 'yes'"]),
+    ],
+)
+def test_bad_settings(folder: Path, scenes: Any, context: Any, settings: dict[str, Any], words: list[str]) -> None:
+    if settings and "path" not in settings:
+        settings = {"path": str(folder), **settings}
+    scenes.refused(load, settings, context, *words)
+
+
+def test_bad_folder(folder: Path, scenes: Any, context: Any) -> None:
+    scenes.refused(load, {"path": folder / "no"}, context, str(folder / "no"), "does not exist")
+    scenes.refused(load, {"path": folder / "transforms_test.json"}, context, "is a file")
+    scenes.refused(load, {"path": folder / "train"}, context, "transforms_train.json", "not found")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", ["not valid JSON"]),
+        (b"{", ["not valid JSON", "line 1"]),
+        (b"\xff\xfe\x00", ["not valid JSON"]),
+        (b"[" * 100_000, ["not valid JSON"]),
+        (b"[]", ["top level is a list of 0", "expected an object"]),
+        (b"{}", ["frames is missing", "non-empty list"]),
+        (b'{"frames": []}', ["frames is a list of 0", "non-empty list"]),
+        (b'{"frames": {}}', ["frames is an object"]),
+        (b'{"frames": [3]}', ["frames[0] is 3", "expected an object"]),
+        (b'{"frames": [{}]}', ["frames[0]", "file_path is missing"]),
+        (b'{"frames": [{"file_path": 3}]}', ["frames[0]", "file_path is 3", "text"]),
+        (b'{"frames": [{"file_path": "a\\u0000b"}]}', ["file_path"]),
+    ],
+)
+def test_bad_json(folder: Path, scenes: Any, context: Any, content: bytes, words: list[str]) -> None:
+    (folder / "transforms_train.json").write_bytes(content)
+    scenes.refused(load, {"path": folder}, context, str(folder / "transforms_train.json"), *words)
+
+
+def set_matrix(i: int, j: int, value: Any) -> Any:
+    def change(document: Any) -> None:
+        document["frames"][3]["transform_matrix"][i][j] = value
+
+    return change
+
+
+def set_frame(key: str, value: Any) -> Any:
+    return lambda document: document["frames"][3].__setitem__(key, value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d: d.pop("camera_angle_x"), ["camera_angle_x is missing", "between 0 and pi"]),
+        (lambda d: d.__setitem__("camera_angle_x", "wide"), ['camera_angle_x is "wide"']),
+        (lambda d: d.__setitem__("camera_angle_x", math.nan), ["camera_angle_x is NaN"]),
+        (lambda d: d.__setitem__("camera_angle_x", True), ["camera_angle_x is true"]),
+        (lambda d: d.__setitem__("camera_angle_x", 0), ["camera_angle_x is 0"]),
+        (lambda d: d.__setitem__("camera_angle_x", 3.2), ["camera_angle_x is 3.2"]),
+        (lambda d: d.__setitem__("camera_angle_x", 10**400), ["camera_angle_x is 1000"]),
+        (lambda d: d["frames"][3].pop("transform_matrix"), ["frames[3]", "transform_matrix is missing"]),
+        (set_frame("transform_matrix", [1, 2, 3]), ["frames[3]", "4 rows of 4 numbers"]),
+        (set_frame("transform_matrix", [[1, 0, 0]] * 4), ["frames[3]", "4 rows of 4 numbers"]),
+        (set_frame("transform_matrix", "eye"), ["frames[3]", "4 rows of 4 numbers"]),
+        (set_matrix(1, 2, math.nan), ["frames[3]", "transform_matrix[1][2] is NaN"]),
+        (set_matrix(0, 3, math.inf), ["frames[3]", "transform_matrix[0][3] is Infinity"]),
+        (set_matrix(0, 0, None), ["frames[3]", "transform_matrix[0][0] is null"]),
+        (set_matrix(3, 0, 1.0), ["frames[3]", "transform_matrix[3]", "0 0 0 1"]),
+        (set_frame("transform_matrix", np.diag([1.0, 1.0, 0.0, 1.0]).tolist()), ["frames[3]", "singular"]),
+        (set_frame("transform_matrix", np.diag([2.0, 2.0, 2.0, 1.0]).tolist()), ["frames[3]", "scaled"]),
+        (set_frame("transform_matrix", np.diag([-1.0, 1.0, 1.0, 1.0]).tolist()), ["frames[3]", "mirrored"]),
+        (set_frame("file_path", "./train/r_0"), ["train/r_0", "listed 2 times"]),
+        (set_frame("file_path", "x" * 5000), ["1 files not found"]),
+    ],
+)
+def test_bad_fields(folder: Path, scenes: Any, context: Any, change: Any, words: list[str]) -> None:
+    edit(folder / "transforms_train.json", change)
+    scenes.refused(load, {"path": folder}, context, "transforms_train.json", *words)
+
+
+def test_a_matrix_of_three_rows_is_complete(folder: Path, context: Any) -> None:
+    edit(folder / "transforms_train.json", lambda d: d["frames"][3]["transform_matrix"].pop())
+    load({"path": folder}, context)
+
+
+def test_all_missing_images_are_listed(folder: Path, scenes: Any, context: Any) -> None:
+    for i in (1, 4, 5):
+        (folder / "train" / f"r_{i}.png").unlink()
+    text = scenes.refused(load, {"path": folder}, context, "3 files not found", *(f"train/r_{i}" for i in (1, 4, 5)))
+    assert "r_0" not in text
+
+
+def test_long_lists_of_missing_images_are_cut(folder: Path, scenes: Any, context: Any) -> None:
+    def change(document: Any) -> None:
+        document["frames"] = [{**document["frames"][0], "file_path": f"none_{i}"} for i in range(40)]
+
+    edit(folder / "transforms_train.json", change)
+    text = scenes.refused(load, {"path": folder}, context, "40 files not found", "none_9", "and 30 more")
+    assert "none_10" not in text
+
+
+def test_damaged_images_are_found_while_loading(folder: Path, scenes: Any, context: Any) -> None:
+    bad = folder / "test" / "r_1.png"
+    data = bad.read_bytes()
+    bad.write_bytes(data[: len(data) // 2])
+    scenes.refused(load, {"path": folder}, context, str(bad), "truncated or corrupt")
+    Image.fromarray(np.zeros((H, W), np.uint8)).save(bad)
+    scenes.refused(load, {"path": folder}, context, str(bad), "8-bit grey PNG", "expected 8-bit RGB or RGBA")
+    Image.fromarray(np.zeros((H, W), np.uint16)).save(bad)
+    scenes.refused(load, {"path": folder}, context, str(bad), "16-bit grey PNG")
+
+
+def test_mixed_sizes_channels_and_kinds(folder: Path, scenes: Any, context: Any) -> None:
+    bad = folder / "train" / "r_3.png"
+    scenes.save(bad, np.zeros((H, W + 1, 4)))
+    scenes.refused(load, {"path": folder}, context, str(bad), "49x36", "expected 48x36", "r_0.png")
+    scenes.save(bad, np.zeros((H, W, 3)))
+    scenes.refused(load, {"path": folder}, context, str(bad), "3 channels", "all RGB or all RGBA")
+    bad.unlink()
+    write_exr(bad.with_suffix(".exr"), torch.zeros(H, W, 4))
+    scenes.refused(load, {"path": folder}, context, "r_3.exr", "mixes OpenEXR")
+
+
+def test_random_background_needs_alpha(folder: Path, scenes: Any, context: Any) -> None:
+    for file in [*(folder / "train").iterdir(), *(folder / "test").iterdir()]:
+        scenes.save(file, np.zeros((H, W, 3)))
+    assert load({"path": folder}, context).background.tolist() == [0.0] * 3
+    scenes.refused(load, {"path": folder, "background": "random"}, context, "scene.background is 'random'", "no alpha")
+
+
+def test_hold_out_of_a_single_view(folder: Path, scenes: Any, context: Any) -> None:
+    edit(folder / "transforms_train.json", lambda d: d.__setitem__("frames", d["frames"][:1]))
+    scenes.refused(load, {"path": folder, "hold_out": 2}, context, "scene.hold_out is 2", "only 1")

@@ -1,0 +1,262 @@
+"""COLMAP loader on tiny models written with pycolmap."""
+
+from __future__ import annotations
+
+import builtins
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from neuprim.core.errors import BackendUnavailable
+from neuprim.tasks.static.datasets.colmap import load
+from neuprim.tasks.static.datasets.colmap_files import check_binary_model
+
+W, H = 64, 50
+PARAMS = {
+    "SIMPLE_PINHOLE": [60.0, 29.3, 27.1],
+    "PINHOLE": [60.0, 66.0, 29.3, 27.1],
+    "SIMPLE_RADIAL": [60.0, 29.3, 27.1, -0.2],
+    "OPENCV": [60.0, 66.0, 29.3, 27.1, -0.2, 0.05, 0.01, -0.02],
+    "OPENCV_FISHEYE": [60.0, 66.0, 29.3, 27.1, 0.05, -0.01, 0.0, 0.0],
+}
+POINTS = np.array([[0.21, -0.13, 0.34], [1.0, 2.0, 3.0]])
+COLORS = np.array([[255, 0, 0], [0, 51, 255]], dtype=np.uint8)
+
+
+@pytest.fixture
+def pycolmap() -> Any:
+    return pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'neuprim[colmap]'")
+
+
+@pytest.fixture
+def capture(tmp_path: Path, scenes: Any, pycolmap: Any) -> Callable[..., Path]:
+    """Writes 10 views of one mark, each the given camera's own projection of it."""
+
+    def write(model: str = "PINHOLE", params: list[float] | None = None, text: bool = False, points: bool = True, count: int = 10) -> Path:
+        path = tmp_path / "toy"
+        reconstruction = pycolmap.Reconstruction()
+        lens = pycolmap.Camera(model=model, width=W, height=H, params=params or PARAMS[model], camera_id=1)
+        reconstruction.add_camera_with_trivial_rig(lens)
+        for i, pose in enumerate(scenes.ring(count, radius=1.6)):
+            view = np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
+            u, v = lens.img_from_cam((view @ np.append(scenes.mark, 1.0))[None, :3])[0] if params is None else (30.0, 25.0)
+            scenes.save(path / "images" / f"{i:02d}.png", scenes.blob(W, H, u, v, 1.0))
+            rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(view[:3, :3]), view[:3, 3])
+            # numbers run against the names, which decide the order
+            reconstruction.add_image_with_trivial_frame(pycolmap.Image(name=f"{i:02d}.png", camera_id=1, image_id=count - i), rigid)
+        for xyz, color in zip(POINTS, COLORS, strict=True) if points else ():
+            reconstruction.add_point3D(xyz, pycolmap.Track(), color)
+        (path / "sparse" / "0").mkdir(parents=True)
+        (reconstruction.write_text if text else reconstruction.write)(str(path / "sparse" / "0"))
+        return path
+
+    return write
+
+
+def worst(scenes: Any, data: Any) -> float:
+    return max(scenes.off_by(s, i) for s in (data.train, data.test) for i in range(len(s)))
+
+
+@pytest.mark.parametrize("model", list(PARAMS))
+def test_marks_are_where_cameras_say(capture: Any, scenes: Any, context: Any, model: str) -> None:
+    path = capture(model)
+    data = load({"path": path}, context)
+    assert worst(scenes, data) < (0.02 if "PINHOLE" in model else 0.06)
+    assert (data.train.pixels(0).mask is None) == ("PINHOLE" in model)
+    assert [data.test.view(i).name for i in range(len(data.test))] == ["00", "08"] and len(data.train) == 8
+    assert (data.name, data.color_space, data.downsampling) == ("toy", "srgb", "none")
+    assert worst(scenes, load({"path": path, "downsample": 2}, context)) < 0.06
+
+
+def test_points_are_the_models(capture: Any, context: Any) -> None:
+    points = load({"path": capture()}, context).initial_points(5, torch.Generator().manual_seed(0))
+    assert torch.allclose(points.means, torch.tensor(POINTS).float())
+    assert torch.allclose(points.colors, torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.2, 1.0]]))
+
+
+def test_without_points_a_box_in_front_of_the_cameras(capture: Any, context: Any) -> None:
+    points = load({"path": capture(points=False)}, context).initial_points(50, torch.Generator().manual_seed(0))
+    assert len(points.means) == 50 and points.means.abs().max() < 1.0
+
+
+def test_text_models(capture: Any, scenes: Any, context: Any) -> None:
+    assert worst(scenes, load({"path": capture("OPENCV", text=True)}, context)) < 0.06
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
+def test_reduced_folders_scale_the_camera_to_the_actual_size(capture: Any, scenes: Any, context: Any, pycolmap: Any, model: str) -> None:
+    path = capture(model)
+    lens = pycolmap.Camera(model=model, width=W, height=H, params=PARAMS[model])
+    w, h = 21, 17  # a third of 64 x 50, each side rounded
+    for i, pose in enumerate(scenes.ring(10, radius=1.6)):
+        view = np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
+        u, v = lens.img_from_cam((view @ np.append(scenes.mark, 1.0))[None, :3])[0]
+        scenes.save(path / "images_3" / f"{i:02d}.png", scenes.blob(w, h, u * w / W, v * h / H, 0.8))
+    data = load({"path": path, "images": "images_3"}, context)
+    assert worst(scenes, data) < 0.1 and data.downsampling == "images_3"
+    assert (data.train.view(0).camera.width, data.train.view(0).camera.height) == (w, h)
+    assert load({"path": path, "images": "images_3", "downsample": 2}, context).downsampling == "images_3, then 10x8 from 21x17 by area"
+
+
+def test_sizes_may_differ(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture()
+    scenes.save(path / "images" / "03.png", np.zeros((H // 2, W // 2)))
+    data = load({"path": path}, context)
+    assert {data.train.view(i).camera.width for i in range(len(data.train))} == {W, W // 2}
+
+
+def test_test_every_and_skip_missing(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture()
+    assert len(load({"path": path, "test_every": 5}, context).test) == 2
+    for i in (3, 4):
+        (path / "images" / f"{i:02d}.png").unlink()
+    scenes.refused(load, {"path": path}, context, "2 files not found", "03.png", "04.png", "scene.skip_missing=true")
+    data = load({"path": path, "skip_missing": True}, context)
+    assert len(data.train) + len(data.test) == 8 and worst(scenes, data) < 0.02
+
+
+# ---------------------------------------------------------------- bad input
+
+
+def test_without_pycolmap_the_extra_is_named(tmp_path: Path, context: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def no_pycolmap(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name == "pycolmap":
+            raise ImportError("No module named 'pycolmap'")
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", no_pycolmap)
+    with pytest.raises(BackendUnavailable, match=r"pip install 'neuprim\[colmap\]'"):
+        load({"path": tmp_path}, context)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"image": "images_4"}, ["scene.image", "did you mean 'images'"]),
+        ({"images": 4}, ["scene.images is 4"]),
+        ({"images": "images_4"}, ["images_4", "does not exist", "scene.images"]),
+        ({"model": "sparse/1"}, ["sparse/1", "no cameras.bin or cameras.txt"]),
+        ({"test_every": 0}, ["scene.test_every is 0"]),
+        ({"hold_out": 3}, ["scene.hold_out is not a setting"]),
+    ],
+)
+def test_bad_settings(capture: Any, scenes: Any, context: Any, settings: dict[str, Any], words: list[str]) -> None:
+    scenes.refused(load, {"path": capture(), **settings}, context, *words)
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
+@pytest.mark.parametrize("part", [0.0, 0.05, 0.5, 0.99])
+def test_truncated_models(capture: Any, scenes: Any, context: Any, file: str, part: float) -> None:
+    path = capture()
+    bad = path / "sparse" / "0" / file
+    if not bad.is_file():
+        pytest.skip(f"this pycolmap writes no {file}")
+    data = bad.read_bytes()
+    bad.write_bytes(data[: int(len(data) * part)])
+    scenes.refused(load, {"path": path}, context, str(bad), "truncated or corrupt")
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
+def test_corrupt_counts_and_trailing_bytes(capture: Any, scenes: Any, context: Any, file: str) -> None:
+    path = capture()
+    bad = path / "sparse" / "0" / file
+    if not bad.is_file():
+        pytest.skip(f"this pycolmap writes no {file}")
+    data = bad.read_bytes()
+    bad.write_bytes(struct.pack("<Q", 2**60) + data[8:])
+    scenes.refused(load, {"path": path}, context, str(bad), "truncated or corrupt")
+    bad.write_bytes(data + b"more")
+    scenes.refused(load, {"path": path}, context, str(bad), "corrupt")
+
+
+def test_inconsistent_models(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture()
+    bad = path / "sparse" / "0" / "images.bin"
+    data = bad.read_bytes()
+    at = data.index(b"00.png") - 4
+    bad.write_bytes(data[:at] + struct.pack("<i", 7) + data[at + 4 :])  # there is no camera 7
+    scenes.refused(load, {"path": path}, context, str(path / "sparse" / "0"), "not a readable COLMAP model")
+
+
+def test_models_with_rigs_of_two_cameras(tmp_path: Path, pycolmap: Any) -> None:
+    if not hasattr(pycolmap, "Rig"):
+        pytest.skip("this pycolmap has no rigs")
+    reconstruction = pycolmap.Reconstruction()
+    rig = pycolmap.Rig(rig_id=1)
+    for i in (1, 2):
+        reconstruction.add_camera(pycolmap.Camera(model="PINHOLE", width=W, height=H, params=PARAMS["PINHOLE"], camera_id=i))
+        sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, i)
+        if i == 1:
+            rig.add_ref_sensor(sensor)
+        else:
+            rig.add_sensor(sensor, pycolmap.Rigid3d())
+    reconstruction.add_rig(rig)
+    reconstruction.write(str(tmp_path))
+    check_binary_model(tmp_path, lambda model: 4)
+
+
+def test_missing_model_files(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture()
+    for file in ("images.bin", "points3D.bin"):
+        (path / "sparse" / "0" / file).unlink()
+    scenes.refused(load, {"path": path}, context, "2 files not found", "images.bin", "points3D.bin")
+
+
+def test_damaged_text_model(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture(text=True)
+    (path / "sparse" / "0" / "cameras.txt").write_text("1 PINHOLE 64\n")
+    scenes.refused(load, {"path": path}, context, "sparse/0")
+
+
+@pytest.mark.parametrize(
+    ("params", "words"),
+    [
+        ([0.0, 66.0, 29.3, 27.1], ["fx=0.0", "focal lengths > 0"]),
+        ([60.0, -66.0, 29.3, 27.1], ["fy=-66.0"]),
+        ([60.0, 66.0, float("nan"), 27.1], ["nan", "finite"]),
+    ],
+)
+def test_impossible_cameras(capture: Any, scenes: Any, context: Any, params: list[float], words: list[str]) -> None:
+    scenes.refused(load, {"path": capture("PINHOLE", params)}, context, "camera 1 of image 00.png", *words)
+
+
+def test_unknown_camera_model(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture()
+    bad = path / "sparse" / "0" / "cameras.bin"
+    data = bytearray(bad.read_bytes())
+    data[12:16] = struct.pack("<i", 999)
+    bad.write_bytes(data)
+    scenes.refused(load, {"path": path}, context, str(bad), "camera model number 999")
+
+
+def test_panoramas_are_refused_by_name(capture: Any, scenes: Any, context: Any, pycolmap: Any) -> None:
+    if not hasattr(pycolmap.CameraModelId, "EQUIRECTANGULAR"):
+        pytest.skip("this pycolmap knows no equirectangular cameras")
+    scenes.refused(load, {"path": capture("EQUIRECTANGULAR", [64.0, 50.0])}, context, "EQUIRECTANGULAR", "pinhole")
+
+
+def test_wrong_image_shape(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture()
+    scenes.save(path / "images" / "03.png", np.zeros((H, W // 2)))
+    scenes.refused(load, {"path": path}, context, "03.png", "32x50", "expected 64x50", "or a reduction")
+
+
+def test_damaged_and_grey_images(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture()
+    file = path / "images" / "03.png"
+    file.write_bytes(file.read_bytes()[:-40])
+    scenes.refused(load, {"path": path}, context, str(file), "truncated or corrupt")
+    Image.fromarray(np.zeros((H, W), np.uint8)).save(file)
+    scenes.refused(load, {"path": path}, context, str(file), "grey")
+
+
+def test_too_few_images(capture: Any, scenes: Any, context: Any) -> None:
+    scenes.refused(load, {"path": capture(count=1)}, context, "training split has no images")

@@ -1,0 +1,304 @@
+"""nerfstudio / instant-ngp loader: intrinsics, lenses, masks, splits, and every kind of bad input."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from neuprim.tasks.static.datasets.nerfstudio import load
+
+W, H = 64, 50
+PINHOLE = {"fl_x": 60.0, "fl_y": 66.0, "cx": 29.3, "cy": 27.1, "w": W, "h": H}
+Lens = Callable[[float, float], tuple[float, float]]
+
+
+def opencv(k1: float, k2: float, p1: float, p2: float, k3: float = 0.0, k4: float = 0.0) -> Lens:
+    """OpenCV's documented distortion, written out."""
+
+    def bend(x: float, y: float) -> tuple[float, float]:
+        r = math.hypot(x, y)
+        radial = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6 + k4 * r**8
+        return x * radial + 2 * p1 * x * y + p2 * (r * r + 2 * x * x), y * radial + p1 * (r * r + 2 * y * y) + 2 * p2 * x * y
+
+    return bend
+
+
+def fisheye(k1: float, k2: float) -> Lens:
+    def bend(x: float, y: float) -> tuple[float, float]:
+        r = math.hypot(x, y)
+        t = math.atan(r)
+        return x / r * (t + k1 * t**3 + k2 * t**5), y / r * (t + k1 * t**3 + k2 * t**5)
+
+    return bend
+
+
+@pytest.fixture
+def capture(tmp_path: Path, scenes: Any) -> Callable[..., Path]:
+    """Writes 10 views of one mark as a lens would show them; keywords go into the file."""
+
+    def write(lens: Lens = lambda x, y: (x, y), count: int = 10, sigma: float = 1.0, **fields: Any) -> Path:
+        path = tmp_path / "toy"
+        values = {**PINHOLE, **fields}
+        frames = []
+        for i, pose in enumerate(scenes.ring(count, radius=1.6)):
+            x, y = lens(*scenes.direction(pose, scenes.mark))
+            u, v = values["fl_x"] * x + values["cx"], values["fl_y"] * y + values["cy"]
+            assert 4 < u < W - 4 and 4 < v < H - 4, "the mark must be in the picture"
+            scenes.save(path / "images" / f"{i:02d}.png", scenes.blob(W, H, u, v, sigma))
+            frames.append({"file_path": f"images/{i:02d}.png", "transform_matrix": pose.tolist()})
+        scenes.write_json(path / "transforms.json", {**values, "frames": frames[::-1]})
+        return path
+
+    return write
+
+
+def edit(path: Path, change: Callable[[Any], Any]) -> None:
+    document = json.loads((path / "transforms.json").read_text())
+    change(document)
+    (path / "transforms.json").write_text(json.dumps(document))
+
+
+def worst(scenes: Any, data: Any) -> float:
+    return max(scenes.off_by(s, i) for s in (data.train, data.test) for i in range(len(s)))
+
+
+def names(views: Any) -> list[str]:
+    return [views.view(i).name for i in range(len(views))]
+
+
+def test_off_centre_pinhole(capture: Any, scenes: Any, context: Any) -> None:
+    data = load({"path": capture()}, context)
+    assert worst(scenes, data) < 0.02
+    assert data.train.pixels(0).mask is None and data.train.pixels(0).alpha is None
+    assert names(data.test) == ["00", "08"] and names(data.train) == ["01", "02", "03", "04", "05", "06", "07", "09"]
+    assert data.background.tolist() == [0.0] * 3
+    assert data.up[2] > 0.9 and data.center.norm() < 0.05
+
+
+def test_down_sampling(capture: Any, scenes: Any, context: Any) -> None:
+    data = load({"path": capture(sigma=2.0), "downsample": 3}, context)
+    assert worst(scenes, data) < 0.03 and data.downsampling == "21x16 from 64x50 by area"
+
+
+@pytest.mark.parametrize(
+    ("lens", "fields"),
+    [
+        (opencv(-0.2, 0.05, 0.01, -0.02), {"k1": -0.2, "k2": 0.05, "p1": 0.01, "p2": -0.02}),
+        (opencv(0.2, 0.02, 0.0, 0.0, 0.03, 0.01), {"k1": 0.2, "k2": 0.02, "k3": 0.03, "k4": 0.01, "camera_model": "OPENCV"}),
+        (fisheye(0.05, -0.01), {"k1": 0.05, "k2": -0.01, "camera_model": "OPENCV_FISHEYE"}),
+        (fisheye(0.0, 0.0), {"is_fisheye": True}),
+    ],
+)
+def test_lenses_are_undone(capture: Any, scenes: Any, context: Any, lens: Lens, fields: dict[str, Any]) -> None:
+    path = capture(lens, **fields)
+    assert worst(scenes, load({"path": path}, context)) < 0.06
+    assert worst(scenes, load({"path": path, "downsample": 2}, context)) < 0.06
+    edit(path, lambda d: [d.pop(k) for k in fields])
+    assert worst(scenes, load({"path": path}, context)) > 0.15, "the marks would not show a lens that is ignored"
+
+
+def test_what_the_photograph_does_not_show_is_masked(capture: Any, context: Any) -> None:
+    # pincushion: the corners of the undistorted view lie outside of the photograph
+    mask = load({"path": capture(opencv(0.3, 0, 0, 0), k1=0.3)}, context).train.pixels(0).mask
+    assert mask is not None and not mask[0, 0] and not mask[-1, -1] and mask[H // 2, W // 2] and 0.5 < mask.float().mean() < 1
+
+
+def test_a_lens_that_folds_over_does_not_mirror_the_middle_into_the_corners(capture: Any, context: Any) -> None:
+    # r (1 - 1.8 r^2) turns back at r = 0.43, inside of the picture
+    mask = load({"path": capture(opencv(-1.8, 0, 0, 0), k1=-1.8)}, context).train.pixels(0).mask
+    assert mask is not None
+    y, x = np.indices((H, W)) + 0.5
+    radius = np.hypot((x - PINHOLE["cx"]) / PINHOLE["fl_x"], (y - PINHOLE["cy"]) / PINHOLE["fl_y"])
+    assert not mask.numpy()[radius > 0.46].any() and mask.numpy()[radius < 0.40].all()
+
+
+def test_per_frame_intrinsics_sizes_and_lenses(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture()
+    pose = scenes.ring(10, 1.6)[4]
+    x, y = opencv(-0.1, 0, 0, 0)(*scenes.direction(pose, scenes.mark))
+    scenes.save(path / "images" / "04.png", scenes.blob(80, 40, 50 * x + 38, 50 * y + 21))
+
+    def change(document: Any) -> None:
+        frame = next(f for f in document["frames"] if "04" in f["file_path"])
+        frame.update(fl_x=50, fl_y=50, cx=38, cy=21, w=80.0, h=40, k1=-0.1)
+
+    edit(path, change)
+    data = load({"path": path, "downsample": 2}, context)
+    assert worst(scenes, data) < 0.06 and data.downsampling == "1/2 by area"
+    assert (data.train.view(3).camera.width, data.train.view(3).camera.height) == (40, 20)
+
+
+def test_field_of_view_stands_in_for_focal_lengths(capture: Any, context: Any) -> None:
+    path = capture()
+
+    def change(document: Any) -> None:
+        for key in PINHOLE:
+            del document[key]
+        document["camera_angle_x"] = 1.0
+
+    edit(path, change)
+    camera = load({"path": path}, context).train.view(0).camera
+    assert (camera.fx, camera.fy) == pytest.approx((32 / math.tan(0.5),) * 2) and (camera.cx, camera.cy) == (32, 25)
+    edit(path, lambda d: d.update(camera_angle_y=0.8))
+    assert load({"path": path}, context).train.view(0).camera.fy == pytest.approx(25 / math.tan(0.4))
+
+
+@pytest.mark.parametrize("per_frame", [True, False])
+def test_masks(capture: Any, scenes: Any, context: Any, per_frame: bool) -> None:
+    path = capture()
+    mask = np.zeros((H, W), np.uint8)
+    mask[10:40, 20:51] = 1
+    mask[21, 31] = 0
+    Image.fromarray(mask).save(path / "mask.png")
+    edit(path, lambda d: [f.update(mask_path="mask.png") for f in d["frames"]] if per_frame else d.update(mask_path="mask.png"))
+    found = load({"path": path}, context).train.pixels(0).mask
+    assert found is not None and np.array_equal(found.numpy(), mask.astype(bool))
+    half = load({"path": path, "downsample": 2}, context).train.pixels(0).mask
+    assert half is not None and half.sum() == 15 * 15 - 1, "a reduced pixel counts where all of its pixels do"
+
+
+@pytest.mark.parametrize(
+    ("lists", "train", "test"),
+    [
+        ({"train_filenames": ["images/01.png", "./images/02.png"], "test_filenames": ["images/05.png"]}, ["01", "02"], ["05"]),
+        ({"test_filenames": [f"images/{i:02d}.png" for i in range(7)]}, ["07", "08", "09"], [f"{i:02d}" for i in range(7)]),
+        ({"train_filenames": [f"images/{i:02d}.png" for i in range(8)]}, [f"{i:02d}" for i in range(8)], ["08", "09"]),
+    ],
+)
+def test_split_lists(capture: Any, context: Any, lists: Any, train: list[str], test: list[str]) -> None:
+    data = load({"path": capture(**lists)}, context)
+    assert (names(data.train), names(data.test)) == (train, test)
+
+
+def test_every_nth_is_a_setting(capture: Any, context: Any) -> None:
+    assert names(load({"path": capture(), "test_every": 3}, context).test) == ["00", "03", "06", "09"]
+
+
+def test_ply_points(capture: Any, context: Any) -> None:
+    path = capture(ply_file_path="points.ply")
+    header = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {c}\n" for c in "xyz")
+    color = "".join(f"property uchar {c}\n" for c in ("red", "green", "blue"))
+    (path / "points.ply").write_text(header + color + "end_header\n1 2 3 255 0 0\n4 5 6 0 255 0\n1 2 3 0 0 255\n")
+    points = load({"path": path}, context).initial_points(10, torch.Generator().manual_seed(0))
+    assert points.means.tolist() == [[1, 2, 3], [4, 5, 6]], "points at one place count once"
+    assert points.colors.tolist() == [[1, 0, 0], [0, 1, 0]]
+    (path / "points.ply").write_text(header + "end_header\n1 2 3\n4 5 6\n7 8 9\n")
+    assert load({"path": path}, context).initial_points(2, torch.Generator().manual_seed(0)).colors.tolist() == [[0.5] * 3] * 2
+
+
+def test_same_stems_in_different_folders_get_different_names(capture: Any, context: Any) -> None:
+    path = capture(count=3)
+    (path / "more").mkdir()
+    (path / "images" / "01.png").rename(path / "more" / "00.png")
+    edit(path, lambda d: next(f for f in d["frames"] if "01" in f["file_path"]).update(file_path="more\\00.png"))
+    data = load({"path": path}, context)
+    assert sorted(names(data.train) + names(data.test)) == ["images_00", "images_02", "more_00"]
+
+
+# ---------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"skip_missin": True}, ["scene.skip_missin", "did you mean 'skip_missing'"]),
+        ({"skip_missing": 1}, ["scene.skip_missing is 1", "true or false"]),
+        ({"test_every": 1}, ["scene.test_every is 1", "at least 2"]),
+        ({"background": "random"}, ["no alpha"]),
+    ],
+)
+def test_bad_settings(capture: Any, scenes: Any, context: Any, settings: dict[str, Any], words: list[str]) -> None:
+    scenes.refused(load, {"path": capture(), **settings}, context, *words)
+
+
+def frame(**fields: Any) -> Callable[[Any], None]:
+    """Changes the frame of images/06.png, the fourth in the file."""
+    return lambda d: d["frames"][3].update(fields)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d: d.pop("fl_x"), ["fl_x is missing", "camera_angle_x"]),
+        (lambda d: d.update(fl_x=-3), ["fl_x is -3", "above 0"]),
+        (lambda d: d.update(fl_y="x"), ['fl_y is "x"', "above 0"]),
+        (lambda d: d.update(cx=math.nan), ["cx is NaN", "finite number"]),
+        (lambda d: d.update(k1="small"), ['k1 is "small"']),
+        (lambda d: d.update(p2=[0.1]), ["p2 is a list of 1"]),
+        (frame(k3=math.inf), ["frames[3]", "k3 is Infinity"]),
+        (lambda d: d.update(w=64.5), ["w is 64.5", "whole number"]),
+        (lambda d: d.update(h=0), ["h is 0", "whole number"]),
+        (lambda d: d.update(w=32), ["image is 64x50", "expected 32x50"]),
+        (lambda d: d.update(camera_model="EQUIRECTANGULAR"), ["EQUIRECTANGULAR", "OPENCV_FISHEYE"]),
+        (lambda d: d.update(camera_model=3), ["camera_model is 3"]),
+        (frame(transform_matrix=np.diag([1.0, -1.0, 1.0, 1.0]).tolist()), ["frames[3]", "mirrored"]),
+        (frame(transform_matrix=np.zeros((4, 4)).tolist()), ["frames[3]", "0 0 0 1"]),
+        (frame(file_path=7), ["frames[3]", "file_path is 7"]),
+        (frame(mask_path="no.png"), ["mask_path", "no.png"]),
+        (frame(mask_path=1), ["frames[3]", "mask_path is 1"]),
+        (lambda d: d.update(train_filenames="all"), ['train_filenames is "all"', "list of texts"]),
+        (lambda d: d.update(test_filenames=["images/77.png"]), ["test_filenames", "images/77.png"]),
+        (lambda d: d.update(train_filenames=["images/01.png"], test_filenames=["images/01.png"]), ["share 1 images"]),
+        (lambda d: d.update(train_filenames=[]), ["training split has no images"]),
+        (lambda d: d.update(test_filenames=[]), ["test split has no images"]),
+        (lambda d: d.update(frames=d["frames"][:1]), ["training split has no images"]),
+        (lambda d: d.update(ply_file_path="no.ply"), ["ply_file_path", "no.ply"]),
+        (lambda d: d.update(frames=[]), ["frames is a list of 0"]),
+    ],
+)
+def test_bad_fields(capture: Any, scenes: Any, context: Any, change: Callable[[Any], Any], words: list[str]) -> None:
+    path = capture()
+    edit(path, change)
+    scenes.refused(load, {"path": path}, context, str(path), *words)
+
+
+def test_missing_images_are_listed_or_skipped(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture()
+    for i in (2, 7):
+        (path / "images" / f"{i:02d}.png").unlink()
+    scenes.refused(load, {"path": path}, context, "2 files not found", "images/02.png", "images/07.png", "scene.skip_missing=true")
+    data = load({"path": path, "skip_missing": True}, context)
+    assert sorted(names(data.train) + names(data.test)) == ["00", "01", "03", "04", "05", "06", "08", "09"]
+    assert worst(scenes, data) < 0.02, "poses stay with their images"
+    for file in (path / "images").iterdir():
+        file.unlink()
+    scenes.refused(load, {"path": path, "skip_missing": True}, context, "10 files not found")
+
+
+def test_lists_may_name_skipped_images(capture: Any, context: Any) -> None:
+    path = capture(test_filenames=["images/02.png", "images/03.png"])
+    (path / "images" / "02.png").unlink()
+    data = load({"path": path, "skip_missing": True}, context)
+    assert names(data.test) == ["03"] and "02" not in names(data.train)
+
+
+def test_bad_masks(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture(mask_path="mask.png")
+    Image.fromarray(np.ones((H, W - 1), np.uint8)).save(path / "mask.png")
+    scenes.refused(load, {"path": path}, context, "mask.png", "63x50", "expected 64x50")
+    Image.fromarray(np.zeros((H, W), np.uint8)).save(path / "mask.png")
+    scenes.refused(load, {"path": path}, context, "leave no pixel that counts")
+    (path / "mask.png").write_bytes(b"rubbish")
+    scenes.refused(load, {"path": path}, context, "mask.png", "not a readable PNG")
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\n", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", b"rubbish"])
+def test_bad_ply(capture: Any, scenes: Any, context: Any, content: bytes) -> None:
+    path = capture(ply_file_path="points.ply")
+    (path / "points.ply").write_bytes(content)
+    scenes.refused(load, {"path": path}, context, "points.ply")
+
+
+def test_damaged_image(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture()
+    file = path / "images" / "03.png"
+    file.write_bytes(file.read_bytes()[:-40])
+    scenes.refused(load, {"path": path}, context, str(file), "truncated or corrupt")

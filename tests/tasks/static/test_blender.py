@@ -179,6 +179,8 @@ def test_bad_folder(folder: Path, scenes: Any, context: Any) -> None:
     scenes.refused(load, {"path": folder / "no"}, context, str(folder / "no"), "does not exist")
     scenes.refused(load, {"path": folder / "transforms_test.json"}, context, "is a file")
     scenes.refused(load, {"path": folder / "train"}, context, "transforms_train.json", "not found")
+    scenes.refused(load, {"path": "x" * 5000}, context, "expected the data set's folder")
+    scenes.refused(load, {"path": "~nobody-of-that-name/x"}, context, "expected the data set's folder")
 
 
 @pytest.mark.parametrize(

@@ -77,8 +77,12 @@ def data_folder(path: Any) -> Path:
     Raises:
         DataError: there is no such folder.
     """
-    folder = Path(path).expanduser()
-    if not folder.is_dir():
+    try:
+        folder = Path(path).expanduser()
+        usable = folder.is_dir()
+    except (OSError, RuntimeError) as error:  # a name that is too long, a home folder that nobody has
+        raise DataError(f"{path}: {error}; expected the data set's folder (scene.path)") from None
+    if not usable:
         found = "is a file" if folder.exists() else "does not exist"
         raise DataError(f"{folder}: {found}; expected the data set's folder (scene.path)")
     return folder

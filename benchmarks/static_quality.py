@@ -30,7 +30,9 @@ def one_run(scene: Path, primitives: int, seconds: int, neurons: int, seed: int)
         out = Path(folder) / "run"
         words = [f"scene.path='{scene}'", f"model.primitives={primitives}", f"model.neurons={neurons}", f"train.max_seconds={seconds}"]
         words += [f"seed={seed}", f"output_dir='{out}'", "train.iterations=1000000", "train.background=white", "train.eval_every=0"]
-        subprocess.run([sys.executable, "-m", "neuprim", "run", "task=static", "scene=blender", *words], check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(
+            [sys.executable, "-m", "neuprim", "run", "task=static", "scene=blender", *words], check=True, stdout=subprocess.DEVNULL
+        )
         return json.loads((out / "metrics.json").read_text())  # type: ignore[no-any-return]
 
 
@@ -49,7 +51,10 @@ def spread(values: list[float], digits: int) -> str:
 
 
 def table(results: dict[str, Any]) -> str:
-    lines = ["| primitives | neurons | training | PSNR | worst view | SSIM | steps | model |", "| --- | --- | --- | --- | --- | --- | --- | --- |"]
+    lines = [
+        "| primitives | neurons | training | PSNR | worst view | SSIM | steps | model |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
     for row in results["rows"]:
         runs = row["runs"]
         lines.append(
@@ -78,7 +83,9 @@ def main() -> None:
             neurons = int(parts[2].lstrip("K")) if len(parts) > 2 else 8
             runs = [one_run(args.scene.resolve(), primitives, seconds, neurons, seed) for seed in range(args.seeds)]
             keys = ("psnr", "psnr_worst", "ssim", "iterations", "train_seconds", "model_bytes", "parameters_per_primitive", "seed")
-            results["rows"].append({"primitives": primitives, "seconds": seconds, "neurons": neurons, "runs": [{k: r[k] for k in keys} for r in runs]})
+            results["rows"].append(
+                {"primitives": primitives, "seconds": seconds, "neurons": neurons, "runs": [{k: r[k] for k in keys} for r in runs]}
+            )
             results["scene"], results["views"], results["versions"] = runs[0]["dataset"], len(runs[0]["per_view"]), runs[0]["versions"]
             RESULTS.parent.mkdir(exist_ok=True)
             RESULTS.write_text(json.dumps(results, indent=1) + "\n")  # after every row: a long benchmark may be cut short

@@ -1,6 +1,6 @@
 """The README's picture from a finished run: held-out views, truth above, render below.
 
-    python docs/make_pictures.py RUN_DIR docs/pictures/solids.png
+python docs/make_pictures.py RUN_DIR docs/pictures/solids.png
 """
 
 from __future__ import annotations

@@ -49,7 +49,11 @@ def draw(model: Primitives, view: View, settings: RenderSettings, background: Te
 
 
 def measure(
-    model: Primitives, views: ViewSet, settings: RenderSettings, background: Tensor, seen: Callable[[int, View, Tensor, Tensor], None] | None = None
+    model: Primitives,
+    views: ViewSet,
+    settings: RenderSettings,
+    background: Tensor,
+    seen: Callable[[int, View, Tensor, Tensor], None] | None = None,
 ) -> list[ViewMetrics]:
     """PSNR and SSIM of every view of a split, float images against ``pixels.over(background)``, unclamped and unquantised.
 
@@ -76,7 +80,9 @@ def load_dataset(config: RunConfig, task: TaskSpec, progress: Callable[[str, flo
     return task.scene(config.scene_name).load(config.scene, context)
 
 
-def summary(config: RunConfig, model: Primitives, dataset: Dataset, views: Sequence[ViewMetrics], model_bytes: int, training: Mapping[str, Any]) -> dict[str, Any]:
+def summary(
+    config: RunConfig, model: Primitives, dataset: Dataset, views: Sequence[ViewMetrics], model_bytes: int, training: Mapping[str, Any]
+) -> dict[str, Any]:
     """The content of ``metrics.json``. ``training`` holds iterations and train_seconds as the run recorded them."""
     worst = min(views, key=lambda v: v.psnr)
     lowered = model.lower(dataset.test.view(0).camera, dataset.test.view(0).conditions)
@@ -108,7 +114,12 @@ def summary(config: RunConfig, model: Primitives, dataset: Dataset, views: Seque
         "train_views": len(dataset.train),
         "seed": config.seed,
         "non_default": {key: list(pair) for key, pair in config.non_default.items()},
-        "versions": {"neuprim": neuprim.__version__, "python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
+        "versions": {
+            "neuprim": neuprim.__version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+        },
     }
 
 
@@ -173,7 +184,9 @@ def render_run(
     folder = out if out is not None and not single else run_dir / "renders" / camera.removesuffix(".json").split("/")[-1]
     animate = format == "webp" and len(views) > 1
     if single and len(views) > 1 and not animate:
-        raise ConfigError(f"--out {out}: {len(views)} views do not fit one .{format} file; give a folder, or --format webp for an animation")
+        raise ConfigError(
+            f"--out {out}: {len(views)} views do not fit one .{format} file; give a folder, or --format webp for an animation"
+        )
     if animate:
         target = out if single and out is not None else folder.with_suffix(".webp")
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -49,10 +49,10 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
         dataset = load_dataset(config, task, progress.preparing)
         if len(dataset.test) == 0:
             raise DataError(f"{dataset.name}: the test split is empty")
-        density, colour = task.build(vars(config.model), dataset)
+        density, colour = task.build({**vars(config.model), "options": config.options}, dataset)
         progress.preparing("starting points", 0.0)
         model = initial_model(density, colour, dataset, config.model, config.seed)
-        trainer = Trainer(model, dataset, task.loss(vars(config.train)), config.train, config.renderer, config.seed)
+        trainer = Trainer(model, dataset, task.loss({**vars(config.train), "options": config.options}), config.train, config.renderer, config.seed)
         saved = directory / "checkpoint.safetensors"
         if config.resume and saved.exists():
             header, tensors = checkpoint.read(saved, "checkpoint")
@@ -152,7 +152,7 @@ def _open_curve(path: Path, step: int) -> Any:
             except (ValueError, KeyError, TypeError):
                 continue  # a line that a kill cut short
     write_text(path, "".join(f"{text}\n" for text in kept))
-    return open(path, "a", encoding="utf-8")  # noqa: SIM115 - the caller closes it
+    return open(path, "a", encoding="utf-8")
 
 
 def _next_evaluation(trainer: Trainer) -> float:

@@ -22,7 +22,13 @@ def camera(width: int = 64, height: int = 48, distance: float = 3.0, fov: float 
 
 
 def tensors(
-    count: int = 60, neurons: int = 8, channels: int = 3, seed: int = 0, radius: float = 0.25, frequency: float = 1.0 / 3.0, dtype: torch.dtype = torch.float32
+    count: int = 60,
+    neurons: int = 8,
+    channels: int = 3,
+    seed: int = 0,
+    radius: float = 0.25,
+    frequency: float = 1.0 / 3.0,
+    dtype: torch.dtype = torch.float32,
 ) -> dict[str, Tensor]:
     """Random primitives in the unit cube: overlapping, anisotropic, of positive and negative density."""
     g = torch.Generator().manual_seed(seed)

@@ -50,7 +50,9 @@ class Camera:
         """Return self, or raise :class:`DataError` naming ``where`` for non-finite, singular, scaled or mirrored cameras."""
         numbers = torch.tensor([self.fx, self.fy, self.cx, self.cy], dtype=torch.float64)
         if not (torch.isfinite(numbers).all() and self.fx > 0 and self.fy > 0):
-            raise DataError(f"{where}: intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}; expected finite numbers, focal lengths > 0")
+            raise DataError(
+                f"{where}: intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}; expected finite numbers, focal lengths > 0"
+            )
         if self.width <= 0 or self.height <= 0:
             raise DataError(f"{where}: image size {self.width}x{self.height}; expected positive")
         view = self.viewmat.detach().double()

@@ -78,7 +78,7 @@ def read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     header = read_header(path, kind)
     try:
         with safe_open(str(path), framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (OSError, SafetensorError, ValueError) as error:
         raise CheckpointError(f"{path}: tensors of the {kind} are unreadable: {error}") from error
     return header, tensors
@@ -105,7 +105,9 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
     density, colour = (_field(path, header, task, kind) for kind in ("density", "colour"))
     _, tensors = read(path, "model")
     if not isinstance(density, DensityField) or not isinstance(colour, ColourField):
-        raise CheckpointError(f"{path}: density and colour fields are {type(density).__name__} and {type(colour).__name__}; expected one of each")
+        raise CheckpointError(
+            f"{path}: density and colour fields are {type(density).__name__} and {type(colour).__name__}; expected one of each"
+        )
     try:
         model = Primitives(density, colour, tensors)
     except (ValueError, KeyError) as error:

@@ -25,6 +25,8 @@ class CosineDensity(DensityField):
     "paper" draws the offset as the authors do, which leaves half of all chords without a gradient.
     """
 
+    init_settings = ("mode", "alpha")
+
     def __init__(self, neurons: int = 8) -> None:
         self.neurons = neurons
 

@@ -111,7 +111,12 @@ LoweredColour = Constant | OpaqueColour
 
 
 class Field(ABC):
-    """Per-primitive parameters with a meaning. Subclasses are final: no field inherits from another."""
+    """Per-primitive parameters with a meaning. Subclasses are final: no field inherits from another.
+
+    ``init_settings`` names the keys of ``model.init`` that the field's initialisers read.
+    """
+
+    init_settings: tuple[str, ...] = ()
 
     @abstractmethod
     def parameters(self) -> list[ParameterSpec]:

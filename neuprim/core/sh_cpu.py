@@ -98,7 +98,9 @@ class _Colors(torch.autograd.Function):
         ctx.arrays = [x.detach().contiguous().numpy() for x in (means, rest)]
         ctx.origin, ctx.degree = origin.detach().double().numpy(), degree
         color = np.empty(dc.shape, np.float32)
-        parallel_for(_colors, len(color), _CHUNK, 0, ctx.arrays[0], dc.detach().contiguous().numpy(), ctx.arrays[1], ctx.origin, degree, color)
+        parallel_for(
+            _colors, len(color), _CHUNK, 0, ctx.arrays[0], dc.detach().contiguous().numpy(), ctx.arrays[1], ctx.origin, degree, color
+        )
         ctx.color = color
         return torch.from_numpy(color)
 

@@ -112,7 +112,9 @@ def test_split_carries_sigma(dtype: torch.dtype, bound: float, neurons: int, fac
 
     # the children lie inside their parents' support, apart from each other, and copying the weights would not have done
     g = geometry({k: v.double() for k, v in t.items()})
-    inside = ((child.means.double() - g.means[parents.repeat(2)])[:, None, :] @ g.rotations[parents.repeat(2)])[:, 0] / g.scales[parents.repeat(2)]
+    inside = ((child.means.double() - g.means[parents.repeat(2)])[:, None, :] @ g.rotations[parents.repeat(2)])[:, 0] / g.scales[
+        parents.repeat(2)
+    ]
     assert torch.allclose(inside.norm(dim=1), torch.tensor(0.5, dtype=torch.float64), atol=1e-5)
     assert torch.allclose(inside[:40], -inside[40:], atol=1e-5)
     copies = {**children, **{k: t[k][parents.repeat(2)] for k in DENSITY}}
@@ -173,7 +175,9 @@ def test_omega0_multiplies_the_whole_phase() -> None:
 @pytest.mark.parametrize("neurons", [0, 1, 8])
 def test_a_fresh_primitive_has_the_opacity_asked_for(neurons: int) -> None:
     n = 5
-    context = InitContext(torch.zeros(n, 3), torch.full((n,), 0.3), torch.full((n, 3), 0.5), torch.Generator().manual_seed(0), {"alpha": 0.6})
+    context = InitContext(
+        torch.zeros(n, 3), torch.full((n,), 0.3), torch.full((n, 3), 0.5), torch.Generator().manual_seed(0), {"alpha": 0.6}
+    )
     fresh = Primitives.initialise(CosineDensity(neurons), SphericalHarmonics(0), context)
     b2 = fresh.params["b2"]
     assert torch.allclose(1 - torch.exp(-2 * b2), torch.full((n, 1), 0.6)), "a central chord has optical depth 2 b2"

@@ -15,7 +15,10 @@ from neuprim.tasks.static.fields import SphericalHarmonics
 
 def build(count: int = 4, neurons: int = 8, degree: int = 3, channels: int = 3) -> Primitives:
     context = InitContext(
-        torch.arange(3.0 * count).reshape(count, 3), torch.full((count,), 0.2), torch.rand(count, channels), torch.Generator().manual_seed(0)
+        torch.arange(3.0 * count).reshape(count, 3),
+        torch.full((count,), 0.2),
+        torch.rand(count, channels),
+        torch.Generator().manual_seed(0),
     )
     return Primitives.initialise(CosineDensity(neurons), SphericalHarmonics(degree, channels), context)
 
@@ -71,7 +74,9 @@ def test_a_tensor_too_many() -> None:
         Primitives(model.density, model.colour, {**model.params, "extra": torch.zeros(4)})
 
 
-@pytest.mark.parametrize(("name", "shape"), [("W1", (4, 7, 3)), ("b2", (4,)), ("quats", (4, 3)), ("sh_rest", (3, 15, 3)), ("log_scales", (4, 1))])
+@pytest.mark.parametrize(
+    ("name", "shape"), [("W1", (4, 7, 3)), ("b2", (4,)), ("quats", (4, 3)), ("sh_rest", (3, 15, 3)), ("log_scales", (4, 1))]
+)
 def test_a_wrong_shape_is_named(name: str, shape: tuple[int, ...]) -> None:
     model = build()
     with pytest.raises(ValueError, match=rf"{name} has shape .*expected") as caught:

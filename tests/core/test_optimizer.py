@@ -10,7 +10,9 @@ from neuprim.core.errors import NonFiniteError
 from neuprim.core.schema import ParameterSpec
 from neuprim.core.train.optimizer import RowAdam, adam_step_reference
 
-SPECS = tuple(ParameterSpec(n, s, 0.0, lambda c: torch.zeros(0)) for n, s in (("means", (3,)), ("W1", (4, 3)), ("b2", (1,)), ("none", (0, 3))))
+SPECS = tuple(
+    ParameterSpec(n, s, 0.0, lambda c: torch.zeros(0)) for n, s in (("means", (3,)), ("W1", (4, 3)), ("b2", (1,)), ("none", (0, 3)))
+)
 RATES = {"means": 1e-2, "W1": 3e-3, "b2": 0.1, "none": 1.0}
 
 
@@ -39,7 +41,10 @@ def test_equals_torch_adam(dtype: torch.dtype, tolerance: float) -> None:
         adam.step()
         for name in mine:
             moved = RATES[name] * (step + 1)
-            assert torch.allclose(mine[name], theirs[name], rtol=0, atol=max(tolerance * moved, 2e-7 if dtype == torch.float32 else 0)), (step, name)
+            assert torch.allclose(mine[name], theirs[name], rtol=0, atol=max(tolerance * moved, 2e-7 if dtype == torch.float32 else 0)), (
+                step,
+                name,
+            )
     assert (mine["means"] - params(dtype=dtype)["means"]).abs().max() > 0.05
     assert optimizer.age.tolist() == [20] * 7
 
@@ -52,6 +57,7 @@ def test_numba_path_equals_the_reference_step() -> None:
     optimizer.age = ages.clone()
     m, v = ({n: torch.zeros_like(x.detach()).double() for n, x in q.items()} for _ in range(2))
     exact = {n: x.detach().double() for n, x in q.items()}
+    peak = {n: torch.zeros_like(x) for n, x in exact.items()}
     for step in range(5):
         set_grads(p, step)
         rates = {n: r * 0.8**step for n, r in RATES.items()}
@@ -59,11 +65,12 @@ def test_numba_path_equals_the_reference_step() -> None:
         for n in exact:
             grad = p[n].grad
             assert grad is not None
+            peak[n] = torch.maximum(peak[n], grad.double().abs())
             adam_step_reference(exact[n], grad.double(), m[n], v[n], rates[n], ages + step + 1)
     for n in ("means", "W1", "b2"):
         assert (p[n].detach() - exact[n]).abs().max() <= 1e-5 * RATES[n] * 5 + 1e-6
-        assert torch.allclose(optimizer.m[n].double(), m[n], rtol=1e-5, atol=1e-30)
-        assert torch.allclose(optimizer.v[n].double(), v[n], rtol=1e-5, atol=1e-37)
+        assert bool(((optimizer.m[n].double() - m[n]).abs() <= 1e-6 * peak[n]).all())
+        assert bool(((optimizer.v[n].double() - v[n]).abs() <= 1e-6 * peak[n] ** 2 + 1e-37).all())
 
 
 def test_first_step_is_one_rate_whatever_the_gradient() -> None:

@@ -35,7 +35,13 @@ def undecided(t: dict[str, Tensor], camera: Camera, settings: RenderSettings) ->
     with torch.no_grad():
         for sign in (-1.0, 1.0):
             low, stop = settings.alpha_min, settings.transmittance_min
-            moved = replace(settings, backend="reference", depth=False, alpha_min=max(low + sign * 1e-5, 0.0), transmittance_min=stop * (1 + sign * 1e-3))
+            moved = replace(
+                settings,
+                backend="reference",
+                depth=False,
+                alpha_min=max(low + sign * 1e-5, 0.0),
+                transmittance_min=stop * (1 + sign * 1e-3),
+            )
             images.append(render_lowered(wide, camera, moved).alpha)
     return images[0] != images[1]
 
@@ -52,7 +58,9 @@ def draw(
     h, w, C = output.rgb.shape
     keep = torch.ones(h, w, dtype=torch.float64) if skip is None else (~skip).double()
     output.stats.pixel_error = (weights((h, w), 3).abs() * keep).float()
-    total = (output.rgb * (weights((h, w, C), 0) * keep[..., None]).to(dtype)).sum() + (output.alpha * (weights((h, w), 1) * keep).to(dtype)).sum()
+    total = (output.rgb * (weights((h, w, C), 0) * keep[..., None]).to(dtype)).sum() + (
+        output.alpha * (weights((h, w), 1) * keep).to(dtype)
+    ).sum()
     if output.depth is not None:
         # a depth is a quotient by alpha: near alpha_min its derivative is large and has few digits
         solid = (output.alpha.detach() > 0.1).double() * keep
@@ -75,7 +83,9 @@ def row_errors(found: Tensor, expected: Tensor) -> Tensor:
     return (a - b).norm(dim=1) / scale.clamp_min(1e-30)
 
 
-def assert_same_frame(t: dict[str, Tensor], camera: Camera, settings: RenderSettings, image_bound: float = 1e-5, grad_bound: float = 1e-3) -> tuple[Frame, Frame]:
+def assert_same_frame(
+    t: dict[str, Tensor], camera: Camera, settings: RenderSettings, image_bound: float = 1e-5, grad_bound: float = 1e-3
+) -> tuple[Frame, Frame]:
     """cpu within ``image_bound`` of the reference, gradients within ``grad_bound`` of each row's norm; returns (cpu, reference)."""
     skip = undecided(t, camera, settings)
     assert skip.float().mean() < 0.05, f"{int(skip.sum())} pixels are undecided: too many for the comparison to mean much"

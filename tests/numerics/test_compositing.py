@@ -34,7 +34,11 @@ def loop(t: dict[str, Tensor], camera: Camera, s: RenderSettings) -> tuple[np.nd
     centre_depth = v["means"] @ R[2] + view[2, 3]
     order = np.argsort(centre_depth, kind="stable")
     C = v["colors"].shape[1]
-    rgb, alpha_image, depth = np.zeros((camera.height, camera.width, C)), np.zeros((camera.height, camera.width)), np.zeros((camera.height, camera.width))
+    rgb, alpha_image, depth = (
+        np.zeros((camera.height, camera.width, C)),
+        np.zeros((camera.height, camera.width)),
+        np.zeros((camera.height, camera.width)),
+    )
     for y in range(camera.height):
         for x in range(camera.width):
             in_camera = np.array([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1.0])
@@ -147,7 +151,16 @@ def test_negative_integrals_are_empty_space(backend: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("alpha_max", 1.0), ("alpha_max", 0.0), ("alpha_min", -0.1), ("transmittance_min", 1.0), ("near", 0.0), ("depth_floor", 0.0), ("threads", -1), ("backend", "gpu")],
+    [
+        ("alpha_max", 1.0),
+        ("alpha_max", 0.0),
+        ("alpha_min", -0.1),
+        ("transmittance_min", 1.0),
+        ("near", 0.0),
+        ("depth_floor", 0.0),
+        ("threads", -1),
+        ("backend", "gpu"),
+    ],
 )
 def test_settings_out_of_range_are_named(name: str, value: object) -> None:
     with pytest.raises(ConfigError, match=rf"renderer\.{name}=.*expected"):

@@ -48,7 +48,7 @@ class Population(ABC):
         """Tensors a checkpoint needs."""
         return {}
 
-    def load_state(self, state: dict[str, Tensor]) -> None:
+    def load_state(self, state: dict[str, Tensor]) -> None:  # noqa: B027 - nothing to restore where nothing was kept
         """Counterpart of :meth:`state`."""
 
 
@@ -187,7 +187,9 @@ class Gradient(Population):
         kept = keep.nonzero()[:, 0]
 
         params = {n: v.detach()[kept].clone() for n, v in model.params.items()}
-        halved = model.density.scale_density({k: model.params[k].detach()[clones] for k in model.of(model.density)}, torch.full((len(clones),), 0.5))
+        halved = model.density.scale_density(
+            {k: model.params[k].detach()[clones] for k in model.of(model.density)}, torch.full((len(clones),), 0.5)
+        )
         copies = {**model.rows(clones), **halved}
         place = torch.full((model.count,), -1, dtype=torch.int64)
         place[kept] = torch.arange(len(kept))

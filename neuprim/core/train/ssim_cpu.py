@@ -19,25 +19,50 @@ from neuprim.core.render.cpu.threads import parallel_for
 __all__ = ["photometric_fused"]
 
 f = np.float32
+u = np.uint64  # an unsigned index cannot count from the end, which lets LLVM vectorise
 _TAPS = 11
 _x = np.arange(_TAPS) - 5.0
 _WINDOW = (np.exp(-(_x**2) / (2 * 1.5**2)) / np.exp(-(_x**2) / (2 * 1.5**2)).sum()).astype(np.float32)
 _ROWS = 16  # rows per band; fixed, so that sums do not depend on the number of threads
-_BLOCK = 512  # floats of a row at a time, so that scratch arrays lie at constant offsets
+_BLOCK = 512  # outputs of a row at a time, so that scratch arrays lie at constant offsets in the nearest cache
+_WIDE = 1024  # the same with the window's reach of 10 pixels; bounds the channels at 51
 _EX, _EY, _EXX, _EYY, _EXY = 0, _BLOCK, 2 * _BLOCK, 3 * _BLOCK, 4 * _BLOCK
 _C1, _C2 = f(0.01**2), f(0.03**2)
 
 
 @inline
-def _add_scaled(out, x, w):  # type: ignore[no-untyped-def]
-    for j in range(out.shape[0]):
-        out[j] += w * x[j]
+def _vertical_moments(V, x, y, at, pitch, count):  # type: ignore[no-untyped-def]
+    """Blurs over 11 rows of flat images from position ``at``: x, y, xx, yy, xy, sums kept in registers."""
+    for j in range(count):
+        s0, s1, s2, s3, s4 = f(0), f(0), f(0), f(0), f(0)
+        for k in range(_TAPS):
+            i = u(at + k * pitch + j)
+            w, a, b = _WINDOW[k], x[i], y[i]
+            wa, wb = w * a, w * b
+            s0 += wa
+            s1 += wb
+            s2 += wa * a
+            s3 += wb * b
+            s4 += wa * b
+        V[j], V[_WIDE + j], V[2 * _WIDE + j], V[3 * _WIDE + j], V[4 * _WIDE + j] = s0, s1, s2, s3, s4
 
 
 @inline
-def _add_product(out, x, y, w):  # type: ignore[no-untyped-def]
-    for j in range(out.shape[0]):
-        out[j] += w * x[j] * y[j]
+def _vertical(V, g, at, pitch, count):  # type: ignore[no-untyped-def]
+    for j in range(count):
+        s = f(0)
+        for k in range(_TAPS):
+            s += _WINDOW[k] * g[u(at + k * pitch + j)]
+        V[j] = s
+
+
+@inline
+def _horizontal(out, V, step, count):  # type: ignore[no-untyped-def]
+    for j in range(count):
+        s = f(0)
+        for k in range(_TAPS):
+            s += _WINDOW[k] * V[u(j + k * step)]
+        out[j] = s
 
 
 @inline
@@ -60,74 +85,62 @@ def _derivatives(s, n, scale):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _similarity(start, stop, x, y, channels, grad_mean, grad_xx, grad_xy):  # type: ignore[no-untyped-def]
-    """Window rows start:stop: derivative maps of the mean SSIM; returns the sum of SSIM over them."""
-    n = x.shape[1]
-    m = n - (_TAPS - 1) * channels
-    scale = f(1) / f((x.shape[0] - _TAPS + 1) * m)
-    v = np.zeros((5, n), np.float32)
+def _similarity(start, stop, x, y, height, channels, maps):  # type: ignore[no-untyped-def]
+    """Window rows start:stop: derivative maps of the mean SSIM; returns the sum of SSIM over them.
+
+    x, y: flat (height x width x channels). maps: (3, windows + 20, m + 20 channels), a zero border around the windows.
+    """
+    n = x.shape[0] // height
+    reach = (_TAPS - 1) * channels
+    m = n - reach
+    scale = f(1) / f((height - _TAPS + 1) * m)
+    V = np.zeros(5 * _WIDE, np.float32)
     s = np.zeros(5 * _BLOCK, np.float32)
     total = 0.0
     for r in range(start, stop):
-        v[:] = f(0)
-        for k in range(_TAPS):  # vertical blur first: long contiguous rows
-            w, xr, yr = _WINDOW[k], x[r + k], y[r + k]
-            _add_scaled(v[0], xr, w)
-            _add_scaled(v[1], yr, w)
-            _add_product(v[2], xr, xr, w)
-            _add_product(v[3], yr, yr, w)
-            _add_product(v[4], xr, yr, w)
         for j0 in range(0, m, _BLOCK):
             size = min(_BLOCK, m - j0)
-            s[:] = f(0)
+            _vertical_moments(V, x, y, r * n + j0, n, size + reach)
             for q in range(5):
-                for k in range(_TAPS):
-                    at = j0 + k * channels
-                    _add_scaled(s[q * _BLOCK : q * _BLOCK + size], v[q, at : at + size], _WINDOW[k])
+                _horizontal(s[q * _BLOCK :], V[q * _WIDE :], channels, size)
             total += _derivatives(s, size, scale)
-            grad_mean[r, j0 : j0 + size] = s[_EX : _EX + size]
-            grad_xx[r, j0 : j0 + size] = s[_EXX : _EXX + size]
-            grad_xy[r, j0 : j0 + size] = s[_EXY : _EXY + size]
+            for q, block in enumerate((_EX, _EXX, _EXY)):
+                row = maps[q, r + _TAPS - 1]
+                row[reach + j0 : reach + j0 + size] = s[block : block + size]
     return total
 
 
 @inline
-def _finish_row(gr, h0, xr, yr, h1, h2, l1_share, weight):  # type: ignore[no-untyped-def]
-    """gr = L1 and SSIM gradient of one image row; returns the sum of |x - y|."""
-    for j in range(gr.shape[0]):
-        gr[j] = f(2) * xr[j] * h1[j]
-    for j in range(gr.shape[0]):
-        gr[j] += yr[j] * h2[j]
-    for j in range(gr.shape[0]):
-        gr[j] = -weight * (gr[j] + h0[j])
+def _finish(gr, x, y, s, n, l1_share, weight):  # type: ignore[no-untyped-def]
+    """gr = L1 and SSIM gradient from the three spread maps; returns the sum of |x - y|."""
     line = f(0)
-    for j in range(gr.shape[0]):
-        d = xr[j] - yr[j]
+    for j in range(n):
+        a, b = x[j], y[j]
+        d = a - b
         line += abs(d)
-        gr[j] += l1_share if d > f(0) else (-l1_share if d < f(0) else f(0))
+        sign = l1_share if d > f(0) else (-l1_share if d < f(0) else f(0))
+        gr[j] = sign - weight * (s[j] + f(2) * a * s[_BLOCK + j] + b * s[2 * _BLOCK + j])
     return line
 
 
 @kernel
-def _spread(start, stop, x, y, channels, grad_mean, grad_xx, grad_xy, weight, grad):  # type: ignore[no-untyped-def]
-    """Image rows start:stop of d loss / d x; returns the sum of |x - y|."""
-    n, m, windows = x.shape[1], grad_mean.shape[1], grad_mean.shape[0]
-    v = np.zeros((3, m), np.float32)
-    h = np.zeros((3, n), np.float32)
-    l1_share = (f(1) - weight) / f(x.shape[0] * n)
+def _spread(start, stop, x, y, height, channels, maps, weight, grad):  # type: ignore[no-untyped-def]
+    """Image rows start:stop of d loss / d x, the adjoint of the blur; returns the sum of |x - y|."""
+    n = x.shape[0] // height
+    pitch = maps.shape[2]
+    reach = (_TAPS - 1) * channels
+    V = np.zeros(_WIDE, np.float32)
+    s = np.zeros(3 * _BLOCK, np.float32)
+    l1_share = (f(1) - weight) / f(x.shape[0])
     total = 0.0
     for i in range(start, stop):
-        v[:] = f(0)
-        for k in range(max(0, i - windows + 1), min(_TAPS, i + 1)):
-            w, r = _WINDOW[k], i - k
-            _add_scaled(v[0], grad_mean[r], w)
-            _add_scaled(v[1], grad_xx[r], w)
-            _add_scaled(v[2], grad_xy[r], w)
-        h[:] = f(0)
-        for q in range(3):
-            for k in range(_TAPS):
-                _add_scaled(h[q, k * channels : k * channels + m], v[q], _WINDOW[k])
-        total += _finish_row(grad[i], h[0], x[i], y[i], h[1], h[2], l1_share, weight)
+        for j0 in range(0, n, _BLOCK):
+            size = min(_BLOCK, n - j0)
+            for q in range(3):
+                _vertical(V, maps[q].reshape(-1), i * pitch + j0, pitch, size + reach)  # the window is symmetric
+                _horizontal(s[q * _BLOCK :], V, channels, size)
+            at = i * n + j0
+            total += _finish(grad[at:], x[at:], y[at:], s, size, l1_share, weight)
     return total
 
 
@@ -135,13 +148,13 @@ class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rendered: Tensor, truth: Tensor, weight: float, parts: dict[str, float]) -> Tensor:
         H, W, C = rendered.shape
-        x = np.ascontiguousarray(rendered.detach().numpy()).reshape(H, W * C)
-        y = np.ascontiguousarray(truth.detach().numpy()).reshape(H, W * C)
+        x = np.ascontiguousarray(rendered.detach().numpy()).reshape(-1)
+        y = np.ascontiguousarray(truth.detach().numpy()).reshape(-1)
         windows, m = H - _TAPS + 1, (W - _TAPS + 1) * C
-        maps = [np.empty((windows, m), np.float32) for _ in range(3)]
-        similarity = sum(parallel_for(_similarity, windows, _ROWS, 0, x, y, C, *maps)) / (windows * m)
-        grad = np.empty((H, W * C), np.float32)
-        l1 = sum(parallel_for(_spread, H, _ROWS, 0, x, y, C, *maps, np.float32(weight), grad)) / x.size
+        maps = np.zeros((3, windows + 20, m + 20 * C), np.float32)
+        similarity = sum(parallel_for(_similarity, windows, _ROWS, 0, x, y, H, C, maps)) / (windows * m)
+        grad = np.empty(x.size, np.float32)
+        l1 = sum(parallel_for(_spread, H, _ROWS, 0, x, y, H, C, maps, np.float32(weight), grad)) / x.size
         parts["l1"], parts["ssim"] = float(l1), float(similarity)
         ctx.save_for_backward(torch.from_numpy(grad).reshape(H, W, C))
         return torch.tensor((1 - weight) * l1 + weight * (1 - similarity), dtype=torch.float32)

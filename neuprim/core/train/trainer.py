@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from neuprim.core.data import Dataset
-from neuprim.core.errors import CheckpointError, DataError, NonFiniteError
+from neuprim.core.errors import CheckpointError, ConfigError, DataError, NonFiniteError, nearest
 from neuprim.core.fields import ColourField, DensityField
 from neuprim.core.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
@@ -51,6 +51,10 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
     Raises:
         DataError: the data set offers no starting point.
     """
+    for key in settings.init:
+        known = ("scale", *density.init_settings, *colour.init_settings)
+        if key not in known:
+            raise ConfigError(f"model.init.{key}: no such setting{nearest(key, known)}")
     generator = torch.Generator().manual_seed(seed)
     cloud = dataset.initial_points(settings.primitives, generator)
     if len(cloud.means) == 0:
@@ -77,6 +81,10 @@ class Trainer:
     ) -> None:
         if len(dataset.train) == 0:
             raise DataError(f"{dataset.name}: the training split is empty")
+        names = [spec.name for spec in model.specs]
+        for key in settings.rates:
+            if key not in names:
+                raise ConfigError(f"train.rates.{key}: no such parameter{nearest(key, names)}")
         self.model, self.dataset, self.loss = model, dataset, loss
         self.settings, self.renderer = settings, replace(renderer, depth=False)
         self.optimizer = RowAdam(model.specs, model.params)

@@ -161,7 +161,7 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, g_rgb: Tensor, g_T: Tensor, g_z: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
         frame: _Frame = ctx.frame
         s, t = frame.settings, ctx.tensors
-        count, K = t["W1"].shape[:2]
+        count = t["W1"].shape[0]
         h, w, C = g_rgb.shape
         grad_rgb = np.ascontiguousarray(g_rgb.numpy(), np.float32)
         gT = np.ascontiguousarray((g_T + g_rgb @ torch.from_numpy(frame.background)).numpy(), np.float32)

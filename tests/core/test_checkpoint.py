@@ -1,0 +1,316 @@
+"""Files that are damaged, foreign or hostile: refused by name, quickly, and nothing in them runs."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import pickle
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from neuprim.core import checkpoint
+from neuprim.core.cosine import CosineDensity
+from neuprim.core.errors import CheckpointError
+from neuprim.core.primitives import Primitives
+from neuprim.core.task import TaskSpec
+from neuprim.tasks.static import TASK
+from neuprim.tasks.static.fields import SphericalHarmonics
+from tests import scenes
+
+
+def model(neurons: int = 3, degree: int = 1) -> Primitives:
+    t = scenes.tensors(5, neurons)
+    params = {k: v for k, v in t.items() if k != "colors"} | {"sh_dc": t["colors"]}
+    if degree:
+        params["sh_rest"] = torch.randn(5, (degree + 1) ** 2 - 1, 3)
+    return Primitives(CosineDensity(neurons), SphericalHarmonics(degree), params)
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    path = tmp_path / "a folder" / "model.safetensors"
+    checkpoint.save_model(path, model(), "static", {"background": [0.0, 0.5, 1.0], "note": "naïve"})
+    return path
+
+
+def refused(path: Path, task: TaskSpec = TASK) -> str:
+    """The message with which a model is refused, which names the file; within a second."""
+    start = time.perf_counter()
+    with pytest.raises(CheckpointError) as caught:
+        checkpoint.load_model(path, task)
+    assert time.perf_counter() - start < 1.0
+    assert str(path) in str(caught.value)
+    return str(caught.value)
+
+
+def rewrite(path: Path, header: dict[str, Any] | str | None = None, tensors: dict[str, Tensor] | None = None, **changes: Any) -> None:
+    """The saved model with another header or other tensors."""
+    old, values = checkpoint.read(path, "model")
+    text = header if isinstance(header, str) else json.dumps({**old, **(header or {}), **changes})
+    save_file({**values, **(tensors or {})}, str(path), metadata={"neuprim": text})
+
+
+# ---------------------------------------------------------------- what is whole
+
+
+def test_round_trip(saved: Path) -> None:
+    again, header = checkpoint.load_model(saved, TASK)
+    torch.manual_seed(0)
+    first = checkpoint.read(saved, "model")[1]
+    assert list(again.params) == [s.name for s in again.specs]
+    assert all(torch.equal(first[k], v) for k, v in again.params.items())
+    assert isinstance(again.density, CosineDensity) and again.density.neurons == 3
+    assert isinstance(again.colour, SphericalHarmonics) and again.colour.degree == 1
+    assert header["background"] == [0.0, 0.5, 1.0] and header["note"] == "naïve" and header["primitives"] == 5
+    assert saved.stat().st_mode & 0o777 == 0o666 & ~_umask()
+    assert [p.name for p in saved.parent.iterdir()] == ["model.safetensors"]
+
+
+def _umask() -> int:
+    old = os.umask(0)
+    os.umask(old)
+    return old
+
+
+@pytest.mark.parametrize("neurons", [0, 16])
+def test_extreme_widths(tmp_path: Path, neurons: int) -> None:
+    path = tmp_path / "m.safetensors"
+    checkpoint.save_model(path, model(neurons, 0), "static", {})
+    assert checkpoint.load_model(path, TASK)[0].params["W1"].shape == (5, neurons, 3)
+
+
+def test_any_tensor_layout_and_type(tmp_path: Path) -> None:
+    tensors = {"strided": torch.arange(12.0).reshape(3, 4).T, "bytes": torch.arange(5, dtype=torch.uint8), "empty": torch.zeros(0, 3), "n": torch.tensor(7)}
+    checkpoint.write(tmp_path / "c", "checkpoint", tensors, {"step": 3})
+    header, again = checkpoint.read(tmp_path / "c", "checkpoint")
+    assert header == {"format": checkpoint.FORMAT, "kind": "checkpoint", "step": 3}
+    assert all(torch.equal(tensors[k], again[k]) and tensors[k].dtype == again[k].dtype for k in tensors)
+
+
+# ---------------------------------------------------------------- what is damaged
+
+
+def test_truncated_anywhere(saved: Path) -> None:
+    whole = saved.read_bytes()
+    cuts = sorted({*(int(i * len(whole) / 48) for i in range(48)), 1, 7, 8, 9, len(whole) - 1})
+    for cut in cuts:
+        saved.write_bytes(whole[:cut])
+        refused(saved)
+    saved.write_bytes(whole)
+    checkpoint.load_model(saved, TASK)
+
+
+def test_bits_flipped_in_the_header(saved: Path) -> None:
+    """Every flip either is refused by name or leaves a valid file (a letter of a free text): never another kind of failure."""
+    whole = bytearray(saved.read_bytes())
+    length = struct.unpack("<Q", whole[:8])[0]
+    outcomes = []
+    for i in range(8 + length):
+        for bit in (0, 5) if i >= 8 else range(8):
+            damaged = bytearray(whole)
+            damaged[i] ^= 1 << bit
+            saved.write_bytes(damaged)
+            try:
+                checkpoint.load_model(saved, TASK)
+                outcomes.append(True)
+            except CheckpointError as error:
+                assert str(saved) in str(error)
+                outcomes.append(False)
+    assert outcomes.count(False) > 0.7 * len(outcomes)
+
+
+def test_a_header_that_claims_terabytes(saved: Path) -> None:
+    whole = saved.read_bytes()
+    for length in (2**40, 2**63, 2**64 - 1):
+        saved.write_bytes(struct.pack("<Q", length) + whole[8:])
+        refused(saved)
+    huge = json.dumps({"means": {"dtype": "F32", "shape": [2**38, 3], "data_offsets": [0, 3 * 2**40]}, "__metadata__": {"neuprim": "{}"}}).encode()
+    saved.write_bytes(struct.pack("<Q", len(huge)) + huge + b"\0" * 64)
+    refused(saved)
+    overflow = json.dumps({"means": {"dtype": "F32", "shape": [2**62, 2**62], "data_offsets": [0, 64]}}).encode()
+    saved.write_bytes(struct.pack("<Q", len(overflow)) + overflow + b"\0" * 64)
+    refused(saved)
+
+
+def test_deeply_nested_json(saved: Path) -> None:
+    rewrite(saved, header="[" * 100_000)
+    refused(saved)
+    nested = b'{"a":' * 50_000
+    saved.write_bytes(struct.pack("<Q", len(nested)) + nested)
+    refused(saved)
+
+
+class Bomb:
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        return os.mkdir, ("executed",)
+
+
+@pytest.mark.parametrize("maker", ["pickle", "torch", "text", "empty", "zeros"])
+def test_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, maker: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "model.safetensors"
+    if maker == "pickle":
+        path.write_bytes(pickle.dumps(Bomb()))
+    elif maker == "torch":
+        torch.save({"x": Bomb()}, path)
+    else:
+        path.write_bytes({"text": b"task: static\n" * 20, "empty": b"", "zeros": b"\0" * 1000}[maker])
+    assert "safetensors" in refused(path) or "header" in refused(path)
+    assert not (tmp_path / "executed").exists()
+
+
+def test_missing_files_and_folders(tmp_path: Path) -> None:
+    assert "no such model" in refused(tmp_path / "none.safetensors")
+    refused(tmp_path)
+
+
+def test_safetensors_of_another_program(tmp_path: Path) -> None:
+    path = tmp_path / "model.safetensors"
+    save_file({"weight": torch.zeros(3)}, str(path))
+    assert "written by neuprim" in refused(path)
+
+
+# ---------------------------------------------------------------- what belongs elsewhere
+
+
+def test_another_task(saved: Path) -> None:
+    rewrite(saved, task="relight")
+    assert "'relight'" in refused(saved) and "'static'" in refused(saved)
+
+
+def test_another_format_version(saved: Path) -> None:
+    rewrite(saved, format=checkpoint.FORMAT + 1)
+    message = refused(saved)
+    assert str(checkpoint.FORMAT + 1) in message and str(checkpoint.FORMAT) in message
+
+
+def test_another_kind(saved: Path) -> None:
+    with pytest.raises(CheckpointError, match="kind is 'model'; expected 'checkpoint'"):
+        checkpoint.read(saved, "checkpoint")
+
+
+@pytest.mark.parametrize("text", ["not json", "[]", "3", "null", '{"kind": "model"}', "{}"])
+def test_headers_that_are_not_ours(saved: Path, text: str) -> None:
+    rewrite(saved, header=text)
+    refused(saved)
+
+
+def test_unknown_field_class(saved: Path) -> None:
+    rewrite(saved, density={"class": "CosineDensty", "settings": {"neurons": 3}})
+    assert "CosineDensty" in refused(saved) and "did you mean 'CosineDensity'" in refused(saved)
+    rewrite(saved, density={"class": "os.system", "settings": {"command": "true"}})
+    refused(saved)
+
+
+def test_fields_in_each_others_place(saved: Path) -> None:
+    rewrite(saved, density={"class": "SphericalHarmonics", "settings": {}})
+    assert "expected one of each" in refused(saved)
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        None, [], "CosineDensity", {"class": "CosineDensity"}, {"class": 3, "settings": {}}, {"class": "CosineDensity", "settings": []},
+        *({"class": "CosineDensity", "settings": s} for s in (
+            {"neurons": 10**9}, {"neurons": -1}, {"neurons": 2**70}, {"neurons": 1e9}, {"neurons": 2.5}, {"neurons": None}, {"neurons": "3"},
+            {"neurons": [3]}, {"neurons": {}}, {"width": 3}, {"neurons": 4}, {"self": 3},
+        )),
+    ],
+    ids=lambda e: json.dumps(e)[:60],
+)  # fmt: skip
+def test_absurd_density_settings(saved: Path, entry: Any) -> None:
+    rewrite(saved, density=entry)
+    refused(saved)
+
+
+@pytest.mark.parametrize("settings", [{"degree": 10**9}, {"degree": 99}, {"degree": -1}, {"degree": "1"}, {"degree": 1, "channels": 10**6}, {"degree": 1, "channels": None}, {"degree": 1, "sh_every": "soon"}])  # fmt: skip
+def test_absurd_colour_settings(saved: Path, settings: dict[str, Any]) -> None:
+    rewrite(saved, colour={"class": "SphericalHarmonics", "settings": settings})
+    if "sh_every" in settings:  # kept as it is and never compared: a model that renders, or a refusal
+        return
+    refused(saved)
+
+
+def test_a_degree_that_does_not_exist_is_refused_when_its_tensors_fit(saved: Path) -> None:
+    rewrite(saved, tensors={"sh_rest": torch.zeros(5, 24, 3)}, colour={"class": "SphericalHarmonics", "settings": {"degree": 4, "channels": 3}})
+    refused(saved)
+
+
+# ---------------------------------------------------------------- tensors that do not fit
+
+
+@pytest.mark.parametrize("value", [torch.zeros(5, 4), torch.zeros(4, 3), torch.zeros(()), torch.zeros(0), torch.zeros(15)], ids=lambda v: str(tuple(v.shape)))
+def test_wrong_shapes(saved: Path, value: Tensor) -> None:
+    rewrite(saved, tensors={"means": value})
+    refused(saved)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.int32, torch.bool, torch.bfloat16])
+def test_wrong_types(saved: Path, dtype: torch.dtype) -> None:
+    rewrite(saved, tensors={"b1": torch.zeros(5, 3, dtype=dtype)})
+    assert "b1" in refused(saved) and str(dtype) in refused(saved)
+
+
+def test_missing_and_extra_tensors(saved: Path) -> None:
+    header, tensors = checkpoint.read(saved, "model")
+    metadata = {"neuprim": json.dumps(header)}
+    save_file({k: v for k, v in tensors.items() if k != "quats"}, str(saved), metadata=metadata)
+    assert "quats" in refused(saved)
+    save_file({**tensors, "extra": torch.zeros(1)}, str(saved), metadata=metadata)
+    assert "extra" in refused(saved)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_tensors_that_are_not_finite(saved: Path, value: float) -> None:
+    w2 = torch.zeros(5, 3)
+    w2[2, 1] = value
+    rewrite(saved, tensors={"w2": w2})
+    assert "w2" in refused(saved)
+
+
+# ---------------------------------------------------------------- writing
+
+
+def test_a_full_disk_leaves_the_old_file(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = saved.read_bytes()
+
+    def full(tensors: dict[str, Tensor], name: str, metadata: dict[str, str]) -> None:
+        Path(name).write_bytes(b"partial")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(checkpoint, "save_file", full)
+    with pytest.raises(CheckpointError, match="No space left on device") as caught:
+        checkpoint.save_model(saved, model(2), "static", {})
+    assert str(saved) in str(caught.value)
+    assert saved.read_bytes() == before
+    assert [p.name for p in saved.parent.iterdir()] == [saved.name]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
+def test_an_interruption_leaves_the_old_file(saved: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]) -> None:
+    before = saved.read_bytes()
+
+    def stop(tensors: dict[str, Tensor], name: str, metadata: dict[str, str]) -> None:
+        Path(name).write_bytes(b"partial")
+        raise error
+
+    monkeypatch.setattr(checkpoint, "save_file", stop)
+    with pytest.raises(error):
+        checkpoint.save_model(saved, model(2), "static", {})
+    assert saved.read_bytes() == before
+    assert [p.name for p in saved.parent.iterdir()] == [saved.name]
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(CheckpointError, match="could not write"):
+        checkpoint.save_model(tmp_path / "file" / "model.safetensors", model(), "static", {})

@@ -40,11 +40,11 @@ def test_equals_torch_adam(dtype: torch.dtype, tolerance: float) -> None:
         optimizer.step(mine, RATES)
         adam.step()
         for name in mine:
-            moved = RATES[name] * (step + 1)
-            assert torch.allclose(mine[name], theirs[name], rtol=0, atol=max(tolerance * moved, 2e-7 if dtype == torch.float32 else 0)), (
-                step,
-                name,
-            )
+            if mine[name].numel():
+                bound = (
+                    tolerance * RATES[name] * (step + 1) + 2 * torch.finfo(dtype).eps * (step + 1) ** 0.5
+                )  # of the steps, and of the value
+                assert (mine[name] - theirs[name]).abs().amax() <= bound, (step, name)
     assert (mine["means"] - params(dtype=dtype)["means"]).abs().max() > 0.05
     assert optimizer.age.tolist() == [20] * 7
 

@@ -52,7 +52,9 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
         density, colour = task.build({**vars(config.model), "options": config.options}, dataset)
         progress.preparing("starting points", 0.0)
         model = initial_model(density, colour, dataset, config.model, config.seed)
-        trainer = Trainer(model, dataset, task.loss({**vars(config.train), "options": config.options}), config.train, config.renderer, config.seed)
+        trainer = Trainer(
+            model, dataset, task.loss({**vars(config.train), "options": config.options}), config.train, config.renderer, config.seed
+        )
         saved = directory / "checkpoint.safetensors"
         if config.resume and saved.exists():
             header, tensors = checkpoint.read(saved, "checkpoint")
@@ -184,7 +186,9 @@ def _warm_up(trainer: Trainer, progress: RunProgress) -> None:
     model = trainer.model
     rows = torch.arange(min(4, model.count))
     few = Primitives(model.density, model.colour, model.rows(rows))
-    Trainer(few, trainer.dataset, trainer.loss, trainer.settings, trainer.renderer, 0).train_step()
+    warm = Trainer(few, trainer.dataset, trainer.loss, trainer.settings, trainer.renderer, 0)
+    warm.step = max(warm.settings.iterations, 1)  # at the end of the budget every band of colour is in use
+    warm.train_step()
 
 
 @contextmanager

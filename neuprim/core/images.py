@@ -9,8 +9,6 @@ Every failure is a :class:`~neuprim.core.errors.DataError` that names the file, 
 
 from __future__ import annotations
 
-import os
-import secrets
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,11 +22,11 @@ from PIL import Image
 from torch import Tensor
 
 from neuprim.core.errors import DataError
+from neuprim.core.files import atomic_path
 
 __all__ = [
     "MAX_PIXELS",
     "ImageInfo",
-    "atomic_path",
     "image_info",
     "linear_to_srgb",
     "read_image",
@@ -265,20 +263,15 @@ def _check_finite(path: Path, pixels: np.ndarray) -> None:
 
 
 @contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path beside ``path`` that replaces it when the block succeeds and is removed when it fails.
-
-    Raises:
-        DataError: the file cannot be written (no such folder, no permission, disk full).
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
+def _writing(path: Path) -> Iterator[Path]:
+    """:func:`neuprim.core.files.atomic_path`, with the file's errors as DataError."""
+    if not path.parent.is_dir():
+        raise DataError(f"{path}: cannot be written (no such folder {path.parent})")
     try:
-        yield temporary
-        os.replace(temporary, path)
+        with atomic_path(path) as temporary:
+            yield temporary
     except OSError as error:
         raise DataError(f"{path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def to_uint8(image: Tensor) -> Tensor:
@@ -304,7 +297,7 @@ def _pillow_image(path: Path, image: Tensor) -> Image.Image:
 
 
 def _save(path: Path, image: Image.Image, kind: str, **options: Any) -> None:
-    with atomic_path(path) as temporary:
+    with _writing(path) as temporary:
         image.save(temporary, format=kind, **options)
 
 
@@ -369,7 +362,7 @@ def write_exr(path: Path, image: Tensor, half: bool = True, extra: Mapping[str, 
             )
         channels[name] = np.ascontiguousarray(plane.detach().cpu().float().numpy())
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with atomic_path(path) as temporary:
+    with _writing(path) as temporary:
         try:
             with OpenEXR.File(header, channels) as file:
                 file.write(str(temporary))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from importlib.resources import files
 from pathlib import Path
 from string import Template
 
+from neuprim.core.files import write_text
 from neuprim.report import sections
 from neuprim.report.record import RunRecord, read_run
 from neuprim.report.text import escape
@@ -26,12 +26,7 @@ def write_report(run_dir: Path) -> Path:
     run_dir = Path(run_dir)
     page = render_page(read_run(run_dir))
     target = run_dir / "report.html"
-    partial = run_dir / f".report.html.{os.getpid()}.partial"
-    try:
-        partial.write_text(page, encoding="utf-8", newline="\n")
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_text(target, page)
     return target
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import torch
 from torch import Tensor
 
-__all__ = ["RenderOutput", "RenderStats"]
+__all__ = ["RenderOutput", "RenderStats", "mean_depth"]
 
 
 @dataclass
@@ -45,3 +46,9 @@ class RenderOutput:
     alpha: Tensor
     depth: Tensor | None
     stats: RenderStats
+
+
+def mean_depth(weighted: Tensor, alpha: Tensor) -> Tensor:
+    """(H, W) sum of w z over sum of w; 0 where nothing is hit. The weights of a ray telescope: their sum is its alpha."""
+    hit = alpha > 0
+    return torch.where(hit, weighted / torch.where(hit, alpha, torch.ones_like(alpha)), torch.zeros_like(weighted))

@@ -16,7 +16,7 @@ from neuprim.core.cameras import Camera
 from neuprim.core.fields import Constant, Cosine
 from neuprim.core.geometry import quaternion_to_matrix
 from neuprim.core.primitives import Lowered
-from neuprim.core.render.output import RenderOutput, RenderStats
+from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.render.projection import screen_boxes
 from neuprim.core.render.settings import RenderSettings
 
@@ -127,10 +127,7 @@ def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings
     if background is not None:
         rgb = rgb + transmittance[..., None] * background.double()
     alpha = 1 - transmittance
-    depth = None
-    if settings.depth:
-        hit = alpha > 0
-        depth = torch.where(hit, z / torch.where(hit, alpha, torch.ones_like(alpha)), torch.zeros_like(z)).to(dtype)
+    depth = mean_depth(z, alpha).to(dtype) if settings.depth else None
     return RenderOutput(rgb.to(dtype), alpha.to(dtype), depth, stats)
 
 

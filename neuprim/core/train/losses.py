@@ -36,7 +36,13 @@ def photometric(settings: Mapping[str, Any]) -> Loss:
     weight = float(settings["ssim_weight"])
 
     def loss(rendered: Tensor, truth: Tensor) -> tuple[Tensor, dict[str, float]]:
-        if rendered.device.type == "cpu" and rendered.dtype == torch.float32 and weight > 0 and min(rendered.shape[:2]) >= 11 and rendered.shape[2] <= 51:
+        if (
+            rendered.device.type == "cpu"
+            and rendered.dtype == torch.float32
+            and weight > 0
+            and min(rendered.shape[:2]) >= 11
+            and rendered.shape[2] <= 51
+        ):
             from neuprim.core.train.ssim_cpu import photometric_fused
 
             return photometric_fused(rendered, truth, weight)

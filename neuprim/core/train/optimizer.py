@@ -94,7 +94,7 @@ class RowAdam:
                 if value.device.type == "cpu" and value.dtype == torch.float32:
                     step = (rates[spec.name] / c1).astype(np.float32)
                     arrays = [x.detach().reshape(-1).numpy() for x in (value, grad.contiguous(), self.m[spec.name], self.v[spec.name])]
-                    parallel_for(_adam_rows, value.shape[0], 4096, 0, spec.size, *arrays, step, root)
+                    parallel_for(_adam_rows, value.shape[0], 1024, 0, spec.size, *arrays, step, root)
                 else:
                     adam_step_reference(value, grad, self.m[spec.name], self.v[spec.name], rates[spec.name], self.age)
 

@@ -20,7 +20,7 @@ from neuprim.core.render.cpu.forward import composite_tiles
 from neuprim.core.render.cpu.layout import G_ERROR, G_WEIGHT, NEURONS, PER_NEURON, SPAN_WIDTH, TILE, row_width
 from neuprim.core.render.cpu.prepare import NON_FINITE, prepare, prepare_backward
 from neuprim.core.render.cpu.threads import parallel_for
-from neuprim.core.render.output import RenderOutput, RenderStats
+from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.render.settings import RenderSettings
 
 __all__ = ["render"]
@@ -229,8 +229,5 @@ def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings
     )  # fmt: skip
     dtype = g.means.dtype
     alpha = 1 - T
-    depth = None
-    if settings.depth:
-        hit = alpha > 0
-        depth = torch.where(hit, zsum / torch.where(hit, alpha, torch.ones_like(alpha)), torch.zeros_like(zsum)).to(dtype)
+    depth = mean_depth(zsum, alpha).to(dtype) if settings.depth else None
     return RenderOutput(rgb.to(dtype), alpha.to(dtype), depth, stats)

@@ -1,0 +1,113 @@
+"""A data set of two known primitives, small enough to fit in a second, in memory and on disk."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from neuprim.core.cameras import Camera, look_at
+from neuprim.core.cosine import CosineDensity
+from neuprim.core.data import Dataset, Pixels, PointCloud, View, ViewSet, camera_extent
+from neuprim.core.fields import Constant, Cosine
+from neuprim.core.geometry import Geometry
+from neuprim.core.primitives import Lowered
+from neuprim.core.render import RenderSettings, render_lowered
+from neuprim.core.train.losses import photometric
+from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
+from neuprim.core.train.trainer import Trainer, initial_model
+from neuprim.tasks.static.fields import SphericalHarmonics
+
+SIZE = 24
+
+
+def truth() -> Lowered:
+    """A red and a blue ellipsoid side by side."""
+    geometry = Geometry(
+        torch.tensor([[-0.35, 0.0, 0.0], [0.4, 0.1, 0.05]]),
+        torch.tensor([[0.4, 0.25, 0.3], [0.3, 0.35, 0.25]]).log(),
+        torch.tensor([[1.0, 0.1, 0.2, 0.0], [0.9, 0.0, -0.3, 0.2]]),
+    )
+    flat = Cosine(torch.zeros(2, 0, 3), torch.zeros(2, 0), torch.zeros(2, 0), torch.tensor([[2.5], [2.0]]))
+    return Lowered(geometry, flat, Constant(torch.tensor([[0.9, 0.15, 0.1], [0.1, 0.3, 0.85]])))
+
+
+def camera(angle: float, height: float) -> Camera:
+    eye = torch.tensor([2.2 * math.cos(angle), 2.2 * math.sin(angle), height])
+    view = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    f = 0.5 * SIZE / math.tan(0.3)
+    return Camera(view, f, f, SIZE / 2, SIZE / 2, SIZE, SIZE)
+
+
+class Views(ViewSet):
+    def __init__(self, count: int, start: float) -> None:
+        self.cameras = [camera(start + 2 * math.pi * i / count, 0.8 * math.sin(2.0 * i)) for i in range(count)]
+        settings = RenderSettings(backend="reference", alpha_min=0.0)
+        frames = [render_lowered(truth(), c, settings) for c in self.cameras]
+        self.images = [Pixels(f.rgb.contiguous(), f.alpha.contiguous()) for f in frames]
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def view(self, index: int) -> View:
+        return View(f"v{index}", self.cameras[index])
+
+    def pixels(self, index: int) -> Pixels:
+        return self.images[index]
+
+
+class TwoPrimitives(Dataset):
+    def __init__(self, random_background: bool = False) -> None:
+        self.name, self.channels, self.color_space, self.data_source = "two", 3, "srgb", "generated"
+        self.train, self.test = Views(6, 0.0), Views(2, 0.4)
+        self.extent = camera_extent([self.train.view(i).camera for i in range(6)])
+        self.background, self.random_background, self.downsampling = torch.ones(3), random_background, "none"
+        self.up, self.center = torch.tensor([0.0, 0.0, 1.0]), torch.zeros(3)
+
+    def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
+        side = torch.arange(count) % 2
+        means = truth().geometry.means[side] + 0.2 * (torch.rand(count, 3, generator=generator) - 0.5)
+        return PointCloud(means, torch.full((count, 3), 0.5))
+
+
+def trainer(dataset: Dataset, iterations: int = 40, seed: int = 0, **changes: Any) -> Trainer:
+    """A fresh trainer of 12 primitives; ``changes`` go to the train settings, ``population`` as a dictionary."""
+    population = PopulationSettings(**{"strategy": "fixed", "every": 7, "start": 0.0, "stop": 1.0, **changes.pop("population", {})})
+    settings = TrainSettings(iterations=iterations, **changes, population=population)
+    settings.check()
+    model = initial_model(CosineDensity(4), SphericalHarmonics(1, 3, 0.25), dataset, ModelSettings(primitives=12), seed)
+    return Trainer(model, dataset, photometric({"ssim_weight": settings.ssim_weight}), settings, RenderSettings(), seed)
+
+
+def write_blender(folder: Path) -> Path:
+    """The same scene as a NeRF-synthetic folder: 6 training and 2 test views with alpha."""
+    dataset = TwoPrimitives()
+    for split, views in (("train", dataset.train), ("test", dataset.test)):
+        (folder / split).mkdir(parents=True, exist_ok=True)
+        frames = []
+        for i in range(len(views)):
+            Image.fromarray(_rgba(views.pixels(i)), "RGBA").save(folder / split / f"r_{i}.png")
+            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": _opengl(views.view(i).camera)})
+        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.6, "frames": frames}))
+    return folder
+
+
+def _rgba(pixels: Pixels) -> np.ndarray[Any, Any]:
+    assert pixels.alpha is not None
+    straight = pixels.rgb / pixels.alpha[..., None].clamp_min(1e-6)
+    both = torch.cat([straight, pixels.alpha[..., None]], -1)
+    result: np.ndarray[Any, Any] = (both.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    return result
+
+
+def _opengl(camera: Camera) -> list[list[float]]:
+    pose: Tensor = torch.linalg.inv(camera.viewmat)
+    pose[:3, 1:3] *= -1
+    result: list[list[float]] = pose.tolist()
+    return result

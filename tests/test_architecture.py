@@ -1,0 +1,119 @@
+"""The rules of the house that a machine can check: imports go down, files stay small."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import neuprim
+
+ROOT = Path(neuprim.__file__).parent
+FILES = sorted(ROOT.rglob("*.py"))
+LONGEST = 400
+
+
+def imported(path: Path) -> set[str]:
+    """Absolute names of all modules a file imports, anywhere in it, type-checking blocks and functions included."""
+    package = (ROOT.name, *path.relative_to(ROOT).parent.parts)
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                base = ".".join([*package[: len(package) - node.level + 1], *([node.module] if node.module else [])])
+            names |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) in ("import_module", "__import__"):
+            names |= {a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str)}
+    return names
+
+
+def within(name: str, package: str) -> bool:
+    return name == package or name.startswith(package + ".")
+
+
+def offences(folder: str, forbidden: tuple[str, ...]) -> list[str]:
+    files = [f for f in FILES if f.is_relative_to(ROOT / folder)]
+    assert len(files) > 2, folder
+    return [f"{f.relative_to(ROOT)} imports {n}" for f in files for n in sorted(imported(f)) if any(within(n, bad) for bad in forbidden)]
+
+
+def test_core_knows_no_task_plugin_or_command() -> None:
+    allowed = ("neuprim.core", "neuprim.__version__")
+    files = [f for f in FILES if f.is_relative_to(ROOT / "core")]
+    wrong = [
+        f"{f.relative_to(ROOT)} imports {n}"
+        for f in files
+        for n in sorted(imported(f))
+        if within(n, "neuprim") and n != "neuprim" and not any(within(n, good) for good in allowed)
+    ]
+    assert wrong == []
+
+
+def test_tasks_know_no_command_plugin_or_other_task() -> None:
+    above = ("neuprim.cli", "neuprim.run", "neuprim.evaluate", "neuprim.report", "neuprim.config", "neuprim.plugins", "neuprim.doctor", "neuprim.progress")
+    for task in sorted(p.name for p in (ROOT / "tasks").iterdir() if (p / "__init__.py").exists()):
+        others = tuple(f"neuprim.tasks.{p.name}" for p in (ROOT / "tasks").iterdir() if p.is_dir() and p.name != task)
+        assert offences(f"tasks/{task}", (*above, *others)) == []
+
+
+def test_nothing_imports_a_built_in_task_by_name() -> None:
+    """Built-in tasks are found through the entry-point group, like anybody's."""
+    wrong = [
+        f"{f.relative_to(ROOT)} imports {n}"
+        for f in FILES
+        if not f.is_relative_to(ROOT / "tasks")
+        for n in imported(f)
+        if n.startswith("neuprim.tasks.")
+    ]
+    assert wrong == []
+
+
+def test_nobody_imports_the_command_line() -> None:
+    wrong = [str(f.relative_to(ROOT)) for f in FILES if f.name != "__main__.py" and any(within(n, "neuprim.cli") for n in imported(f))]
+    assert wrong == []
+
+
+def test_the_checker_sees_every_form_of_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), "ROOT", tmp_path)
+    (tmp_path / "core" / "render").mkdir(parents=True)
+    file = tmp_path / "core" / "render" / "x.py"
+    for text in (
+        "import neuprim.tasks.static",
+        "from neuprim.tasks import static",
+        "from neuprim import tasks",
+        "def f():\n    from neuprim.tasks.static import TASK",
+        "import importlib\nimportlib.import_module('neuprim.tasks.static')",
+    ):
+        file.write_text(text)
+        assert any(within(n, "neuprim.tasks") for n in imported(file)), text
+    file.write_text("from ...tasks import static")
+    assert any(n.endswith(".tasks.static") for n in imported(file))
+    file.write_text("from .settings import RenderSettings")
+    assert any(n.endswith("core.render.settings") for n in imported(file))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_files_stay_small(path: Path) -> None:
+    lines = len(path.read_text(encoding="utf-8").splitlines())
+    assert lines <= LONGEST + 20, f"{lines} lines"
+
+
+def test_every_module_says_what_it_is_for() -> None:
+    silent = [str(f.relative_to(ROOT)) for f in FILES if f.read_text(encoding="utf-8").strip() and not ast.get_docstring(ast.parse(f.read_text(encoding="utf-8")))]
+    assert silent == []
+
+
+def test_nothing_unpickles_or_evaluates() -> None:
+    """No file of a user's is ever executed."""
+    wrong = []
+    for f in FILES:
+        for node in ast.walk(ast.parse(f.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("eval", "exec"):
+                wrong.append(f"{f.relative_to(ROOT)}:{node.lineno}")
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("torch.load", "pickle.load", "pickle.loads", "yaml.load", "yaml.unsafe_load"):
+                wrong.append(f"{f.relative_to(ROOT)}:{node.lineno}")
+    assert wrong == []

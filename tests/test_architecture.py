@@ -54,7 +54,16 @@ def test_core_knows_no_task_plugin_or_command() -> None:
 
 
 def test_tasks_know_no_command_plugin_or_other_task() -> None:
-    above = ("neuprim.cli", "neuprim.run", "neuprim.evaluate", "neuprim.report", "neuprim.config", "neuprim.plugins", "neuprim.doctor", "neuprim.progress")
+    above = (
+        "neuprim.cli",
+        "neuprim.run",
+        "neuprim.evaluate",
+        "neuprim.report",
+        "neuprim.config",
+        "neuprim.plugins",
+        "neuprim.doctor",
+        "neuprim.progress",
+    )
     for task in sorted(p.name for p in (ROOT / "tasks").iterdir() if (p / "__init__.py").exists()):
         others = tuple(f"neuprim.tasks.{p.name}" for p in (ROOT / "tasks").iterdir() if p.is_dir() and p.name != task)
         assert offences(f"tasks/{task}", (*above, *others)) == []
@@ -98,12 +107,18 @@ def test_the_checker_sees_every_form_of_import(tmp_path: Path, monkeypatch: pyte
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_files_stay_small(path: Path) -> None:
-    lines = len(path.read_text(encoding="utf-8").splitlines())
-    assert lines <= LONGEST + 20, f"{lines} lines"
+    """A fused kernel may be longer, alone in its file."""
+    text = path.read_text(encoding="utf-8")
+    kernels = sum(name in text for name in ("@kernel\n", "@inline\n"))
+    assert len(text.splitlines()) <= (1.5 if kernels else 1.05) * LONGEST
 
 
 def test_every_module_says_what_it_is_for() -> None:
-    silent = [str(f.relative_to(ROOT)) for f in FILES if f.read_text(encoding="utf-8").strip() and not ast.get_docstring(ast.parse(f.read_text(encoding="utf-8")))]
+    silent = [
+        str(f.relative_to(ROOT))
+        for f in FILES
+        if f.read_text(encoding="utf-8").strip() and not ast.get_docstring(ast.parse(f.read_text(encoding="utf-8")))
+    ]
     assert silent == []
 
 
@@ -114,6 +129,12 @@ def test_nothing_unpickles_or_evaluates() -> None:
         for node in ast.walk(ast.parse(f.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("eval", "exec"):
                 wrong.append(f"{f.relative_to(ROOT)}:{node.lineno}")
-            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("torch.load", "pickle.load", "pickle.loads", "yaml.load", "yaml.unsafe_load"):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in (
+                "torch.load",
+                "pickle.load",
+                "pickle.loads",
+                "yaml.load",
+                "yaml.unsafe_load",
+            ):
                 wrong.append(f"{f.relative_to(ROOT)}:{node.lineno}")
     assert wrong == []

@@ -29,7 +29,7 @@ def set_grads(p: dict[str, Tensor], seed: int) -> None:
         v.grad = torch.where(torch.rand(v.shape, generator=g) < 0.2, torch.zeros_like(grad), grad).to(v.dtype)
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-6), (torch.float64, 1e-12)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
 def test_equals_torch_adam(dtype: torch.dtype, tolerance: float) -> None:
     mine, theirs = params(dtype=dtype), params(dtype=dtype)
     optimizer = RowAdam(SPECS, mine)

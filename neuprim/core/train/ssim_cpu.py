@@ -19,7 +19,7 @@ from neuprim.core.render.cpu.threads import parallel_for
 __all__ = ["photometric_fused"]
 
 f = np.float32
-u = np.uint64  # an unsigned index cannot count from the end, which lets LLVM vectorise
+index = np.uint64  # an unsigned index cannot count from the end, which lets LLVM vectorise
 _TAPS = 11
 _x = np.arange(_TAPS) - 5.0
 _WINDOW = (np.exp(-(_x**2) / (2 * 1.5**2)) / np.exp(-(_x**2) / (2 * 1.5**2)).sum()).astype(np.float32)
@@ -36,7 +36,7 @@ def _vertical_moments(V, x, y, at, pitch, count):  # type: ignore[no-untyped-def
     for j in range(count):
         s0, s1, s2, s3, s4 = f(0), f(0), f(0), f(0), f(0)
         for k in range(_TAPS):
-            i = u(at + k * pitch + j)
+            i = index(at + k * pitch + j)
             w, a, b = _WINDOW[k], x[i], y[i]
             wa, wb = w * a, w * b
             s0 += wa
@@ -52,7 +52,7 @@ def _vertical(V, g, at, pitch, count):  # type: ignore[no-untyped-def]
     for j in range(count):
         s = f(0)
         for k in range(_TAPS):
-            s += _WINDOW[k] * g[u(at + k * pitch + j)]
+            s += _WINDOW[k] * g[index(at + k * pitch + j)]
         V[j] = s
 
 
@@ -61,7 +61,7 @@ def _horizontal(out, V, step, count):  # type: ignore[no-untyped-def]
     for j in range(count):
         s = f(0)
         for k in range(_TAPS):
-            s += _WINDOW[k] * V[u(j + k * step)]
+            s += _WINDOW[k] * V[index(j + k * step)]
         out[j] = s
 
 

@@ -82,6 +82,7 @@ from neuprim.core.render.cpu.turns import TAU, cos_turns, dsinc_turns, one_minus
 __all__ = ["backward_tiles", "sum_rows"]
 
 f = np.float32
+index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(TILE).astype(np.float32)
 
 
@@ -179,27 +180,31 @@ def _uncomposite_row(st, lanes, cg, w, a, b, rank):  # type: ignore[no-untyped-d
 
 
 @inline
-def _uncomposite_rgb_row(st, lanes, sums, a, b, rank, c0, c1, c2):  # type: ignore[no-untyped-def]
+def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, c0, c1, c2):  # type: ignore[no-untyped-def]
     """:func:`_uncomposite_row` and the tallies of three channels in one pass; ``sums`` are 16 wide and reduced once per pair."""
     a, b = f(a), f(b)
     for k in range(TILE):
-        step, alpha = _STEPS[k], lanes[k]
+        step, alpha = _STEPS[k], S[index(at + k + ALPHA)]
         inside = (step >= a) & (step < b)
-        use = inside & (alpha > f(0)) & (st[k + LAST] >= rank)
+        use = inside & (alpha > f(0)) & (state[index(base + k + LAST)] >= rank)
         alpha = alpha if use else f(0)
-        over = lanes[k + OVER - ALPHA] if use else f(1)
-        g0, g1, g2 = st[k + G_COLOR], st[k + G_COLOR + PIXELS], st[k + G_COLOR + 2 * PIXELS]
+        over = S[index(at + k + OVER)] if use else f(1)
+        g0, g1, g2 = (
+            state[index(base + k + G_COLOR)],
+            state[index(base + k + G_COLOR + PIXELS)],
+            state[index(base + k + G_COLOR + 2 * PIXELS)],
+        )
         cg = g0 * c0 + g1 * c1 + g2 * c2
-        behind = st[k + BEHIND]
-        before = st[k + T_] * over
+        behind = state[index(base + k + BEHIND)]
+        before = state[index(base + k + T_)] * over
         weight = alpha * before
-        g = (before * cg - behind * over) * lanes[k + SLOPE - ALPHA]
-        st[k + BEHIND] = behind + weight * cg
-        st[k + T_] = before
+        g = (before * cg - behind * over) * S[index(at + k + SLOPE)]
+        state[index(base + k + BEHIND)] = behind + weight * cg
+        state[index(base + k + T_)] = before
         g = g if use else f(0)
-        lanes[k + GRAD - ALPHA] = g if inside else lanes[k + GRAD - ALPHA]
+        S[index(at + k + GRAD)] = g if inside else S[index(at + k + GRAD)]
         sums[k] += weight
-        sums[k + TILE] += weight * st[k + ERR]
+        sums[k + TILE] += weight * state[index(base + k + ERR)]
         sums[k + 2 * TILE] += weight * g0
         sums[k + 3 * TILE] += weight * g1
         sums[k + 4 * TILE] += weight * g2
@@ -399,7 +404,7 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                 if b > a:
                     at = offset[y] - a
                     if C == 3 and not with_depth:
-                        _uncomposite_rgb_row(state[y * TILE :], S[ALPHA + at :], sums, a, b, rank, colors[i, 0], colors[i, 1], colors[i, 2])
+                        _uncomposite_rgb_row(state, S, y * TILE, at, sums, a, b, rank, colors[i, 0], colors[i, 1], colors[i, 2])
                         continue
                     cg[:] = f(0)
                     for c in range(C):

@@ -43,6 +43,7 @@ from neuprim.core.render.cpu.turns import cos_turns, one_minus_exp, sinc_turns
 __all__ = ["composite_tiles"]
 
 f = np.float32
+index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(TILE).astype(np.float32)
 _LIVE_EVERY = 4  # pairs between two counts of live pixels: a dead row costs a few lanes, a count costs a reduction per row
 
@@ -92,19 +93,19 @@ def _opacity(S, n, amin, amax):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _composite_rgb_row(st, lanes, a, b, tmin, rank, c0, c1, c2):  # type: ignore[no-untyped-def]
+def _composite_rgb_row(state, S, base, at, a, b, tmin, rank, c0, c1, c2):  # type: ignore[no-untyped-def]
     """One pixel row of three channels: colour += alpha T c, then T; a pixel is live while T >= T_min."""
     a, b = f(a), f(b)
     for k in range(TILE):
-        step, T = _STEPS[k], st[k + T_]
+        step, T = _STEPS[k], state[index(base + k + T_)]
         use = (step >= a) & (step < b) & (T >= tmin)
-        alpha = lanes[k] if use else f(0)
+        alpha = S[index(at + k)] if use else f(0)
         weight = alpha * T
-        st[k + T_] = T - weight
-        st[k + LAST] = rank if alpha > f(0) else st[k + LAST]
-        st[k + COLOR] += weight * c0
-        st[k + COLOR + PIXELS] += weight * c1
-        st[k + COLOR + 2 * PIXELS] += weight * c2
+        state[index(base + k + T_)] = T - weight
+        state[index(base + k + LAST)] = rank if alpha > f(0) else state[index(base + k + LAST)]
+        state[index(base + k + COLOR)] += weight * c0
+        state[index(base + k + COLOR + PIXELS)] += weight * c1
+        state[index(base + k + COLOR + 2 * PIXELS)] += weight * c2
 
 
 @inline
@@ -177,9 +178,7 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                     if b > a:
                         at = offset[y] - a  # the row's lanes start at offset[y], its pixels at a: shift so that both run with k
                         if C == 3 and not with_depth:
-                            _composite_rgb_row(
-                                state[y * TILE :], S[ALPHA + at :], a, b, tmin, rank, colors[i, 0], colors[i, 1], colors[i, 2]
-                            )
+                            _composite_rgb_row(state, S, y * TILE, ALPHA + at, a, b, tmin, rank, colors[i, 0], colors[i, 1], colors[i, 2])
                         else:
                             _composite_row(state[y * TILE :], S[ALPHA + at :], w, a, b, tmin, rank)
                             for c in range(C):

@@ -48,6 +48,7 @@ from neuprim.core.render.cpu.layout import (
 __all__ = ["chords", "compact", "row_spans"]
 
 f = np.float32
+index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(TILE).astype(np.float32)
 _MARGIN = f(2e-3)  # pixels; a lane too many is rejected by its own D
 
@@ -89,19 +90,18 @@ def compact(S, state, offset, bounds, y0, y1, rows_live, fx0, fy0):  # type: ign
         m = bounds[y + TILE] - a
         if m > 0 and rows_live[y] > f(0):
             x0, dv = fx0 + f(a), fy0 + f(y)
-            v, w = S[n:], state[NORM + y * TILE + a :]
+            j = NORM + y * TILE + a
             for k in range(TILE):
-                v[k] = x0 + _STEPS[k]
-                v[k + DV] = dv
-                v[k + NORM_L] = w[k]
+                S[index(DU + n + k)] = x0 + _STEPS[k]
+                S[index(DV + n + k)] = dv
+                S[index(NORM_L + n + k)] = state[index(j + k)]
             n += m
         else:
             bounds[y + TILE] = a
-    v = S[n:]
     for k in range(TILE):
-        v[k] = f(0)
-        v[k + DV] = f(0)
-        v[k + NORM_L] = f(0)
+        S[index(DU + n + k)] = f(0)
+        S[index(DV + n + k)] = f(0)
+        S[index(NORM_L + n + k)] = f(0)
     return n
 
 

@@ -54,17 +54,17 @@ def quadrature(t: dict[str, Tensor], origin: Tensor, d: Tensor, near_z: Tensor, 
 @pytest.mark.parametrize("distance", [2.0, 0.1], ids=["outside", "inside"])
 def test_closed_form_equals_quadrature(neurons: int, distance: float) -> None:
     hit = 0
-    for seed in range(3):
+    for seed in range(2):
         t = scenes.tensors(1, neurons, seed=seed, radius=0.4, dtype=torch.float64)
         t["means"] *= 0.2
-        camera = scenes.camera(13, 11, distance=distance, fov=50, shift=(1.3, -0.7))
+        camera = scenes.camera(9, 7, distance=distance, fov=50, shift=(1.3, -0.7))
         alpha = render_lowered(scenes.lowered(t), camera, EXACT).alpha.reshape(-1)
         local = pixel_directions(camera).reshape(-1, 3)
         depth = quadrature(t, camera.position, local @ camera.viewmat[:3, :3], EXACT.near / local[:, 2])
         expected = (-torch.expm1(-depth.clamp_min(0))).clamp_max(EXACT.alpha_max)
         assert (alpha - expected).abs().max() <= 1e-12
         hit += int((alpha > 0.01).sum())
-    assert hit > 50, "the rays must meet something"
+    assert hit > 20, "the rays must meet something"
 
 
 def test_density_is_the_formula_of_the_paper() -> None:

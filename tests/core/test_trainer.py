@@ -62,9 +62,11 @@ def test_training_learns(plain: Dataset) -> None:
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_half_saved_loaded_and_half_is_the_whole(strategy: str, random_background: Dataset, tmp_path: Path) -> None:
     """N chosen so that the stop falls in the middle of an epoch and between two interventions."""
-    make = lambda: tiny.trainer(
-        random_background, 40, population=STRATEGIES[strategy], warmup_steps=5, anisotropy_weight=1e-3, anisotropy_from=15
-    )
+
+    def make() -> Trainer:
+        smooth = {"warmup_steps": 5, "anisotropy_weight": 1e-3, "anisotropy_from": 15}
+        return tiny.trainer(random_background, 40, population=STRATEGIES[strategy], **smooth)
+
     whole = make()
     expected = list(whole.run())
     first = make()

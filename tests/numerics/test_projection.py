@@ -40,8 +40,8 @@ def extent(mask: Tensor, pixel: float) -> tuple[float, float, float, float]:
 
 @pytest.mark.parametrize(("distance", "fov", "shift"), [(3.0, 40.0, (0.0, 0.0)), (1.6, 100.0, (9.0, -6.0)), (30.0, 4.0, (-25.0, 3.0))])
 def test_boxes_hold_every_hit_and_are_tight(distance: float, fov: float, shift: tuple[float, float]) -> None:
-    fine = 6
-    t = scenes.tensors(16, 0, seed=31, radius=0.2, dtype=torch.float64)
+    fine = 5
+    t = scenes.tensors(12, 0, seed=31, radius=0.2, dtype=torch.float64)
     g = scenes.lowered(t).geometry
     camera = scenes.camera(40, 30, distance=distance, fov=fov, shift=shift)
     boxes = screen_boxes(g, camera, NEAR)
@@ -62,7 +62,7 @@ def test_boxes_hold_every_hit_and_are_tight(distance: float, fov: float, shift: 
         slack = 1.5 / fine
         assert found[0] - x0 < slack and found[1] - y0 < slack and x1 - found[2] < slack and y1 - found[3] < slack, row
         checked += 1
-    assert checked >= 8
+    assert checked >= 5
 
 
 def test_boxes_across_the_near_plane_are_the_whole_screen() -> None:
@@ -151,12 +151,12 @@ def test_one_primitive_in_every_corner_and_edge() -> None:
 
 def test_no_tile_is_listed_without_need() -> None:
     """Tile lists are close to the least possible: about the number of tiles that a hit pixel lies in."""
-    t = shapes(60, torch.tensor([math.log(0.5), math.log(0.05), math.log(0.05)]), 3, 1.0)
-    camera = scenes.camera(160, 120)
+    t = shapes(40, torch.tensor([math.log(0.5), math.log(0.05), math.log(0.05)]), 3, 1.0)
+    camera = scenes.camera(112, 80)
     pairs = render_lowered(scenes.lowered(t), camera, RenderSettings(backend="cpu")).stats.pairs
     g = scenes.lowered({k: v.double() for k, v in t.items()}).geometry
     needed = 0
-    for row in range(60):
-        mask = torch.nn.functional.pad(hits(g, row, camera), (0, 0, 0, 8))
-        needed += int(mask.reshape(8, 16, 10, 16).any(3).any(1).sum())
+    for row in range(40):
+        mask = hits(g, row, camera)
+        needed += int(mask.reshape(5, 16, 7, 16).any(3).any(1).sum())
     assert needed <= pairs <= 1.1 * needed + 5

@@ -58,7 +58,7 @@ def read_cameras(path: Path, size: tuple[int, int] | None = None) -> list[tuple[
             matrix = torch.tensor(merged["transform_matrix"], dtype=torch.float64)
         except KeyError:
             raise DataError(f"{where}: field 'transform_matrix' is missing") from None
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, OverflowError) as error:
             raise DataError(f"{where}: transform_matrix is not a 4x4 matrix of numbers ({error})") from error
         if matrix.shape != (4, 4):
             raise DataError(f"{where}: transform_matrix has shape {tuple(matrix.shape)}; expected (4, 4)")
@@ -71,6 +71,10 @@ def _number(data: dict[str, Any], key: str, where: str, default: float | None = 
     value = data.get(key, default)
     if value is None:
         raise DataError(f"{where}: field {key!r} is missing")
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    try:
+        fine = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # an integer beyond floats
+        fine = False
+    if not fine:
         raise DataError(f"{where}: {key} is {value!r}; expected a finite number")
     return float(value)

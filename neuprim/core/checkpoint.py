@@ -53,7 +53,7 @@ def read_header(path: Path, kind: str) -> dict[str, Any]:
             metadata = file.metadata() or {}
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such {kind}") from None
-    except (OSError, SafetensorError, ValueError) as error:
+    except (OSError, SafetensorError, ValueError, RuntimeError) as error:  # RuntimeError: replaced while being opened
         raise CheckpointError(f"{path}: not a readable {kind} (safetensors: {error}); the file is damaged or of another kind") from error
     if _KEY not in metadata:
         raise CheckpointError(f"{path}: no {_KEY!r} header found; expected a {kind} written by neuprim")
@@ -79,7 +79,7 @@ def read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     try:
         with safe_open(str(path), framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}
-    except (OSError, SafetensorError, ValueError) as error:
+    except (OSError, SafetensorError, ValueError, RuntimeError) as error:
         raise CheckpointError(f"{path}: tensors of the {kind} are unreadable: {error}") from error
     return header, tensors
 
@@ -110,7 +110,7 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
         )
     try:
         model = Primitives(density, colour, tensors)
-    except (ValueError, KeyError) as error:
+    except (ValueError, KeyError, TypeError, IndexError) as error:
         raise CheckpointError(f"{path}: {error}") from error
     for name, value in tensors.items():
         if value.dtype != torch.float32:

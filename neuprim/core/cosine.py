@@ -28,6 +28,8 @@ class CosineDensity(DensityField):
     init_settings = ("mode", "alpha")
 
     def __init__(self, neurons: int = 8) -> None:
+        if not isinstance(neurons, int) or not 0 <= neurons <= 16:
+            raise ValueError(f"{neurons!r} neurons; expected 0..16")
         self.neurons = neurons
 
     def settings(self) -> dict[str, Any]:

@@ -51,7 +51,8 @@ class Pixels:
         """(H, W, C) composited over a (C,) colour; opaque pixels are returned as they are."""
         if self.alpha is None:
             return self.rgb
-        return self.rgb + (1.0 - self.alpha)[..., None] * background.to(self.rgb)
+        uncovered, channels = (1.0 - self.alpha).reshape(-1), self.rgb.shape[-1]
+        return torch.addr(self.rgb.reshape(-1, channels), uncovered, background.to(self.rgb)).reshape(self.rgb.shape)
 
 
 class ViewSet(ABC):

@@ -45,6 +45,8 @@ class Primitives:
         if len(set(names)) != len(names) or set(names) != set(params):
             raise ValueError(f"parameters {sorted(params)} do not match the specs {sorted(names)}")
         self.params: dict[str, Tensor] = {n: params[n] for n in names}
+        if self.params["means"].dim() != 2:
+            raise ValueError(f"parameter means has shape {tuple(self.params['means'].shape)}, expected (N, 3)")
         for spec in self.specs:
             found, expected = tuple(self.params[spec.name].shape), (self.count, *spec.shape)
             if found != expected:

@@ -20,6 +20,7 @@ from neuprim.core.schema import ParameterSpec
 __all__ = ["RowAdam", "adam_step_reference"]
 
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
+_CHUNK_NUMBERS = 65_536  # numbers per unit of work; fixed, although the result does not depend on it
 
 
 def adam_step_reference(value: Tensor, grad: Tensor, m: Tensor, v: Tensor, rate: float, age: Tensor) -> None:
@@ -33,26 +34,45 @@ def adam_step_reference(value: Tensor, grad: Tensor, m: Tensor, v: Tensor, rate:
 
 
 @exact_kernel
-def _adam_rows(start, stop, width, value, grad, m, v, step, root):  # type: ignore[no-untyped-def]
-    """The same on flat float32 arrays of ``width`` numbers per row; step = rate / c1 and root = sqrt(1 / c2) per row.
+def _adam_rows(start, stop, width, value, grad, m, v, rate, correction, root):  # type: ignore[no-untyped-def]
+    """The same on flat float32 arrays of ``width`` numbers per row; correction = 1 / c1 and root = sqrt(1 / c2) per row.
 
     Rows of one age stand together nearly everywhere, so they are taken in runs: long loops that vectorise.
     """
-    one, b1, b2, eps = np.float32(1), np.float32(BETA1), np.float32(BETA2), np.float32(EPS)
+    b1, b2, one_b1, one_b2, eps = np.float32(BETA1), np.float32(BETA2), np.float32(1 - BETA1), np.float32(1 - BETA2), np.float32(EPS)
     i = start
     while i < stop:
         j = i + 1
-        while j < stop and step[j] == step[i]:
+        while j < stop and correction[j] == correction[i] and root[j] == root[i]:
             j += 1
-        a, r = step[i], root[i]
+        a, r = np.float32(rate * correction[i]), np.float32(root[i])
         x, g, mi, vi = value[i * width : j * width], grad[i * width : j * width], m[i * width : j * width], v[i * width : j * width]
         for k in range(x.shape[0]):
-            mk = b1 * mi[k] + (one - b1) * g[k]
-            vk = b2 * vi[k] + (one - b2) * g[k] * g[k]
+            mk = b1 * mi[k] + one_b1 * g[k]
+            vk = b2 * vi[k] + one_b2 * g[k] * g[k]
             mi[k] = mk
             vi[k] = vk
             x[k] -= a * mk / (np.sqrt(vk) * r + eps)
         i = j
+
+
+@exact_kernel
+def _all_finite(x):  # type: ignore[no-untyped-def]
+    """Whether no element is NaN or infinite: x - x is 0 exactly then."""
+    bad = np.float32(0)
+    for k in range(x.shape[0]):
+        bad += x[k] - x[k]
+    return bad == np.float32(0)
+
+
+def _check_gradient(name: str, grad: Tensor) -> None:
+    if grad.device.type == "cpu" and grad.dtype == torch.float32:
+        fine = _all_finite(grad.contiguous().reshape(-1).numpy())
+    else:
+        fine = bool(torch.isfinite(grad).all())
+    if not fine:
+        row = int((~torch.isfinite(grad.reshape(grad.shape[0], -1)).all(dim=1)).nonzero()[0])
+        raise NonFiniteError(f"gradient of {name} of primitive {row} is not finite: {grad[row].flatten()[:8].tolist()}")
 
 
 class RowAdam:
@@ -75,28 +95,31 @@ class RowAdam:
         Raises:
             NonFiniteError: a gradient is NaN or infinite; names parameter and primitive, and changes nothing.
         """
-        grads = {s.name: params[s.name].grad for s in self.specs}
-        for name, grad in grads.items():
-            if grad is not None and not bool(torch.isfinite(grad.sum())):
-                bad = ~torch.isfinite(grad.reshape(grad.shape[0], -1)).all(dim=1)
-                if bool(bad.any()):
-                    row = int(bad.nonzero()[0])
-                    raise NonFiniteError(f"gradient of {name} of primitive {row} is not finite: {grad[row].flatten()[:8].tolist()}")
+        updates = []
+        for spec in self.specs:
+            value, grad = params[spec.name].detach(), params[spec.name].grad
+            if grad is not None and value.numel():
+                _check_gradient(spec.name, grad)
+                updates.append((spec, value, grad))
         self.age += 1
         age = self.age.numpy().astype(np.float64)
-        c1, c2 = 1 - BETA1**age, 1 - BETA2**age
-        root = np.sqrt(1 / c2).astype(np.float32)
-        with torch.no_grad():
-            for spec in self.specs:
-                value, grad = params[spec.name], grads[spec.name]
-                if grad is None or value.numel() == 0:
-                    continue
-                if value.device.type == "cpu" and value.dtype == torch.float32:
-                    step = (rates[spec.name] / c1).astype(np.float32)
-                    arrays = [x.detach().reshape(-1).numpy() for x in (value, grad.contiguous(), self.m[spec.name], self.v[spec.name])]
-                    parallel_for(_adam_rows, value.shape[0], 1024, 0, spec.size, *arrays, step, root)
-                else:
-                    adam_step_reference(value, grad, self.m[spec.name], self.v[spec.name], rates[spec.name], self.age)
+        correction, root = 1 / (1 - BETA1**age), np.sqrt(1 / (1 - BETA2**age))
+        work = []  # (arguments of _adam_rows), small enough to share out
+        for spec, value, grad in updates:
+            m, v, rate = self.m[spec.name], self.v[spec.name], rates[spec.name]
+            if value.device.type == "cpu" and value.dtype == torch.float32:
+                flat = [x.reshape(-1).numpy() for x in (value, grad.contiguous(), m, v)]
+                rows = max(_CHUNK_NUMBERS // spec.size, 1)
+                starts = range(0, value.shape[0], rows)
+                work += [(r, min(r + rows, value.shape[0]), spec.size, *flat, rate, correction, root) for r in starts]
+            else:
+                adam_step_reference(value, grad, m, v, rate, self.age)
+
+        def share(start: int, stop: int) -> None:
+            for arguments in work[start:stop]:
+                _adam_rows(*arguments)
+
+        parallel_for(share, len(work), 1, 0)
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
         """Follow a change of population: keep ``rows`` (in their new order); where ``fresh`` is set, start again from nothing."""

@@ -7,6 +7,7 @@ with respect to E[x], E[xx] and E[xy] are spread back with the adjoint of the sa
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import numpy as np
@@ -144,6 +145,17 @@ def _spread(start, stop, x, y, height, channels, maps, weight, grad):  # type: i
     return total
 
 
+_buffers = threading.local()
+
+
+def _bordered(rows: int, columns: int) -> Any:
+    """Three maps with a zero border. Reused by the next image of the same size in this thread: only the inside is ever written."""
+    maps = getattr(_buffers, "maps", None)
+    if maps is None or maps.shape != (3, rows, columns):
+        maps = _buffers.maps = np.zeros((3, rows, columns), np.float32)
+    return maps
+
+
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rendered: Tensor, truth: Tensor, weight: float, parts: dict[str, float]) -> Tensor:
@@ -151,7 +163,7 @@ class _Photometric(torch.autograd.Function):
         x = np.ascontiguousarray(rendered.detach().numpy()).reshape(-1)
         y = np.ascontiguousarray(truth.detach().numpy()).reshape(-1)
         windows, m = H - _TAPS + 1, (W - _TAPS + 1) * C
-        maps = np.zeros((3, windows + 20, m + 20 * C), np.float32)
+        maps = _bordered(windows + 20, m + 20 * C)
         similarity = sum(parallel_for(_similarity, windows, _ROWS, 0, x, y, H, C, maps)) / (windows * m)
         grad = np.empty(x.size, np.float32)
         l1 = sum(parallel_for(_spread, H, _ROWS, 0, x, y, H, C, maps, np.float32(weight), grad)) / x.size

@@ -152,8 +152,10 @@ class Trainer:
             raise NonFiniteError(f"loss is {loss.item()} at step {self.step} on view {view.name}")
         with torch.no_grad():
             difference = rgb - truth
-            output.stats.pixel_error = difference.abs().mean(dim=-1)
-            mse = difference.square().mean().item()
+            channels = difference.shape[-1]
+            output.stats.pixel_error = difference.abs() @ torch.full((channels,), 1.0 / channels)
+            flat = difference.reshape(-1)
+            mse = torch.dot(flat, flat).item() / flat.numel()
         loss.backward()
 
         self.population.observe(model, output.stats)
@@ -221,18 +223,24 @@ class Trainer:
             model = Primitives(self.model.density, self.model.colour, part("params."))
             optimizer = RowAdam(model.specs, model.params)
             optimizer.load_state(part("adam."))
-            for name, moments in (*optimizer.m.items(), *optimizer.v.items()):
-                if moments.shape != model.params[name].shape:
-                    raise ValueError(f"moments of {name} have shape {tuple(moments.shape)}")
-            if optimizer.age.shape != (model.count,):
-                raise ValueError(f"ages have shape {tuple(optimizer.age.shape)}")
+            for name, value in (*model.params.items(), *optimizer.m.items(), *optimizer.v.items()):
+                shape = model.params[name].shape
+                if value.shape != shape or value.dtype != torch.float32 or not bool(torch.isfinite(value).all()):
+                    raise ValueError(
+                        f"{name} or a moment of it is {value.dtype} {tuple(value.shape)}; expected finite float32 {tuple(shape)}"
+                    )
+            if optimizer.age.shape != (model.count,) or optimizer.age.dtype != torch.int64:
+                raise ValueError(f"ages are {optimizer.age.dtype} {tuple(optimizer.age.shape)}; expected int64 ({model.count},)")
             order = tensors["order"]
-            if order.dim() != 1 or (len(order) and (int(order.min()) < 0 or int(order.max()) >= views)):
+            if order.dim() != 1 or order.dtype != torch.int64 or (len(order) and (int(order.min()) < 0 or int(order.max()) >= views)):
                 raise ValueError("the order of views is out of range")
             generator = torch.Generator()
             generator.set_state(tensors["generator"])
             population = part("population.")
-        except (ValueError, KeyError, RuntimeError, TypeError) as error:
+            for name, value in population.items():
+                if value.dim() > 0 and value.shape != (model.count,):
+                    raise ValueError(f"statistic {name} has shape {tuple(value.shape)}; expected ({model.count},)")
+        except (ValueError, KeyError, RuntimeError, TypeError, IndexError) as error:
             raise CheckpointError(f"{where}: does not fit this run's settings ({error})") from error
         self.model.params = model.params
         self.optimizer, self.order, self.generator = optimizer, order.clone(), generator

@@ -23,6 +23,10 @@ class SphericalHarmonics(ColourField):
     """
 
     def __init__(self, degree: int = 3, channels: int = 3, sh_every: float = 0.0) -> None:
+        if not isinstance(degree, int) or not 0 <= degree <= 3:
+            raise ValueError(f"spherical-harmonics degree {degree!r}; expected 0..3")
+        if not isinstance(channels, int) or channels < 1:
+            raise ValueError(f"{channels!r} colour channels; expected at least 1")
         self.degree, self.channels, self.sh_every = degree, channels, sh_every
         self.active = degree
 

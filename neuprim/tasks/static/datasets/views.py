@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -16,6 +17,7 @@ from neuprim.core.cameras import Camera
 from neuprim.core.data import Pixels, View, ViewSet
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.images import ImageInfo, read_image, read_mask
+from neuprim.core.render.cpu.compile import exact_kernel
 from neuprim.tasks.static.datasets.distortion import Distortion, resample, source_grid
 
 __all__ = ["Frame", "ImageViews"]
@@ -51,6 +53,23 @@ class _Stored:
     data: Tensor
     premultiplied: bool
     mask: Tensor | None
+
+
+@exact_kernel
+def _premultiply(rgba, rgb, alpha):  # type: ignore[no-untyped-def]
+    scale = np.float32(1.0 / 255.0)
+    for i in range(rgba.shape[0]):
+        a = np.float32(rgba[i, 3]) * scale
+        alpha[i] = a
+        for c in range(3):
+            rgb[i, c] = np.float32(rgba[i, c]) * scale * a
+
+
+def _premultiplied(rgba: Tensor) -> tuple[Tensor, Tensor]:
+    """(H, W, 3) and (H, W) floats of straight-alpha 8-bit pixels, in one pass: this happens at every training step."""
+    rgb, alpha = torch.empty(*rgba.shape[:2], 3), torch.empty(rgba.shape[:2])
+    _premultiply(rgba.reshape(-1, 4).numpy(), rgb.reshape(-1, 3).numpy(), alpha.reshape(-1).numpy())
+    return rgb, alpha
 
 
 class ImageViews(ViewSet):
@@ -90,6 +109,8 @@ class ImageViews(ViewSet):
             DataError: the file is missing, damaged or changed size since the data set was opened, or its mask leaves nothing.
         """
         stored = self._load(range(len(self))[index])
+        if stored.data.dtype == torch.uint8 and stored.data.shape[-1] == 4 and not stored.premultiplied:
+            return Pixels(*_premultiplied(stored.data), stored.mask)
         data = stored.data.float()
         if stored.data.dtype == torch.uint8:
             data = data / 255.0

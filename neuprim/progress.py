@@ -44,7 +44,7 @@ class RunProgress:
 
     def note(self, text: str) -> None:
         """A line that stays."""
-        self.console.print(f"{self.title}: {text}", highlight=False)
+        self.console.print(f"{self.title}: {text}", highlight=False, soft_wrap=True)
 
     def preparing(self, text: str, fraction: float) -> None:
         """Work before the training loop."""

@@ -77,7 +77,7 @@ def _train(trainer: Trainer, config: RunConfig, dataset: Dataset, progress: RunP
     curve = _open_curve(directory / "metrics.jsonl", trainer.step)
     last_saved, next_eval = time.monotonic(), _next_evaluation(trainer)
     interrupted = False
-    with _interruptible() as stop, curve:
+    with _interruptible() as stop, curve, _one_torch_thread():
         for report in trainer.run():
             progress.step(report, trainer.progress)
             line: dict[str, Any] = {}
@@ -181,7 +181,7 @@ def _warm_up(trainer: Trainer, progress: RunProgress) -> None:
     """Compile the kernels outside the training clock: one throw-away step on a copy of a few primitives."""
     from neuprim.core.render.cpu.compile import cache_directory as kernels
 
-    if not any(kernels().rglob("*.nbc")):
+    if not any(kernels().rglob("*backward_tiles*.nbc")):
         progress.preparing("compiling kernels, once per installation (about a minute)", 0.0)
     model = trainer.model
     rows = torch.arange(min(4, model.count))
@@ -189,6 +189,17 @@ def _warm_up(trainer: Trainer, progress: RunProgress) -> None:
     warm = Trainer(few, trainer.dataset, trainer.loss, trainer.settings, trainer.renderer, 0)
     warm.step = max(warm.settings.iterations, 1)  # at the end of the budget every band of colour is in use
     warm.train_step()
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Between kernels torch has only small tensors; its own thread pool would spin on the cores the kernels need."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @contextmanager

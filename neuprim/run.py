@@ -18,7 +18,7 @@ from rich.console import Console
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint, images
 from neuprim.core.data import Dataset, View
-from neuprim.core.errors import DataError
+from neuprim.core.errors import CheckpointError, DataError
 from neuprim.core.files import write_json, write_text
 from neuprim.core.primitives import Primitives
 from neuprim.core.train.trainer import Trainer, initial_model
@@ -58,6 +58,8 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
         saved = directory / "checkpoint.safetensors"
         if config.resume and saved.exists():
             header, tensors = checkpoint.read(saved, "checkpoint")
+            if header.get("task") != config.task:
+                raise CheckpointError(f"{saved}: written for task {header.get('task')!r}; this run's task is {config.task!r}")
             trainer.load_state(tensors, header, str(saved))
             progress.note(f"resumed at step {trainer.step}")
         directory.mkdir(parents=True, exist_ok=True)

@@ -312,3 +312,13 @@ def test_bad_data_leaves_an_earlier_run_alone(scene: Path, tmp_path: Path) -> No
     with pytest.raises(DataError, match="nowhere"):
         fit([*words(tmp_path / "nowhere", out, 10), "resume=true"])
     assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
+
+
+def test_a_checkpoint_of_another_task_is_refused(scene: Path, tmp_path: Path) -> None:
+    out = fit(words(scene, tmp_path / "run", 20))
+    header, tensors = checkpoint.read(out / "checkpoint.safetensors", "checkpoint")
+    checkpoint.write(out / "checkpoint.safetensors", "checkpoint", tensors, {**header, "task": "dynamic"})
+    before = (out / "checkpoint.safetensors").read_bytes()
+    with pytest.raises(CheckpointError, match=r"checkpoint\.safetensors.*'dynamic'.*'static'"):
+        fit(words(scene, out, 40, "resume=true"))
+    assert (out / "checkpoint.safetensors").read_bytes() == before

@@ -260,3 +260,8 @@ def test_damaged_and_grey_images(capture: Any, scenes: Any, context: Any) -> Non
 
 def test_too_few_images(capture: Any, scenes: Any, context: Any) -> None:
     scenes.refused(load, {"path": capture(count=1)}, context, "training split has no images")
+
+
+def test_a_whole_run_learns_the_mark(capture: Any, scenes: Any, tmp_path: Path) -> None:
+    psnr, black = scenes.fitted("colmap", capture("OPENCV", points=False), tmp_path / "run")
+    assert psnr > black + 3

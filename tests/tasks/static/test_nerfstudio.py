@@ -302,3 +302,8 @@ def test_damaged_image(capture: Any, scenes: Any, context: Any) -> None:
     file = path / "images" / "03.png"
     file.write_bytes(file.read_bytes()[:-40])
     scenes.refused(load, {"path": path}, context, str(file), "truncated or corrupt")
+
+
+def test_a_whole_run_learns_the_mark(capture: Any, scenes: Any, tmp_path: Path) -> None:
+    psnr, black = scenes.fitted("nerfstudio", capture(), tmp_path / "run")
+    assert psnr > black + 3

@@ -425,7 +425,10 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                         st = state[GZ + y * TILE :]
                         for k in range(a, b):
                             S[GMID + at + k] = w[k] * st[k] * p[UNIT]
-            out[G_WEIGHT], out[G_ERROR] = _total(sums, 0), _total(sums, TILE)
+            weight = _total(sums, 0)
+            if weight == f(0):
+                continue  # hidden or below the cut everywhere: every gradient is zero
+            out[G_WEIGHT], out[G_ERROR] = weight, _total(sums, TILE)
             for c in range(C):
                 out[color_at + c] = _total(sums, (2 + c) * TILE)
             _field_gradient(S, n16, out)
@@ -442,9 +445,9 @@ def sum_rows(start, stop, order, first, slots, pair_rows, grads, touched):  # ty
         i = order[r]
         g = grads[i]
         g[:] = np.float32(0)
-        seen = first[r + 1] > first[r]
-        touched[i] = seen
         for k in range(first[r], first[r + 1]):
             row = pair_rows[slots[k]]
-            for c in range(g.shape[0]):
-                g[c] += row[c]
+            if row[G_WEIGHT] > np.float32(0):
+                for c in range(g.shape[0]):
+                    g[c] += row[c]
+        touched[i] = g[G_WEIGHT] > np.float32(0)

@@ -1,6 +1,6 @@
 """Quality of the static task on a NeRF-synthetic scene: PSNR by primitives and seconds, beside the K = 0 baseline.
 
-    python benchmarks/static_quality.py DIR [--seeds 3] [--rows 2000x60 5000x120 ...] [--readme]
+    python benchmarks/static_quality.py DIR [--seeds 3] [--rows 2000x60 5000x120 ...] [--keep] [--readme]
 
 DIR holds the scene (transforms_train.json, ...). Every run is `neuprim run task=static scene=blender` with the preset
 `quick`; numbers are means over seeds +- half the spread, on the test views, of the last checkpoint. Results go to
@@ -71,18 +71,24 @@ def main() -> None:
     parser.add_argument("scene", type=Path, nargs="?")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--rows", nargs="*", default=list(ROWS), help="PRIMITIVESxSECONDS[xKNEURONS]")
+    parser.add_argument("--keep", action="store_true", help="keep the recorded rows that are not measured now")
     parser.add_argument("--readme", action="store_true", help="write the recorded table into README.md")
     args = parser.parse_args()
     if args.scene:
         from neuprim.core.render.cpu.threads import core_count
 
         results: dict[str, Any] = {"cpu": cpu_name(), "cores": core_count(), "seeds": args.seeds, "rows": []}
+        if args.keep:
+            results["rows"] = json.loads(RESULTS.read_text())["rows"]
         for text in args.rows:
             parts = text.split("x")
             primitives, seconds = int(parts[0]), int(parts[1])
             neurons = int(parts[2].lstrip("K")) if len(parts) > 2 else 8
             runs = [one_run(args.scene.resolve(), primitives, seconds, neurons, seed) for seed in range(args.seeds)]
             keys = ("psnr", "psnr_worst", "ssim", "iterations", "train_seconds", "model_bytes", "parameters_per_primitive", "seed")
+            results["rows"] = [
+                r for r in results["rows"] if (r["primitives"], r["seconds"], r["neurons"]) != (primitives, seconds, neurons)
+            ]
             results["rows"].append(
                 {"primitives": primitives, "seconds": seconds, "neurons": neurons, "runs": [{k: r[k] for k in keys} for r in runs]}
             )

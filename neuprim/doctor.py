@@ -171,9 +171,10 @@ def _probe(name: str) -> str | None:
 
 
 def _caches() -> Rows:
-    from numba.core import config
+    from neuprim.core.files import cache_directory as everything
+    from neuprim.core.render.cpu.compile import cache_directory as kernels
 
-    place = (
-        getattr(config, "CACHE_DIR", "") or "in __pycache__ beside each module, or in the user's cache directory where that is read-only"
-    )
-    return [("numba", f"{place} (set by NUMBA_CACHE_DIR)")]
+    return [
+        ("kernels", f"{kernels()} (set by NUMBA_CACHE_DIR)"),
+        ("generated scenes", f"{everything() / 'scenes'} (set by NEUPRIM_CACHE_DIR)"),
+    ]

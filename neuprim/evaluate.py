@@ -140,10 +140,9 @@ def load_run(run_dir: Path) -> tuple[RunConfig, TaskSpec, Primitives, dict[str, 
 
 def evaluate_run(run_dir: Path) -> dict[str, Any]:
     """The metrics of a run's last checkpoint, measured again from disk alone; the same numbers as the run's own."""
-    config, task, model, _ = load_run(run_dir)
+    config, task, model, header = load_run(run_dir)
     dataset = load_dataset(config, task)
     path = run_dir / "model.safetensors"
-    _, header = load_model(path, task)
     training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
     views = measure(model, dataset.test, config.renderer, dataset.background)
     return summary(config, model, dataset, views, path.stat().st_size, training)

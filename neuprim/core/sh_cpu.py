@@ -1,4 +1,4 @@
-"""Spherical-harmonics colours with their gradient, fused per primitive (torch's small kernels cost ten times as much on a CPU)."""
+"""Spherical-harmonics colours with their gradient, fused per primitive."""
 
 from __future__ import annotations
 

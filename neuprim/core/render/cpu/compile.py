@@ -24,7 +24,7 @@ __all__ = ["FAST", "cache_directory", "exact_kernel", "inline", "kernel"]
 
 
 def _prefer_wide_vectors() -> None:
-    """Ask LLVM for 512-bit vectors where the processor has them; it avoids them by default, at 1.3-1.8 times the time here.
+    """Ask LLVM for 512-bit vectors where the processor has them; it avoids them by default, at a cost in these kernels.
 
     Takes effect when nothing was compiled before; NUMBA_CPU_FEATURES, where set, wins.
     """

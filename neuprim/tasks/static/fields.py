@@ -58,5 +58,9 @@ class SphericalHarmonics(ColourField):
         return Constant(color.clamp_min(0.0))
 
 
+_DARKEST = 1e-3
+"""Initial colours start at least this far above zero: at zero and below, max(0, .) passes no gradient and black stays black."""
+
+
 def _initial_dc(ctx: InitContext) -> Tensor:
-    return ((ctx.colors - 0.5) / sh.C0).float()
+    return ((ctx.colors.clamp_min(_DARKEST) - 0.5) / sh.C0).float()

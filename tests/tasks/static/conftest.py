@@ -94,10 +94,12 @@ class Scenes:
 
     @staticmethod
     def fitted(scene: str, path: Path, out: Path) -> dict[str, Any]:
-        """Metrics of a short run, from data to report."""
+        """Metrics of a short run, from data to report, that has learned something: its loss has fallen by half."""
         words = ["task=static", f"scene={scene}", f"scene.path={path}", f"output_dir={out}", "model.primitives=60", "model.neurons=4"]
         run(compose([*words, "train.iterations=150", "train.max_seconds=null", "train.population.every=20"]), Console(quiet=True))
         assert (out / "report.html").exists()
+        losses = [json.loads(line)["loss"] for line in (out / "metrics.jsonl").read_text().splitlines()]
+        assert losses[-1] < 0.5 * losses[0], losses
         return read_metrics(out)
 
 

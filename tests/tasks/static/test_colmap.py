@@ -38,7 +38,14 @@ def pycolmap() -> Any:
 def capture(tmp_path: Path, scenes: Any, pycolmap: Any) -> Callable[..., Path]:
     """Writes 10 views of one mark, each the given camera's own projection of it."""
 
-    def write(model: str = "PINHOLE", params: list[float] | None = None, text: bool = False, points: bool = True, count: int = 10) -> Path:
+    def write(
+        model: str = "PINHOLE",
+        params: list[float] | None = None,
+        text: bool = False,
+        points: bool = True,
+        count: int = 10,
+        sigma: float = 1.0,
+    ) -> Path:
         path = tmp_path / "toy"
         reconstruction = pycolmap.Reconstruction()
         lens = pycolmap.Camera(model=model, width=W, height=H, params=params or PARAMS[model], camera_id=1)
@@ -46,7 +53,7 @@ def capture(tmp_path: Path, scenes: Any, pycolmap: Any) -> Callable[..., Path]:
         for i, pose in enumerate(scenes.ring(count, radius=1.6)):
             view = np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
             u, v = lens.img_from_cam((view @ np.append(scenes.mark, 1.0))[None, :3])[0] if params is None else (30.0, 25.0)
-            scenes.save(path / "images" / f"{i:02d}.png", scenes.blob(W, H, u, v, 1.0))
+            scenes.save(path / "images" / f"{i:02d}.png", scenes.blob(W, H, u, v, sigma))
             rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(view[:3, :3]), view[:3, 3])
             # numbers run against the names, which decide the order
             reconstruction.add_image_with_trivial_frame(pycolmap.Image(name=f"{i:02d}.png", camera_id=1, image_id=count - i), rigid)
@@ -263,5 +270,5 @@ def test_too_few_images(capture: Any, scenes: Any, context: Any) -> None:
 
 
 def test_a_whole_run_ends_in_a_report(capture: Any, scenes: Any, tmp_path: Path) -> None:
-    metrics = scenes.fitted("colmap", capture("OPENCV", points=False), tmp_path / "run")
+    metrics = scenes.fitted("colmap", capture("OPENCV", points=False, sigma=8.0), tmp_path / "run")
     assert metrics["scene"] == "colmap" and metrics["data_source"] == "real" and len(metrics["per_view"]) == 2

@@ -305,5 +305,5 @@ def test_damaged_image(capture: Any, scenes: Any, context: Any) -> None:
 
 
 def test_a_whole_run_ends_in_a_report(capture: Any, scenes: Any, tmp_path: Path) -> None:
-    metrics = scenes.fitted("nerfstudio", capture(), tmp_path / "run")
+    metrics = scenes.fitted("nerfstudio", capture(sigma=8.0), tmp_path / "run")
     assert metrics["scene"] == "nerfstudio" and metrics["data_source"] == "real" and len(metrics["per_view"]) == 2

@@ -29,11 +29,12 @@ def set_grads(p: dict[str, Tensor], seed: int) -> None:
         v.grad = torch.where(torch.rand(v.shape, generator=g) < 0.2, torch.zeros_like(grad), grad).to(v.dtype)
 
 
+@pytest.mark.parametrize("beta2", [0.999, 0.99])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
-def test_equals_torch_adam(dtype: torch.dtype, tolerance: float) -> None:
+def test_equals_torch_adam(dtype: torch.dtype, tolerance: float, beta2: float) -> None:
     mine, theirs = params(dtype=dtype), params(dtype=dtype)
-    optimizer = RowAdam(SPECS, mine)
-    adam = torch.optim.Adam([{"params": [theirs[n]], "lr": RATES[n]} for n in theirs], eps=1e-15)
+    optimizer = RowAdam(SPECS, mine, beta2)
+    adam = torch.optim.Adam([{"params": [theirs[n]], "lr": RATES[n]} for n in theirs], betas=(0.9, beta2), eps=1e-15)
     for step in range(20):
         set_grads(mine, step)
         set_grads(theirs, step)

@@ -19,27 +19,27 @@ from neuprim.core.schema import ParameterSpec
 
 __all__ = ["RowAdam", "adam_step_reference"]
 
-BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
+BETA1, EPS = 0.9, 1e-15
 _CHUNK_NUMBERS = 65_536  # numbers per unit of work; fixed, although the result does not depend on it
 
 
-def adam_step_reference(value: Tensor, grad: Tensor, m: Tensor, v: Tensor, rate: float, age: Tensor) -> None:
+def adam_step_reference(value: Tensor, grad: Tensor, m: Tensor, v: Tensor, rate: float, age: Tensor, beta2: float = 0.999) -> None:
     """One in-place Adam step (Kingma and Ba 2015) of an (N, ...) tensor; ``age`` (N,) counts each row's steps, this one included."""
     shape = (-1, *[1] * (value.dim() - 1))
     m.mul_(BETA1).add_(grad, alpha=1 - BETA1)
-    v.mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
+    v.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
     c1 = (1 - BETA1 ** age.to(value)).reshape(shape)
-    c2 = (1 - BETA2 ** age.to(value)).reshape(shape)
+    c2 = (1 - beta2 ** age.to(value)).reshape(shape)
     value.sub_(rate * (m / c1) / ((v / c2).sqrt() + EPS))
 
 
 @exact_kernel
-def _adam_rows(start, stop, width, value, grad, m, v, rate, correction, root):  # type: ignore[no-untyped-def]
+def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, correction, root):  # type: ignore[no-untyped-def]
     """The same on flat float32 arrays of ``width`` numbers per row; correction = 1 / c1 and root = sqrt(1 / c2) per row.
 
     Rows of one age stand together nearly everywhere, so they are taken in runs: long loops that vectorise.
     """
-    b1, b2, one_b1, one_b2, eps = np.float32(BETA1), np.float32(BETA2), np.float32(1 - BETA1), np.float32(1 - BETA2), np.float32(EPS)
+    b1, b2, one_b1, one_b2, eps = np.float32(BETA1), np.float32(beta2), np.float32(1 - BETA1), np.float32(1 - beta2), np.float32(EPS)
     i = start
     while i < stop:
         j = i + 1
@@ -81,9 +81,11 @@ class RowAdam:
     Attributes:
         m, v: first and second moments by parameter name.
         age: (N,) steps every row has taken, float32-exact integers.
+        beta2: decay of the second moment; short runs do better with a shorter memory.
     """
 
-    def __init__(self, specs: Iterable[ParameterSpec], params: dict[str, Tensor]) -> None:
+    def __init__(self, specs: Iterable[ParameterSpec], params: dict[str, Tensor], beta2: float = 0.999) -> None:
+        self.beta2 = beta2
         self.specs = tuple(specs)
         self.m = {s.name: torch.zeros_like(params[s.name]) for s in self.specs}
         self.v = {s.name: torch.zeros_like(params[s.name]) for s in self.specs}
@@ -103,7 +105,7 @@ class RowAdam:
                 updates.append((spec, value, grad))
         self.age += 1
         age = self.age.numpy().astype(np.float64)
-        correction, root = 1 / (1 - BETA1**age), np.sqrt(1 / (1 - BETA2**age))
+        correction, root = 1 / (1 - BETA1**age), np.sqrt(1 / (1 - self.beta2**age))
         work = []  # (arguments of _adam_rows), small enough to share out
         for spec, value, grad in updates:
             m, v, rate = self.m[spec.name], self.v[spec.name], rates[spec.name]
@@ -111,9 +113,9 @@ class RowAdam:
                 flat = [x.reshape(-1).numpy() for x in (value, grad.contiguous(), m, v)]
                 rows = max(_CHUNK_NUMBERS // spec.size, 1)
                 starts = range(0, value.shape[0], rows)
-                work += [(r, min(r + rows, value.shape[0]), spec.size, *flat, rate, correction, root) for r in starts]
+                work += [(r, min(r + rows, value.shape[0]), spec.size, *flat, rate, self.beta2, correction, root) for r in starts]
             else:
-                adam_step_reference(value, grad, m, v, rate, self.age)
+                adam_step_reference(value, grad, m, v, rate, self.age, self.beta2)
 
         def share(start: int, stop: int) -> None:
             for arguments in work[start:stop]:

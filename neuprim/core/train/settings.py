@@ -75,6 +75,7 @@ class TrainSettings:
         max_seconds: stop after this many seconds of training, if given (such a run is not bit-reproducible).
         rates: learning rate by parameter name, over the specs' own.
         final_rate: the rates decay exponentially to this fraction of themselves at the end of the budget; 1 is constant.
+        adam_beta2: decay of Adam's second moment per step, in [0, 1).
         warmup_steps: steps over which the rates rise linearly from zero.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
         anisotropy_weight, anisotropy_from: weight of mean(std over axes of s / min s), and the step it starts at.
@@ -88,6 +89,7 @@ class TrainSettings:
     max_seconds: float | None = None
     rates: dict[str, float] = field(default_factory=dict)
     final_rate: float = 0.05
+    adam_beta2: float = 0.999
     warmup_steps: int = 0
     ssim_weight: float = 0.2
     anisotropy_weight: float = 0.0
@@ -103,6 +105,7 @@ class TrainSettings:
             ("iterations", self.iterations >= 0, "0 or more"),
             ("max_seconds", self.max_seconds is None or self.max_seconds > 0, "a positive number of seconds, or null"),
             ("final_rate", 0 < self.final_rate <= 1, "a number in (0, 1]"),
+            ("adam_beta2", 0 <= self.adam_beta2 < 1, "a number in [0, 1)"),
             ("ssim_weight", 0 <= self.ssim_weight <= 1, "a number in [0, 1]"),
             ("log_every", self.log_every >= 1, "at least 1"),
             ("background", self.background in ("auto", "white", "black", "random"), "auto, white, black or random"),

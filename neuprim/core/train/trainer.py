@@ -87,7 +87,7 @@ class Trainer:
                 raise ConfigError(f"train.rates.{key}: no such parameter{nearest(key, names)}")
         self.model, self.dataset, self.loss = model, dataset, loss
         self.settings, self.renderer = settings, replace(renderer, depth=False)
-        self.optimizer = RowAdam(model.specs, model.params)
+        self.optimizer = RowAdam(model.specs, model.params, settings.adam_beta2)
         self.population = make_population(settings.population)
         self.generator = torch.Generator().manual_seed(seed + 1)
         self.order = torch.empty(0, dtype=torch.int64)
@@ -221,7 +221,7 @@ class Trainer:
             raise CheckpointError(f"{where}: trained on {views} views, the data set now has {len(self.dataset.train)}")
         try:
             model = Primitives(self.model.density, self.model.colour, part("params."))
-            optimizer = RowAdam(model.specs, model.params)
+            optimizer = RowAdam(model.specs, model.params, self.settings.adam_beta2)
             optimizer.load_state(part("adam."))
             for name, value in (*model.params.items(), *optimizer.m.items(), *optimizer.v.items()):
                 shape = model.params[name].shape

@@ -17,8 +17,8 @@ from neuprim.core.primitives import Lowered
 from neuprim.core.render.cpu.backward import backward_tiles, sum_rows
 from neuprim.core.render.cpu.binning import TileLists, bin_primitives
 from neuprim.core.render.cpu.forward import composite_tiles
-from neuprim.core.render.cpu.layout import G_ERROR, G_WEIGHT, NEURONS, PER_NEURON, SPAN_WIDTH, TILE, row_width
-from neuprim.core.render.cpu.prepare import NON_FINITE, prepare, prepare_backward
+from neuprim.core.render.cpu.layout import G_ERROR, G_NEURONS, G_WEIGHT, PER_NEURON, SPAN_WIDTH, TILE, gradient_width, row_width
+from neuprim.core.render.cpu.prepare import NON_FINITE, VISIBLE, prepare, prepare_backward, prepare_wide
 from neuprim.core.render.cpu.threads import parallel_for
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.render.settings import RenderSettings
@@ -44,7 +44,10 @@ class _Frame:
     neurons: int
     rows: Array
     spans: Array
-    simple: Array
+    wide: Array
+    slots: Array
+    kinds: Array
+    order: Array
     boxes: Array
     norms: Array
     limits: Array
@@ -84,18 +87,27 @@ def _prepare(
     neurons = K + K % 2  # the backward kernel takes neurons in pairs; a padded one has amplitude 0
     rows = np.empty((count, row_width(neurons)), np.float32)
     spans = np.zeros((count, SPAN_WIDTH), np.float32)
-    simple = np.empty((count, max(neurons, 1)), np.bool_)
+    kinds, order = np.empty((count, neurons // 2), np.uint8), np.empty((count, K), np.uint8)
     boxes, depth, status = np.empty((count, 4), np.int32), np.empty(count, np.float64), np.empty(count, np.uint8)
+    delicate = np.empty(count, np.bool_)
     R, t = np.ascontiguousarray(view[:3, :3]), np.ascontiguousarray(view[:3, 3])
     cam = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
     size = np.array([camera.width, camera.height], np.int64)
     names = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
     parallel_for(
         prepare, count, _PRIMITIVES_PER_CHUNK, settings.threads, *(tensors[n] for n in names),
-        R, t, cam, size, settings.near, omega0 / _TURN, rows, spans, simple, boxes, depth, status,
+        R, t, cam, size, settings.near, omega0 / _TURN, rows, spans, kinds, order, boxes, depth, status, delicate,
     )  # fmt: skip
     if bool((status == NON_FINITE).any()):
         raise _non_finite(tensors, int(np.flatnonzero(status == NON_FINITE)[0]))
+    slots, which = np.full(count, -1, np.int32), np.flatnonzero(delicate & (status == VISIBLE))
+    slots[which] = np.arange(len(which), dtype=np.int32)
+    wide = np.empty((len(which), rows.shape[1]))
+    parallel_for(
+        prepare_wide, len(which), _PRIMITIVES_PER_CHUNK, settings.threads, which, *(tensors[n] for n in names),
+        R, t, cam, settings.near, omega0 / _TURN, order, wide,
+    )  # fmt: skip
+    stats.extra["delicate"] = len(which)
     lists = bin_primitives(rows, spans, boxes, depth, status, camera.width, camera.height, settings.threads)
     stats.pairs = lists.pairs
     limits = np.array([settings.alpha_min, settings.alpha_max, settings.transmittance_min, settings.depth_floor], np.float32)
@@ -110,7 +122,10 @@ def _prepare(
         neurons,
         rows,
         spans,
-        simple,
+        wide,
+        slots,
+        kinds,
+        order,
         boxes,
         _norms(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy),
         limits,
@@ -147,7 +162,7 @@ class _Rasterize(torch.autograd.Function):
         z, last = np.zeros((h, w) if settings.depth else (1, 1), np.float32), np.empty((h, w), np.int32)
         palette = np.ascontiguousarray(tensors["colors"], np.float32)
         lanes = parallel_for(
-            composite_tiles, frame.tiles, frame.chunk, settings.threads, frame.rows, frame.spans, frame.simple, frame.boxes,
+            composite_tiles, frame.tiles, frame.chunk, settings.threads, frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
             frame.lists.starts, frame.lists.ids, palette, frame.norms, frame.background, frame.limits, settings.depth, frame.neurons,
             rgb, T, z, last,
         )  # fmt: skip
@@ -168,10 +183,10 @@ class _Rasterize(torch.autograd.Function):
         gz = np.ascontiguousarray(g_z.numpy(), np.float32)
         wanted = frame.stats.pixel_error
         error = np.zeros((h, w), np.float32) if wanted is None else np.ascontiguousarray(wanted.detach().numpy(), np.float32)
-        width = row_width(frame.neurons, C)
+        width = gradient_width(frame.neurons, C)
         pair_rows = np.empty((frame.lists.pairs, width), np.float32)
         lanes = parallel_for(
-            backward_tiles, frame.tiles, frame.chunk, s.threads, frame.rows, frame.spans, frame.simple, frame.boxes,
+            backward_tiles, frame.tiles, frame.chunk, s.threads, frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
             frame.lists.starts, frame.lists.ids, ctx.palette, frame.norms, frame.limits, s.depth, frame.neurons,
             ctx.T, ctx.last, grad_rgb, gT, gz, error, pair_rows,
         )  # fmt: skip
@@ -195,10 +210,10 @@ class _Rasterize(torch.autograd.Function):
         g_view = np.zeros((count if want_view else 1, 3, 4), np.float64)
         parallel_for(
             prepare_backward, count, _PRIMITIVES_PER_CHUNK, s.threads, t["means"], t["log_scales"], t["quats"], t["W1"],
-            frame.R, frame.t, frame.intrinsics, s.near, frame.omega0 / _TURN, frame.rows, grads, touched,
+            frame.R, frame.t, frame.intrinsics, s.near, frame.omega0 / _TURN, frame.rows, frame.order, grads, touched,
             *out, g_b2, g_view, want_view,
         )  # fmt: skip
-        base = NEURONS + PER_NEURON * frame.neurons
+        base = G_NEURONS + PER_NEURON * frame.neurons
         if wanted is not None:
             frame.stats.weight = torch.from_numpy(grads[:, G_WEIGHT].copy())
             frame.stats.error_weight = torch.from_numpy(grads[:, G_ERROR].copy())

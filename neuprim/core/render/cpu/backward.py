@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.render.cpu.compile import exact_kernel, inline, kernel
+from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH, delicate_chords, delicate_slopes
 from neuprim.core.render.cpu.layout import (
     ALPHA,
     AMPLITUDE,
@@ -29,6 +30,8 @@ from neuprim.core.render.cpu.layout import (
     G_COLOR,
     G_ERROR,
     G_LOG_M,
+    G_NEURONS,
+    G_OFFSET,
     G_WEIGHT,
     GEX,
     GEY,
@@ -41,12 +44,11 @@ from neuprim.core.render.cpu.layout import (
     GRAD,
     GZ,
     HALF,
+    HEIGHT,
     IA,
     LAST,
+    MEDIUM,
     MID,
-    MX,
-    MY,
-    MZ,
     N_COS,
     N_DSINC,
     N_SIN,
@@ -54,15 +56,19 @@ from neuprim.core.render.cpu.layout import (
     NEURONS,
     NORM,
     NORM_L,
-    OFFSET,
     OVER,
     PER_NEURON,
     PHASE,
     PIXELS,
+    PX,
+    PY,
+    PZ,
     QX,
     QY,
     QZ,
+    SLIDE,
     SLOPE,
+    SLOW,
     T_,
     TC,
     TILE,
@@ -77,7 +83,7 @@ from neuprim.core.render.cpu.layout import (
     XA,
 )
 from neuprim.core.render.cpu.tiles import chords, compact, row_spans
-from neuprim.core.render.cpu.turns import TAU, cos_turns, dsinc_turns, one_minus_exp, sinc_turns
+from neuprim.core.render.cpu.turns import TAU, cos_turns, one_minus_exp, sinc_turns, slopes_fast, slopes_medium, slopes_slow
 
 __all__ = ["backward_tiles", "sum_rows"]
 
@@ -86,57 +92,39 @@ index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorise
 _STEPS = np.arange(TILE).astype(np.float32)
 
 
-@inline
-def _neurons_simple(S, V0, V1, n, p, o):  # type: ignore[no-untyped-def]
-    """Forward value of two neurons, and the three products of each that the gradients need; rates below half a turn per half chord."""
-    ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
-    o2 = o + PER_NEURON
-    bx, by, bz, bb, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + PHASE], p[o2 + AMPLITUDE]
-    for k in range(n):
-        half = S[HALF + k]
-        ex, ey, ez = S[EXL + k], S[EYL + k], S[EZL + k]
-        qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
-        v = (ex * ax + ey * ay + ez * az) * half
-        u = qx * ax + qy * ay + qz * az + ab
-        r = u - np.rint(u)
-        z, zv = r * r, v * v
-        c, si = cos_turns(z), sinc_turns(zv)
-        V0[N_COS + k] = c * si
-        V0[N_SIN + k] = -TAU * TAU * r * sinc_turns(z) * si
-        V0[N_DSINC + k] = c * dsinc_turns(zv) * f(2) * v
-        v1 = (ex * bx + ey * by + ez * bz) * half
-        u1 = qx * bx + qy * by + qz * bz + bb
-        r1 = u1 - np.rint(u1)
-        z1, zv1 = r1 * r1, v1 * v1
-        c1, si1 = cos_turns(z1), sinc_turns(zv1)
-        V1[N_COS + k] = c1 * si1
-        V1[N_SIN + k] = -TAU * TAU * r1 * sinc_turns(z1) * si1
-        V1[N_DSINC + k] = c1 * dsinc_turns(zv1) * f(2) * v1
-        S[FIELD + k] += c * si * aa + c1 * si1 * ba
+def _neurons(slopes):  # type: ignore[no-untyped-def]
+    """Forward value of two neurons, and the three products of each that the gradients need, with the sinc of their range of rates."""
+
+    @inline
+    def add(S, V0, V1, n, p, o):  # type: ignore[no-untyped-def]
+        ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
+        o2 = o + PER_NEURON
+        bx, by, bz, bb, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + PHASE], p[o2 + AMPLITUDE]
+        for k in range(n):
+            half = S[HALF + k]
+            ex, ey, ez = S[EXL + k], S[EYL + k], S[EZL + k]
+            qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
+            v = (ex * ax + ey * ay + ez * az) * half
+            u = qx * ax + qy * ay + qz * az + ab
+            r = u - np.rint(u)
+            v1 = (ex * bx + ey * by + ez * bz) * half
+            u1 = qx * bx + qy * by + qz * bz + bb
+            r1 = u1 - np.rint(u1)
+            sinc, slope, sinc1, slope1 = slopes(v, v1)
+            z, z1 = r * r, r1 * r1
+            c, c1 = cos_turns(z), cos_turns(z1)
+            V0[N_COS + k] = c * sinc
+            V0[N_SIN + k] = -TAU * TAU * r * sinc_turns(z) * sinc
+            V0[N_DSINC + k] = c * slope
+            V1[N_COS + k] = c1 * sinc1
+            V1[N_SIN + k] = -TAU * TAU * r1 * sinc_turns(z1) * sinc1
+            V1[N_DSINC + k] = c1 * slope1
+            S[FIELD + k] += c * sinc * aa + c1 * sinc1 * ba
+
+    return add
 
 
-@inline
-def _neuron(S, V, n, p, o):  # type: ignore[no-untyped-def]
-    """One neuron of any rate; d sinc/dv = (cos - sinc)/v beyond half a turn."""
-    ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
-    for k in range(n):
-        v = (S[EXL + k] * ax + S[EYL + k] * ay + S[EZL + k] * az) * S[HALF + k]
-        u = S[QX + k] * ax + S[QY + k] * ay + S[QZ + k] * az + ab
-        r = u - np.rint(u)
-        z = r * r
-        turns = np.rint(v)
-        rv = v - turns
-        zv = rv * rv
-        near = turns == f(0)
-        iv = f(1) / (f(1) if near else v)
-        base = sinc_turns(zv)
-        si = base if near else base * rv * iv
-        ds = dsinc_turns(zv) * f(2) * v if near else (cos_turns(zv) - si) * iv
-        c = cos_turns(z)
-        V[N_COS + k] = c * si
-        V[N_SIN + k] = -TAU * TAU * r * sinc_turns(z) * si
-        V[N_DSINC + k] = c * ds
-        S[FIELD + k] += c * si * aa
+_neurons_slow, _neurons_medium, _neurons_fast = _neurons(slopes_slow), _neurons(slopes_medium), _neurons(slopes_fast)
 
 
 @inline
@@ -238,12 +226,13 @@ def _field_gradient(S, n, out):  # type: ignore[no-untyped-def]
         log_m += gf * S[FIELD + k]
         S[GQX + k], S[GQY + k], S[GQZ + k] = f(0), f(0), f(0)
         S[GEX + k], S[GEY + k], S[GEZ + k] = f(0), f(0), f(0)
-    out[OFFSET], out[G_LOG_M] = offset, log_m
+    out[G_OFFSET], out[G_LOG_M] = offset, log_m
 
 
 @inline
-def _two_neurons(S, V0, V1, n, p, o, out):  # type: ignore[no-untyped-def]
-    """Gradients of two neurons, and their share of dL/dQ and dL/d(half e); two at a time to share the loads."""
+def _two_neurons(S, V0, V1, n, p, m, out):  # type: ignore[no-untyped-def]
+    """Gradients of neurons m and m + 1, and their share of dL/dQ and dL/d(half e); two at a time to share the loads."""
+    o = NEURONS + PER_NEURON * m
     ax, ay, az, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + AMPLITUDE]
     o2 = o + PER_NEURON
     bx, by, bz, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + AMPLITUDE]
@@ -273,6 +262,7 @@ def _two_neurons(S, V0, V1, n, p, o, out):  # type: ignore[no-untyped-def]
         S[GEX + k] += v * ax + v1 * bx
         S[GEY + k] += v * ay + v1 * by
         S[GEZ + k] += v * az + v1 * bz
+    o, o2 = G_NEURONS + PER_NEURON * m, G_NEURONS + PER_NEURON * (m + 1)
     out[o + AMPLITUDE], out[o + PHASE], out[o + WX], out[o + WY], out[o + WZ] = s0, s1, s2, s3, s4
     out[o2 + AMPLITUDE], out[o2 + PHASE], out[o2 + WX], out[o2 + WY], out[o2 + WZ] = r0, r1, r2, r3, r4
 
@@ -286,7 +276,7 @@ def _chord_gradient(S, n, p, out):  # type: ignore[no-untyped-def]
     for k in range(n):
         half, ex, ey, ez = S[HALF + k], S[EXL + k], S[EYL + k], S[EZL + k]
         mid, tm, ia, uncut, dh = S[MID + k], S[TM + k], S[IA + k], S[UNCUT + k], S[DH + k]
-        mx, my, mz = S[MX + k], S[MY + k], S[MZ + k]
+        px, py, pz, h, slide = S[PX + k], S[PY + k], S[PZ + k], S[HEIGHT + k], S[SLIDE + k]
         gqx, gqy, gqz = S[GQX + k], S[GQY + k], S[GQZ + k]
         vx, vy, vz = S[GEX + k], S[GEY + k], S[GEZ + k]
         g_half = vx * ex + vy * ey + vz * ez + S[GRAD + k] * S[FIELD + k]
@@ -295,23 +285,22 @@ def _chord_gradient(S, n, p, out):  # type: ignore[no-untyped-def]
         gt1 = (g_mid + g_half) * f(0.5)
         gt0 = (g_mid - g_half) * f(0.5) * uncut
         g_tm, g_h = gt0 + gt1, gt1 - gt0  # t0 = tm - h, t1 = tm + h
-        px, py, pz = mx + tm * ex, my + tm * ey, mz + tm * ez
-        D = max(f(1) - (px * px + py * py + pz * pz), f(0))
-        h = np.sqrt(D * ia)
         gD = g_h * dh  # dh/dD with D floored
         gA = -(g_h * h * f(0.5) + g_tm * tm) * ia  # via a = e.e, h = sqrt(D/a), tm = -(m.e)/a
         gB = -g_tm * ia
-        m2 = f(-2) * gD  # D = 1 - |m + tm e|^2, and |m + tm e| does not change with tm
+        m2 = f(-2) * gD  # D = 1 - |p|^2, and |p| = |m + tm e| does not change with tm
         gmx, gmy, gmz = gqx + m2 * px + gB * ex, gqy + m2 * py + gB * ey, gqz + m2 * pz + gB * ez
-        gA2 = f(2) * gA
-        gex += tm * m2 * px + gB * mx + gA2 * ex
-        gey += tm * m2 * py + gB * my + gA2 * ey
-        gez += tm * m2 * pz + gB * mz + gA2 * ez
-        du, dv = S[DU + k], S[DV + k]
-        hx, hy, hz = gex + tc * gmx, gey + tc * gmy, gez + tc * gmz
-        a0 += gex
-        a1 += gey
-        a2 += gez
+        # the ray's origin is m = p - tm e
+        gA2 = f(2) * gA - gB * tm
+        gp = tm * m2 + gB
+        gex += gp * px + gA2 * ex
+        gey += gp * py + gA2 * ey
+        gez += gp * pz + gA2 * ez
+        du, dv, reach = S[DU + k], S[DV + k], tc + slide
+        hx, hy, hz = gex + reach * gmx, gey + reach * gmy, gez + reach * gmz
+        a0 += gex + slide * gmx
+        a1 += gey + slide * gmy
+        a2 += gez + slide * gmz
         a3 += du * hx
         a4 += du * hy
         a5 += du * hz
@@ -329,16 +318,16 @@ def _chord_gradient(S, n, p, out):  # type: ignore[no-untyped-def]
 
 @kernel
 def backward_tiles(  # type: ignore[no-untyped-def]
-    start, stop, rows, spans, simple, boxes, starts, ids, colors, norms, limits, with_depth, neurons,
+    start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, limits, with_depth, neurons,
     transmittance, last, g_rgb, g_transmittance, g_z, error, pair_rows,
 ):  # fmt: skip
     """Gradient rows of every pair of tiles ``start:stop``. ``g_transmittance`` already holds the background's share."""
     height, width = norms.shape
     across = (width + TILE - 1) // TILE
     C = colors.shape[1]
-    color_at = NEURONS + PER_NEURON * neurons
+    color_at = G_NEURONS + PER_NEURON * neurons
     amin, amax, floor = limits[0], limits[1], limits[3]
-    S = np.zeros(BACKWARD_SCRATCH + 1024, np.float32)
+    S, D = np.zeros(BACKWARD_SCRATCH + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
     V = np.zeros((neurons, NEURON_SCRATCH), np.float32)
     state = np.zeros((6 + C) * PIXELS + 2 * TILE, np.float32)
     w, cg, sums = np.zeros(TILE, np.float32), np.zeros(TILE, np.float32), np.zeros((2 + C) * TILE, np.float32)
@@ -385,14 +374,20 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                 continue
             n16 = ((n + 15) // 16) * 16
             evaluated += n16
-            chords(S, n16, p, floor, True)
-            for m in range(0, neurons, 2):
-                o = NEURONS + PER_NEURON * m
-                if simple[i, m] and simple[i, m + 1]:
-                    _neurons_simple(S, V[m], V[m + 1], n16, p, o)
-                else:
-                    _neuron(S, V[m], n16, p, o)
-                    _neuron(S, V[m + 1], n16, p, o + PER_NEURON)
+            if slots[i] >= 0:
+                exact = wide[slots[i]]
+                delicate_chords(S, D, bounds, y0, y1, tx, ty, n16, exact, floor, False, True)
+                delicate_slopes(S, D, V, n16, exact, neurons)
+            else:
+                chords(S, n16, p, floor, False, True)
+                for m in range(0, neurons, 2):
+                    o = NEURONS + PER_NEURON * m
+                    if kinds[i, m // 2] == MEDIUM:
+                        _neurons_medium(S, V[m], V[m + 1], n16, p, o)
+                    elif kinds[i, m // 2] == SLOW:
+                        _neurons_slow(S, V[m], V[m + 1], n16, p, o)
+                    else:
+                        _neurons_fast(S, V[m], V[m + 1], n16, p, o)
             _opacity(S, n16, amin, amax)
             for k in range(n, n16):
                 S[GRAD + k] = f(0)
@@ -414,7 +409,7 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                     if with_depth:
                         st = state[GZ + y * TILE :]
                         for k in range(a, b):
-                            cg[k] += st[k] * (p[ANCHOR_Z] + p[UNIT] * S[MID + at + k])
+                            cg[k] += st[k] * (p[ANCHOR_Z] + p[UNIT] * (S[MID + at + k] + S[SLIDE + at + k]))
                     _uncomposite_row(state[y * TILE :], S[ALPHA + at :], cg, w, a, b, rank)
                     _tally(state[y * TILE :], w, sums)
                     for c in range(C):
@@ -433,7 +428,7 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                 out[color_at + c] = _total(sums, (2 + c) * TILE)
             _field_gradient(S, n16, out)
             for m in range(0, neurons, 2):
-                _two_neurons(S, V[m], V[m + 1], n16, p, NEURONS + PER_NEURON * m, out)
+                _two_neurons(S, V[m], V[m + 1], n16, p, m, out)
             _chord_gradient(S, n16, p, out)
     return evaluated
 

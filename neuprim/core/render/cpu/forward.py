@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.render.cpu.compile import inline, kernel
+from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH, delicate_chords, delicate_neurons
 from neuprim.core.render.cpu.layout import (
     ALPHA,
     AMPLITUDE,
@@ -17,6 +18,7 @@ from neuprim.core.render.cpu.layout import (
     FORWARD_SCRATCH,
     HALF,
     LAST,
+    MEDIUM,
     MID,
     NEURONS,
     NORM,
@@ -27,6 +29,7 @@ from neuprim.core.render.cpu.layout import (
     QX,
     QY,
     QZ,
+    SLOW,
     T_,
     TILE,
     UNIT,
@@ -38,7 +41,7 @@ from neuprim.core.render.cpu.layout import (
     ZSUM,
 )
 from neuprim.core.render.cpu.tiles import chords, compact, row_spans
-from neuprim.core.render.cpu.turns import cos_turns, one_minus_exp, sinc_turns
+from neuprim.core.render.cpu.turns import cos_turns, one_minus_exp, sincs_fast, sincs_medium, sincs_slow
 
 __all__ = ["composite_tiles"]
 
@@ -48,38 +51,31 @@ _STEPS = np.arange(TILE).astype(np.float32)
 _LIVE_EVERY = 4  # pairs between two counts of live pixels: a dead row costs a few lanes, a count costs a reduction per row
 
 
-@inline
-def _neurons_simple(S, n, p, o):  # type: ignore[no-untyped-def]
-    """FIELD += w2 cos(phase at the middle) sinc(rate x half chord), for two neurons whose half-chord phase stays within half a turn."""
-    ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
-    o2 = o + PER_NEURON
-    bx, by, bz, bb, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + PHASE], p[o2 + AMPLITUDE]
-    for k in range(n):
-        half = S[HALF + k]
-        ex, ey, ez = S[EXL + k], S[EYL + k], S[EZL + k]
-        qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
-        v = (ex * ax + ey * ay + ez * az) * half
-        u = qx * ax + qy * ay + qz * az + ab
-        r = u - np.rint(u)
-        v1 = (ex * bx + ey * by + ez * bz) * half
-        u1 = qx * bx + qy * by + qz * bz + bb
-        r1 = u1 - np.rint(u1)
-        S[FIELD + k] += cos_turns(r * r) * sinc_turns(v * v) * aa + cos_turns(r1 * r1) * sinc_turns(v1 * v1) * ba
+def _neurons(sincs):  # type: ignore[no-untyped-def]
+    """FIELD += w2 cos(phase at the middle) sinc(rate x half chord) of two neurons, with the sinc of their range of rates."""
+
+    @inline
+    def add(S, n, p, o):  # type: ignore[no-untyped-def]
+        ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
+        o2 = o + PER_NEURON
+        bx, by, bz, bb, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + PHASE], p[o2 + AMPLITUDE]
+        for k in range(n):
+            half = S[HALF + k]
+            ex, ey, ez = S[EXL + k], S[EYL + k], S[EZL + k]
+            qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
+            v = (ex * ax + ey * ay + ez * az) * half
+            u = qx * ax + qy * ay + qz * az + ab
+            r = u - np.rint(u)
+            v1 = (ex * bx + ey * by + ez * bz) * half
+            u1 = qx * bx + qy * by + qz * bz + bb
+            r1 = u1 - np.rint(u1)
+            sinc, sinc1 = sincs(v, v1)
+            S[FIELD + k] += cos_turns(r * r) * sinc * aa + cos_turns(r1 * r1) * sinc1 * ba
+
+    return add
 
 
-@inline
-def _neuron(S, n, p, o):  # type: ignore[no-untyped-def]
-    """One neuron of any rate: sinc(2 pi v) = sinc(2 pi r) r/v with r = v - rint(v), exactly reduced."""
-    ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
-    for k in range(n):
-        v = (S[EXL + k] * ax + S[EYL + k] * ay + S[EZL + k] * az) * S[HALF + k]
-        u = S[QX + k] * ax + S[QY + k] * ay + S[QZ + k] * az + ab
-        r = u - np.rint(u)
-        turns = np.rint(v)
-        rv = v - turns
-        ratio = rv / v
-        ratio = f(1) if turns == f(0) else ratio
-        S[FIELD + k] += cos_turns(r * r) * sinc_turns(rv * rv) * ratio * aa
+_neurons_slow, _neurons_medium, _neurons_fast = _neurons(sincs_slow), _neurons(sincs_medium), _neurons(sincs_fast)
 
 
 @inline
@@ -124,19 +120,20 @@ def _composite_row(st, lanes, w, a, b, tmin, rank):  # type: ignore[no-untyped-d
 
 @kernel
 def composite_tiles(  # type: ignore[no-untyped-def]
-    start, stop, rows, spans, simple, boxes, starts, ids, colors, norms, background, limits, with_depth, neurons,
+    start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, background, limits, with_depth, neurons,
     rgb, transmittance, zsum, last,
 ):  # fmt: skip
     """Draw tiles ``start:stop``; returns the number of evaluated lanes.
 
     limits = (alpha_min, alpha_max, transmittance_min, depth_floor), all float32. ``norms`` (H, W) is the length of the
-    pixel's ray direction whose camera-z is 1. ``last`` receives the rank + 1 of each pixel's last contributor.
+    pixel's ray direction whose camera-z is 1. Where ``slots[i]`` is not -1, primitive i is drawn in float64 from that row of
+    ``wide``. ``last`` receives the rank + 1 of each pixel's last contributor.
     """
     height, width = norms.shape
     across = (width + TILE - 1) // TILE
     C = colors.shape[1]
     amin, amax, tmin, floor = limits[0], limits[1], limits[2], limits[3]
-    S = np.zeros(FORWARD_SCRATCH + 1024, np.float32)
+    S, D = np.zeros(FORWARD_SCRATCH + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
     state = np.zeros((4 + C) * PIXELS + 2 * TILE, np.float32)
     w = np.zeros(TILE, np.float32)
     bounds, offset = np.zeros(2 * TILE, np.int32), np.zeros(TILE, np.int32)
@@ -163,14 +160,20 @@ def composite_tiles(  # type: ignore[no-untyped-def]
             if n > 0:
                 n16 = ((n + 15) // 16) * 16
                 evaluated += n16
-                chords(S, n16, p, floor, False)
-                for m in range(0, neurons, 2):
-                    o = NEURONS + PER_NEURON * m
-                    if simple[i, m] and simple[i, m + 1]:
-                        _neurons_simple(S, n16, p, o)
-                    else:
-                        _neuron(S, n16, p, o)
-                        _neuron(S, n16, p, o + PER_NEURON)
+                if slots[i] >= 0:
+                    exact = wide[slots[i]]
+                    delicate_chords(S, D, bounds, y0, y1, tx, ty, n16, exact, floor, with_depth, False)
+                    delicate_neurons(S, D, n16, exact, neurons)
+                else:
+                    chords(S, n16, p, floor, with_depth, False)
+                    for m in range(0, neurons, 2):
+                        o = NEURONS + PER_NEURON * m
+                        if kinds[i, m // 2] == MEDIUM:
+                            _neurons_medium(S, n16, p, o)
+                        elif kinds[i, m // 2] == SLOW:
+                            _neurons_slow(S, n16, p, o)
+                        else:
+                            _neurons_fast(S, n16, p, o)
                 _opacity(S, n16, amin, amax)
                 rank = f(q - starts[t] + 1)
                 for y in range(y0, y1):

@@ -6,24 +6,34 @@ at constant offsets are what lets LLVM vectorise them; the names keep them reada
 
 from __future__ import annotations
 
-__all__ = ["lane", "row_width"]
+__all__ = ["gradient_width", "lane", "row_width"]
 
 # ---- one primitive, as a pixel kernel sees it (method: "float64 preparation, float32 pixels").
 # The ray of pixel offset (du, dv) from the anchor pixel (UX, UY) is, in whitened space with t in units of m,
-#   x(t) = (XA + TC (du EX + dv EY)) + t (E0 + du EX + dv EY).
-E0, EX, EY, XA = 0, 3, 6, 9
-TC = 12  # anchor depth / m
-UX, UY = 13, 14  # anchor pixel
-NEAR = 15  # near plane, (near - anchor depth)/m
-OFFSET = 16  # b2
-UNIT, ANCHOR_Z = 17, 18  # m and anchor depth in scene units, for the depth image
-NEURONS = 20  # then five numbers per neuron:
+#   x(t) = (XA + TC G) + t e,  G = du EX + dv EY,  e = E0 + G.
+# Its origin is slid along the ray by s = du TU + dv TV, to where x is nearly orthogonal to e. The closest approach is then a
+# small correction, and float32 loses nothing to thin axes:
+#   x(t + s) = (XA + du XU + dv XV + s G) + t e,  XU = TC EX + TU E0,  XV = TC EY + TV E0.
+E0, EX, EY, XA, XU, XV = 0, 3, 6, 9, 12, 15
+TC = 18  # anchor depth / m
+TU, TV = 19, 20
+UX, UY = 21, 22  # anchor pixel
+NEAR = 23  # near plane, (near - anchor depth)/m
+OFFSET = 24  # b2
+UNIT, ANCHOR_Z = 25, 26  # m and anchor depth in scene units, for the depth image
+NEURONS = 27  # then five numbers per neuron:
 WX, WY, WZ, PHASE, AMPLITUDE = 0, 1, 2, 3, 4  # W1 on whitened axes and b1 in turns, w2
 PER_NEURON = 5
 
-# ---- columns of a gradient row that differ from the primitive's
-G_LOG_M = 12  # sum of dL/dI I: the explicit 1/m of the density
-G_WEIGHT, G_ERROR = 13, 14  # sums of alpha T and alpha T x pixel error: statistics, not gradients
+# How fast a pair of neurons may turn over a half chord, in turns; neurons are stored by rising rate, so that pairs are alike.
+SLOW, MEDIUM, FAST = 0, 1, 2
+SLOW_TURNS, MEDIUM_TURNS = 0.4999, 1.4999
+
+# ---- a gradient row: dL/d(E0, EX, EY, XA) in the same columns, then
+G_OFFSET = 12
+G_LOG_M = 13  # sum of dL/dI I: the explicit 1/m of the density
+G_WEIGHT, G_ERROR = 14, 15  # sums of alpha T and alpha T x pixel error: statistics, not gradients
+G_NEURONS = 16  # five per neuron, then C colours
 
 # ---- row spans of a primitive's silhouette, relative to its anchor pixel
 SKEW, XC, YC, HX, HY = 0, 1, 2, 3, 4
@@ -34,9 +44,18 @@ TILE = 16
 LANES = 288  # 256 pixels of a tile, padded so that a vector may run over the end
 
 
-def row_width(neurons: int, channels: int = 0) -> int:
-    """Floats per row for K padded neurons and C colour columns, a multiple of 16."""
-    return -(-(NEURONS + PER_NEURON * neurons + channels) // 16) * 16
+def _padded(floats: int) -> int:
+    return -(-floats // 16) * 16
+
+
+def row_width(neurons: int) -> int:
+    """Floats per primitive row for K padded neurons, a multiple of 16."""
+    return _padded(NEURONS + PER_NEURON * neurons)
+
+
+def gradient_width(neurons: int, channels: int) -> int:
+    """Floats per gradient row for K padded neurons and C colours, a multiple of 16."""
+    return _padded(G_NEURONS + PER_NEURON * neurons + channels)
 
 
 def lane(index: int) -> int:
@@ -50,7 +69,7 @@ EXL, EYL, EZL = lane(2), lane(3), lane(4)  # ray direction e in whitened space
 QX, QY, QZ = lane(5), lane(6), lane(7)  # chord middle
 HALF = lane(8)  # half chord, units of m along e; 0 where the ray misses
 FIELD = lane(9)  # mean of f over the chord
-MX, MY, MZ = lane(10), lane(11), lane(12)  # ray point at the anchor depth
+PX, PY, PZ = lane(10), lane(11), lane(12)  # closest point to the centre
 MID, TM, IA = lane(13), lane(14), lane(15)  # chord middle, closest approach (both t), 1/(e.e)
 DH = lane(16)  # dh/dD with the floor on D
 UNCUT = lane(17)  # 1 where the near plane does not cut the chord
@@ -63,8 +82,10 @@ GF = lane(23)  # dL/d FIELD
 GQX, GQY, GQZ = lane(24), lane(25), lane(26)  # dL/d chord middle
 GEX, GEY, GEZ = lane(27), lane(28), lane(29)  # dL/d (half e)
 GMID = lane(30)  # dL/d MID from the depth image
+HEIGHT = lane(31)  # half chord before the near plane cuts it
+SLIDE = lane(32)  # s: MID and TM are measured from a ray origin slid by this much
 FORWARD_SCRATCH = lane(20)
-BACKWARD_SCRATCH = lane(31)
+BACKWARD_SCRATCH = lane(33)
 # per neuron in the backward pass: cos sinc, -2 pi sin sinc, cos dsinc
 N_COS, N_SIN, N_DSINC = lane(0), lane(1), lane(2)
 NEURON_SCRATCH = lane(3)

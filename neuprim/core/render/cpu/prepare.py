@@ -19,30 +19,47 @@ from neuprim.core.render.cpu.layout import (
     E0,
     EX,
     EY,
+    FAST,
     G_LOG_M,
+    G_NEURONS,
+    G_OFFSET,
     HX,
     HY,
+    MEDIUM,
+    MEDIUM_TURNS,
     NEAR,
     NEURONS,
     OFFSET,
     PER_NEURON,
     PHASE,
     SKEW,
+    SLOW,
+    SLOW_TURNS,
     TC,
+    TU,
+    TV,
     UNBOUNDED,
     UNIT,
     UX,
     UY,
     WX,
+    WY,
+    WZ,
     XA,
     XC,
+    XU,
+    XV,
     YC,
-)
+)  # fmt: skip
 
-__all__ = ["CULLED", "NON_FINITE", "VISIBLE", "prepare", "prepare_backward"]
+__all__ = ["CULLED", "NON_FINITE", "VISIBLE", "prepare", "prepare_backward", "prepare_wide"]
 
 VISIBLE, CULLED, NON_FINITE = 0, 1, 2
 _FLOAT32_MAX = 3.0e38
+
+# Where the pixel stage leaves float32 (measured by benchmarks/numerics.py): whitened coordinates beyond this many radii of the
+# thinnest axis, neurons beyond this many turns per half chord, anchors this many pixels away.
+_DELICATE_RADII, _DELICATE_TURNS, _DELICATE_PIXELS = 8.0, 4.0, 16384.0
 
 strict = njit(error_model="numpy", forceinline=True)
 
@@ -116,67 +133,91 @@ def _frame(mean, log_scale, quat, R, t, cam, near, local, B, axes, c, anchor):  
     return m, n
 
 
-@exact_kernel
-def prepare(start, stop, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, size, near, turns, rows, spans, simple, boxes, depth, status):  # type: ignore[no-untyped-def]
-    """Fill kernel rows, silhouette spans, pixel boxes, view depths and status of primitives ``start:stop``.
+@strict
+def _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, rate, order, row):  # type: ignore[no-untyped-def]
+    """Fill the float64 kernel row of primitive ``i`` and ``order[i]``; returns (m, whether all is finite, largest number).
 
-    cam = (fx, fy, cx, cy); size = (width, height); turns = omega0 / 2 pi. ``simple[i, k]`` says that neuron k's phase
-    changes by less than a turn over any chord, so that sinc needs no range reduction.
+    ``work`` (10, 3): scratch, of which rows 0..2 return B, 3 the axes s/m, 4 the centre in camera axes.
     """
     K = W1.shape[1]
-    local, B, A = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    axes, c, anchor, ref, w = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    e0, ex, ey, xa = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    k0, ka, kb, tmp = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    B, axes, c, local, anchor, w = work[0:3], work[3], work[4], work[5:8], work[8], work[9]
     fx, fy, cx, cy = cam[0], cam[1], cam[2], cam[3]
-    for i in range(start, stop):
-        row = rows[i]
-        row[:] = np.float32(0)
-        m, _ = _frame(means[i], log_scales[i], quats[i], R, t, cam, near, local, B, axes, c, anchor)
-        tc = anchor[0] / m
-        ref[0] = (anchor[1] - cx) / fx
-        ref[1] = (anchor[2] - cy) / fy
-        ref[2] = 1.0
-        for j in range(3):
-            w[j] = tc * ref[j] - c[j] / m
-        biggest = 0.0
-        total = 0.0
-        for a in range(3):
-            for j in range(3):
-                A[a, j] = B[j, a] / axes[a]  # m S^-1 B^T
-            e0[a] = A[a, 0] * ref[0] + A[a, 1] * ref[1] + A[a, 2]
-            ex[a] = A[a, 0] / fx
-            ey[a] = A[a, 1] / fy
-            xa[a] = A[a, 0] * w[0] + A[a, 1] * w[1] + A[a, 2] * w[2]
-            row[E0 + a], row[EX + a], row[EY + a], row[XA + a] = e0[a], ex[a], ey[a], xa[a]
-            biggest = max(biggest, abs(xa[a]), abs(e0[a]))
-            total += e0[a] + ex[a] + ey[a] + xa[a]
-        row[TC], row[UX], row[UY] = tc, anchor[1], anchor[2]
-        row[NEAR] = (near - anchor[0]) / m
-        row[OFFSET] = b2[i]
-        row[UNIT], row[ANCHOR_Z] = m, anchor[0]
-        biggest = max(biggest, tc, abs(near - anchor[0]) / m, m, abs(np.float64(b2[i])))
-        total += tc + row[NEAR] + m + b2[i]
-        for k in range(K):
-            o = NEURONS + PER_NEURON * k
-            norm = 0.0
-            for j in range(3):
-                v = turns * axes[j] * (W1[i, k, 0] * local[0, j] + W1[i, k, 1] * local[1, j] + W1[i, k, 2] * local[2, j])
-                row[o + WX + j] = v
-                norm += v * v
-                biggest = max(biggest, abs(v))
-            phase = turns * np.float64(b1[i, k])
-            row[o + PHASE] = phase - np.rint(phase)
-            row[o + AMPLITUDE] = w2[i, k]
-            simple[i, k] = norm < 0.4999 * 0.4999
-            total += norm + phase + w2[i, k]
-            biggest = max(biggest, abs(np.float64(w2[i, k])))
-        for k in range(K, simple.shape[1]):
-            simple[i, k] = True
+    m, _ = _frame(means[i], log_scales[i], quats[i], R, t, cam, near, local, B, axes, c, anchor)
+    tc = anchor[0] / m
+    u, v = (anchor[1] - cx) / fx, (anchor[2] - cy) / fy
+    w[0], w[1], w[2] = tc * u - c[0] / m, tc * v - c[1] / m, tc - c[2] / m
+    biggest, total, aa, xe, ye = 0.0, 0.0, 0.0, 0.0, 0.0
+    for a in range(3):
+        A0, A1, A2 = B[0, a] / axes[a], B[1, a] / axes[a], B[2, a] / axes[a]  # m S^-1 B^T
+        e0, ex, ey, xa = A0 * u + A1 * v + A2, A0 / fx, A1 / fy, A0 * w[0] + A1 * w[1] + A2 * w[2]
+        row[E0 + a], row[EX + a], row[EY + a], row[XA + a] = e0, ex, ey, xa
+        aa, xe, ye = aa + e0 * e0, xe + ex * e0, ye + ey * e0
+        biggest = max(biggest, abs(xa), abs(e0))
+        total += e0 + ex + ey + xa
+    tu, tv = -tc * xe / aa, -tc * ye / aa
+    for a in range(3):
+        row[XU + a], row[XV + a] = tc * row[EX + a] + tu * row[E0 + a], tc * row[EY + a] + tv * row[E0 + a]
+    row[TC], row[TU], row[TV], row[UX], row[UY] = tc, tu, tv, anchor[1], anchor[2]
+    row[NEAR], row[OFFSET], row[UNIT], row[ANCHOR_Z] = (near - anchor[0]) / m, b2[i], m, anchor[0]
+    biggest = max(biggest, tc, abs(row[NEAR]), m, abs(row[OFFSET]))
+    total += tc + row[NEAR] + m + row[OFFSET]
+    for k in range(K):
+        w0 = turns * axes[0] * (W1[i, k, 0] * local[0, 0] + W1[i, k, 1] * local[1, 0] + W1[i, k, 2] * local[2, 0])
+        w1 = turns * axes[1] * (W1[i, k, 0] * local[0, 1] + W1[i, k, 1] * local[1, 1] + W1[i, k, 2] * local[2, 1])
+        w2_ = turns * axes[2] * (W1[i, k, 0] * local[0, 2] + W1[i, k, 1] * local[1, 2] + W1[i, k, 2] * local[2, 2])
+        speed = np.sqrt(w0 * w0 + w1 * w1 + w2_ * w2_)
+        phase = turns * np.float64(b1[i, k])
+        biggest = max(biggest, speed, abs(np.float64(w2[i, k])))
+        total += speed + phase + w2[i, k]
+        at = k  # insertion sort
+        while at > 0 and rate[at - 1] > speed:
+            rate[at], order[i, at] = rate[at - 1], order[i, at - 1]
+            for j in range(NEURONS + PER_NEURON * at, NEURONS + PER_NEURON * (at + 1)):
+                row[j] = row[j - PER_NEURON]
+            at -= 1
+        o = NEURONS + PER_NEURON * at
+        rate[at], order[i, at] = speed, k
+        row[o + WX], row[o + WY], row[o + WZ], row[o + PHASE], row[o + AMPLITUDE] = w0, w1, w2_, phase - np.rint(phase), w2[i, k]
+    return m, np.isfinite(total), biggest
 
+
+@exact_kernel
+def prepare_wide(start, stop, which, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, order, wide):  # type: ignore[no-untyped-def]
+    """float64 rows of primitives ``which[start:stop]``, which the pixel stage draws in float64."""
+    work, rate = np.empty((10, 3)), np.empty(W1.shape[1])
+    for n in range(start, stop):
+        wide[n, :] = 0.0
+        _wide_row(which[n], means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, rate, order, wide[n])
+
+
+@exact_kernel
+def prepare(
+    start, stop, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, size, near, turns,
+    rows, spans, kinds, order, boxes, depth, status, delicate,
+):  # type: ignore[no-untyped-def] # fmt: skip
+    """Fill kernel rows, silhouette spans, pixel boxes, view depths and status of primitives ``start:stop``.
+
+    cam = (fx, fy, cx, cy); size = (width, height); turns = omega0 / 2 pi. Neurons are stored by rising rate: ``order[i, k]`` is the
+    model's index of row neuron k, ``kinds[i, m]`` the range of rates (SLOW, MEDIUM, FAST) of row neurons 2m and 2m + 1.
+    ``delicate[i]`` says that float32 is not enough for the primitive's pixels (see :func:`prepare_wide`).
+    """
+    K = W1.shape[1]
+    work, rate, row = np.empty((10, 3)), np.empty(K), np.zeros(rows.shape[1])
+    B, axes, c, e0, ex, ey, xa = work[0:3], work[3], work[4], row[E0:EX], row[EX:EY], row[EY:XA], row[XA:XU]
+    k0, ka, kb, tmp = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(start, stop):
+        m, finite, biggest = _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, rate, order, row)
+        for n in range(kinds.shape[1]):
+            fastest = rate[min(2 * n + 1, K - 1)]
+            kinds[i, n] = SLOW if fastest < SLOW_TURNS else (MEDIUM if fastest < MEDIUM_TURNS else FAST)
+        for j in range(row.shape[0]):
+            rows[i, j] = row[j]
+        tc = row[TC]
+        delicate[i] = (K > 0 and rate[K - 1] > _DELICATE_TURNS) or max(abs(row[UX]), abs(row[UY])) > _DELICATE_PIXELS
+        delicate[i] |= max(abs(xa[0]), abs(xa[1]), abs(xa[2])) > _DELICATE_RADII  # far from the camera's anchor, in the thinnest axis
         depth[i] = c[2]
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
-        if not np.isfinite(total):
+        if not finite:
             status[i] = NON_FINITE
             continue
         status[i] = CULLED
@@ -224,6 +265,13 @@ def prepare(start, stop, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, si
                 if peak > 0.0:
                     span[SKEW], span[XC], span[YC] = -q4 / q3, -(q1 + q4 * yc) / q3, yc
                     span[HX], span[HY] = np.sqrt(peak) / -q3, np.sqrt(-peak / d2)
+                    # what sliding the origin leaves over, s G, at the silhouette's rim
+                    slide = abs(row[TU]) * span[HX] + abs(row[TV]) * span[HY]
+                    delicate[i] |= slide * (np.sqrt(_dot(ex, ex)) * span[HX] + np.sqrt(_dot(ey, ey)) * span[HY]) > _DELICATE_RADII
+        if delicate[i]:  # the float64 rows do not slide
+            for a in range(3):
+                rows[i, XU + a], rows[i, XV + a] = tc * ex[a], tc * ey[a]
+            rows[i, TU], rows[i, TV] = 0.0, 0.0
         if x1 > x0 and y1 > y0:
             boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = int(x0), int(y0), int(x1), int(y1)
             status[i] = VISIBLE
@@ -231,7 +279,7 @@ def prepare(start, stop, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, si
 
 @exact_kernel
 def prepare_backward(  # type: ignore[no-untyped-def]
-    start, stop, means, log_scales, quats, W1, R, t, cam, near, turns, rows, grads, touched,
+    start, stop, means, log_scales, quats, W1, R, t, cam, near, turns, rows, order, grads, touched,
     g_means, g_log_scales, g_quats, g_W1, g_b1, g_w2, g_b2, g_view, want_view,
 ):  # fmt: skip
     """Chain rule from gradient rows to parameters, for primitives ``start:stop``; returns dL/d(R | t) of this chunk, (3, 4)."""
@@ -244,7 +292,7 @@ def prepare_backward(  # type: ignore[no-untyped-def]
         if not touched[i]:
             continue
         g = grads[i]
-        m, n = _frame(means[i], log_scales[i], quats[i], R, t, cam, near, local, B, axes, c, anchor)
+        m, inverse = _frame(means[i], log_scales[i], quats[i], R, t, cam, near, local, B, axes, c, anchor)
         tc = anchor[0] / m
         ref[0], ref[1], ref[2] = (anchor[1] - cx) / fx, (anchor[2] - cy) / fy, 1.0
         for j in range(3):
@@ -267,21 +315,21 @@ def prepare_backward(  # type: ignore[no-untyped-def]
         for a in range(3):
             for j in range(3):
                 gL[a, j] = 0.0
-        for k in range(K):
-            o = NEURONS + PER_NEURON * k
+        for n in range(K):
+            k, o, og = order[i, n], NEURONS + PER_NEURON * n, G_NEURONS + PER_NEURON * n
             for j in range(3):
-                gw = np.float64(g[o + WX + j])
+                gw = np.float64(g[og + WX + j])
                 gl[j] += gw * rows[i, o + WX + j]  # W on whitened axes scales with s_j/m
                 log_m -= gw * rows[i, o + WX + j]
                 for a in range(3):
                     gL[a, j] += turns * axes[j] * W1[i, k, a] * gw
             for a in range(3):
                 g_W1[i, k, a] = turns * (
-                    g[o + WX] * axes[0] * local[a, 0] + g[o + WX + 1] * axes[1] * local[a, 1] + g[o + WX + 2] * axes[2] * local[a, 2]
+                    g[og + WX] * axes[0] * local[a, 0] + g[og + WX + 1] * axes[1] * local[a, 1] + g[og + WX + 2] * axes[2] * local[a, 2]
                 )
-            g_b1[i, k] = turns * g[o + PHASE]
-            g_w2[i, k] = g[o + AMPLITUDE]
-        g_b2[i] = g[OFFSET]
+            g_b1[i, k] = turns * g[og + PHASE]
+            g_w2[i, k] = g[og + AMPLITUDE]
+        g_b2[i] = g[G_OFFSET]
         first = 0
         for j in range(1, 3):
             if log_scales[i, j] > log_scales[i, first]:
@@ -294,7 +342,7 @@ def prepare_backward(  # type: ignore[no-untyped-def]
                 gL[a, j] += R[0, a] * gB[0, j] + R[1, a] * gB[1, j] + R[2, a] * gB[2, j]
         for j in range(4):
             q[j] = quats[i, j]
-        _rotation_backward(q, n, gL, gq)
+        _rotation_backward(q, inverse, gL, gq)
         for j in range(4):
             g_quats[i, j] = gq[j]
         if want_view:

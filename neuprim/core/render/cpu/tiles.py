@@ -21,27 +21,32 @@ from neuprim.core.render.cpu.layout import (
     EZL,
     FIELD,
     HALF,
+    HEIGHT,
     HX,
     HY,
     IA,
     MID,
-    MX,
-    MY,
-    MZ,
     NEAR,
     NORM,
     NORM_L,
     OFFSET,
+    PX,
+    PY,
+    PZ,
     QX,
     QY,
     QZ,
     SKEW,
-    TC,
+    SLIDE,
     TILE,
     TM,
+    TU,
+    TV,
     UNCUT,
     XA,
     XC,
+    XU,
+    XV,
     YC,
 )
 
@@ -50,7 +55,7 @@ __all__ = ["chords", "compact", "row_spans"]
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(TILE).astype(np.float32)
-_MARGIN = f(2e-3)  # pixels; a lane too many is rejected by its own D
+_MARGIN, _ROUNDING = f(2e-3), f(4e-7)  # pixels, and per pixel of the ellipse; a lane too many is rejected by its own D
 
 
 @inline
@@ -67,8 +72,9 @@ def row_spans(span, fx0, fy0, y0, y1, x0, x1, bounds):  # type: ignore[no-untype
         dv = row - yc
         k = dv * ihy
         s = f(1) - k * k
-        half = hx * np.sqrt(max(s, f(0))) + _MARGIN
         mid = xc + skew * dv
+        half = hx * np.sqrt(max(s, f(0)))
+        half += _MARGIN + _ROUNDING * (half + abs(mid))
         lo = max(np.ceil(mid - half), low)
         hi = min(np.floor(mid + half) + f(1), high)
         inside = (s > f(-1e-2)) & (row >= top) & (row < bottom)
@@ -106,36 +112,44 @@ def compact(S, state, offset, bounds, y0, y1, rows_live, fx0, fy0):  # type: ign
 
 
 @inline
-def chords(S, n, p, depth_floor, backward):  # type: ignore[no-untyped-def]
+def chords(S, n, p, depth_floor, with_mid, backward):  # type: ignore[no-untyped-def]
     """Chord middle Q, direction E and half length of n lanes (method: "Line integral"); HALF = 0 where the ray misses."""
     e0, e1, e2 = p[E0], p[E0 + 1], p[E0 + 2]
     x0, x1, x2 = p[EX], p[EX + 1], p[EX + 2]
     y0, y1, y2 = p[EY], p[EY + 1], p[EY + 2]
     a0, a1, a2 = p[XA], p[XA + 1], p[XA + 2]
-    tc, near, offset = p[TC], p[NEAR], p[OFFSET]
+    u0, u1, u2 = p[XU], p[XU + 1], p[XU + 2]
+    v0, v1, v2 = p[XV], p[XV + 1], p[XV + 2]
+    tu, tv, near, offset = p[TU], p[TV], p[NEAR], p[OFFSET]
     for k in range(n):
         du, dv = S[DU + k], S[DV + k]
+        slide = du * tu + dv * tv
         gx, gy, gz = du * x0 + dv * y0, du * x1 + dv * y1, du * x2 + dv * y2
         ex, ey, ez = e0 + gx, e1 + gy, e2 + gz
-        mx, my, mz = a0 + tc * gx, a1 + tc * gy, a2 + tc * gz
+        mx, my, mz = a0 + du * u0 + dv * v0 + slide * gx, a1 + du * u1 + dv * v1 + slide * gy, a2 + du * u2 + dv * v2 + slide * gz
         ia = f(1) / (ex * ex + ey * ey + ez * ez)
         tm = -(mx * ex + my * ey + mz * ez) * ia
         px, py, pz = mx + tm * ex, my + tm * ey, mz + tm * ez
         D = f(1) - (px * px + py * py + pz * pz)
         h = np.sqrt(max(D, f(1e-12)) * ia)
         t0, t1 = tm - h, tm + h
-        uncut = f(1) if t0 > near else f(0)
-        t0 = max(t0, near)
+        near_here = near - slide
+        uncut = f(1) if t0 > near_here else f(0)
+        t0 = max(t0, near_here)
         mid = (t0 + t1) * f(0.5)
         half = (t1 - t0) * f(0.5)
         half = half if D > f(0) else f(0)
         half = max(half, f(0))
-        S[QX + k], S[QY + k], S[QZ + k] = mx + mid * ex, my + mid * ey, mz + mid * ez
+        # from the closest point, not from the ray's origin: the shift is zero unless the near plane cuts
+        shift = mid - tm
+        S[QX + k], S[QY + k], S[QZ + k] = px + shift * ex, py + shift * ey, pz + shift * ez
         S[EXL + k], S[EYL + k], S[EZL + k] = ex, ey, ez
         S[HALF + k] = half
         S[FIELD + k] = offset
-        S[MID + k] = mid
+        if with_mid:
+            S[MID + k] = mid + slide
         if backward:
-            S[MX + k], S[MY + k], S[MZ + k] = mx, my, mz
-            S[TM + k], S[IA + k], S[UNCUT + k] = tm, ia, uncut
+            S[PX + k], S[PY + k], S[PZ + k] = px, py, pz
+            S[MID + k], S[TM + k], S[IA + k], S[UNCUT + k] = mid, tm, ia, uncut
+            S[HEIGHT + k], S[SLIDE + k] = h, slide
             S[DH + k] = f(0.5) * ia / np.sqrt(max(D, depth_floor) * ia)

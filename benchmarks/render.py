@@ -1,0 +1,216 @@
+"""Speed of the cpu backend: time per evaluated lane, lanes per true hit, arithmetic rate, memory; and ratios against another program.
+
+    python benchmarks/render.py [--scenes 5000x400 20000x400 20000x800] [--threads 1 2] [--rounds 9] [--against DIR] [--record]
+
+DIR holds the numba study this backend grew out of (common.py, numk_fi.py): both draw the same primitives from the same camera,
+alternating in one process, and the ratio of their fastest rounds is printed (below 1 this backend is faster). Preparation and
+binning are inside on both sides; three colours, no depth. Absolute times are of this machine in its present mood: only ratios travel.
+
+Flops are counted by one rule on both sides: 420 per evaluated lane forward, 1,100 backward (K = 8). --record adds the result to
+benchmarks/results/render.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit
+
+from neuprim.core.cameras import Camera
+from neuprim.core.fields import Constant, Cosine
+from neuprim.core.geometry import Geometry
+from neuprim.core.primitives import Lowered
+from neuprim.core.render import RenderSettings, render_lowered
+from neuprim.core.render.cpu.layout import SPAN_WIDTH, gradient_width, row_width
+
+RESULTS = Path(__file__).parent / "results" / "render.json"
+FLOPS = {"forward": 420, "backward": 1100}
+Pair = tuple[Callable[[], Any], Callable[[], Any]]
+
+
+def random_scene(count: int, seed: int = 0, overlap: float = 30.0, rate: float = 4.0) -> dict[str, torch.Tensor]:
+    """Anisotropic primitives filling a unit cube that cover its face ``overlap`` times; phases turn up to ``rate`` radians per axis and m.
+
+    The same numbers in the same order as the study's generator, so that both sides draw one scene.
+    """
+    g = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=g, dtype=torch.float64)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    means = uniform(count, 3) - 0.5
+    scales = math.sqrt(overlap / (count * math.pi)) * 0.92 * torch.exp(0.45 * normal(count, 3))
+    W1, b1 = (2 * uniform(count, 8, 3) - 1) * rate, (2 * uniform(count, 8) - 1) * math.pi
+    w2, b2 = normal(count, 8) * 0.12, 0.12 + 0.1 * uniform(count)
+    return {"mean": means, "scale": scales, "quat": normal(count, 4), "W1": W1, "b1": b1, "w2": w2, "b2": b2, "col": uniform(count, 3)}
+
+
+def lower(p: dict[str, torch.Tensor]) -> Lowered:
+    t = {k: v.float().requires_grad_() for k, v in p.items()}
+    with torch.no_grad():
+        log_scales = t["scale"].log()
+    geometry = Geometry(t["mean"], log_scales.requires_grad_(), t["quat"])
+    return Lowered(geometry, Cosine(t["W1"], t["b1"], t["w2"], t["b2"], omega0=1.0), Constant(t["col"]))
+
+
+def view(size: int, distance: float = 1.7, fov: float = 40.0) -> Camera:
+    a, b = 0.5, 0.3
+    Ry = torch.tensor([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]], dtype=torch.float64)
+    Rx = torch.tensor([[1, 0, 0], [0, math.cos(b), -math.sin(b)], [0, math.sin(b), math.cos(b)]], dtype=torch.float64)
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3], matrix[2, 3] = Rx @ Ry, distance
+    f = 0.5 * size / math.tan(math.radians(fov) / 2)
+    return Camera(matrix, f, f, size / 2, size / 2, size, size)
+
+
+@njit(cache=False)
+def _count_hits(E0, EX, EY, XA, tc, anchor, boxes):  # type: ignore[no-untyped-def]
+    hits = 0
+    for i in range(len(tc)):
+        for y in range(boxes[i, 1], boxes[i, 3]):
+            for x in range(boxes[i, 0], boxes[i, 2]):
+                du, dv = x + 0.5 - anchor[i, 0], y + 0.5 - anchor[i, 1]
+                ee, me, mm = 0.0, 0.0, 0.0
+                for a in range(3):
+                    g = du * EX[i, a] + dv * EY[i, a]
+                    e, m = E0[i, a] + g, XA[i, a] + tc[i] * g
+                    ee, me, mm = ee + e * e, me + m * e, mm + m * m
+                hits += mm - me * me / ee < 1.0
+    return hits
+
+
+def true_hits(lowered: Lowered, camera: Camera) -> int:
+    """Rays that really meet a primitive, of all (pixel, primitive) pairs."""
+    from neuprim.core.render.cpu import layout
+    from neuprim.core.render.cpu.backend import _Rasterize  # the frame a forward pass keeps
+
+    g, d = lowered.geometry, lowered.density
+    assert isinstance(d, Cosine) and isinstance(lowered.colour, Constant)
+    out = render_lowered(lowered, camera, RenderSettings(backend="cpu"), torch.zeros(3))
+    node = out.rgb.grad_fn
+    while node is not None and not hasattr(node, "frame"):
+        node = node.next_functions[0][0]
+    assert node is not None, _Rasterize
+    frame = node.frame  # type: ignore[attr-defined]
+    rows = frame.rows.astype(np.float64)
+    parts = [rows[:, c : c + 3] for c in (layout.E0, layout.EX, layout.EY, layout.XA)]
+    del g, d
+    return int(_count_hits(*parts, rows[:, layout.TC], rows[:, [layout.UX, layout.UY]], frame.boxes))
+
+
+def ours(lowered: Lowered, camera: Camera, threads: int) -> tuple[Pair, dict[str, int]]:
+    settings, background = RenderSettings(backend="cpu", threads=threads), torch.zeros(3)
+    g_rgb = torch.ones(camera.height, camera.width, 3)
+    kept = render_lowered(lowered, camera, settings, background)
+    leaves = [lowered.geometry.means, lowered.geometry.log_scales, lowered.geometry.quats, lowered.colour.rgb]  # type: ignore[union-attr]
+    leaves += [lowered.density.W1, lowered.density.b1, lowered.density.w2, lowered.density.b2]  # type: ignore[union-attr]
+
+    def forward() -> None:
+        with torch.no_grad():
+            render_lowered(lowered, camera, settings, background)
+
+    def backward() -> None:
+        torch.autograd.grad(kept.rgb, leaves, g_rgb, retain_graph=True)
+
+    backward()
+    lanes = {k: int(kept.stats.extra[f"{k}_lanes"]) for k in FLOPS}
+    return (forward, backward), {**lanes, "pairs": kept.stats.pairs}
+
+
+def study(folder: Path, p: dict[str, torch.Tensor], size: int, threads: int) -> Pair:
+    """The study's preparation (torch, float64), binning (numpy) and kernels (numba)."""
+    sys.path.insert(0, str(folder))
+    import common
+    import numk_fi
+
+    cam = common.camera(size, size)
+    g_rgb = np.ones((size, size, 3), np.float32)
+    leaves = {k: v.clone().requires_grad_() for k, v in p.items()}
+
+    def forward() -> Any:
+        with torch.no_grad():
+            rows, centre = common.preprocess(p, cam)
+            kernel = numk_fi.K().setup(rows, common.bounds(p, cam), centre, cam)
+        kernel.fwd(threads)
+        return kernel
+
+    rows, _ = common.preprocess(leaves, cam)
+    kept = forward()
+
+    def backward() -> None:
+        kept.bwd(g_rgb, threads)
+        torch.autograd.grad(rows, list(leaves.values()), torch.from_numpy(kept.G), retain_graph=True)
+
+    return forward, backward
+
+
+def fastest(pairs: list[Callable[[], Any]], rounds: int) -> list[float]:
+    """Fastest of ``rounds`` runs of each, taken in turns so that all meet the same noise; one run each beforehand."""
+    for run in pairs:
+        run()
+    times = [math.inf] * len(pairs)
+    for _ in range(rounds):
+        for i, run in enumerate(pairs):
+            start = time.perf_counter()
+            run()
+            times[i] = min(times[i], time.perf_counter() - start)
+    return times
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--scenes", nargs="*", default=["5000x400", "20000x400", "20000x800"], help="PRIMITIVESxSIZE")
+    parser.add_argument("--threads", nargs="*", type=int, default=[1, 2])
+    parser.add_argument("--rate", type=float, default=4.0, help="largest phase rate per axis, radians per m (trained models: about 10)")
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--against", type=Path)
+    parser.add_argument("--record", action="store_true")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = []
+    print(
+        f"rate {args.rate} rad per axis; per primitive {4 * row_width(8) + 4 * SPAN_WIDTH} bytes of rows and spans, per pair 8 bytes, ",
+        end="",
+    )
+    print(f"with gradients {4 * gradient_width(8, 3)} bytes more per pair and per primitive (K = 8)")
+    print("| scene | threads | pass | ms | ns/lane | lanes/hit | GFLOP/s | ratio |\n| --- | --- | --- | --- | --- | --- | --- | --- |")
+    for text in args.scenes:
+        count, size = (int(x) for x in text.split("x"))
+        p, camera = random_scene(count, rate=args.rate), view(size)
+        lowered = lower(p)
+        hits = true_hits(lowered, camera)
+        for threads in args.threads:
+            mine, counts = ours(lowered, camera, threads)
+            other = study(args.against, p, size, threads) if args.against else None
+            for i, name in enumerate(FLOPS):
+                times = fastest([mine[i], *([other[i]] if other else [])], args.rounds)
+                lanes = counts[name]
+                row: dict[str, Any] = {"scene": text, "rate": args.rate, "threads": threads, "pass": name, "ms": times[0] * 1e3}
+                row |= {"ns_per_lane": times[0] / lanes * 1e9 * threads, "lanes_per_hit": lanes / hits}
+                row |= {"gflops": lanes * FLOPS[name] / times[0] / 1e9, "ratio": times[0] / times[1] if other else None}
+                ratio = "" if row["ratio"] is None else f"{row['ratio']:.2f}"
+                print(
+                    f"| {text} | {threads} | {name} | {row['ms']:.1f} | {row['ns_per_lane']:.1f} | {row['lanes_per_hit']:.2f} "
+                    f"| {row['gflops']:.0f} | {ratio} |",
+                    flush=True,
+                )
+                rows.append(row)
+    if args.record:
+        RESULTS.parent.mkdir(exist_ok=True)
+        RESULTS.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

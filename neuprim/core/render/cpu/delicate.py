@@ -1,0 +1,151 @@
+"""The float64 pixel stage, for the few primitives that float32 cannot follow: needles and discs near the camera, fast neurons.
+
+Same interface as the float32 building blocks: what they leave in the lanes is rounded to float32 at the end, so compositing and
+the gradient sums are shared.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neuprim.core.render.cpu.compile import inline
+from neuprim.core.render.cpu.layout import (
+    AMPLITUDE,
+    DH,
+    E0,
+    EX,
+    EXL,
+    EY,
+    EYL,
+    EZL,
+    FIELD,
+    HALF,
+    HEIGHT,
+    IA,
+    MID,
+    N_COS,
+    N_DSINC,
+    N_SIN,
+    NEAR,
+    NEURONS,
+    OFFSET,
+    PER_NEURON,
+    PHASE,
+    PX,
+    PY,
+    PZ,
+    QX,
+    QY,
+    QZ,
+    SLIDE,
+    TC,
+    TILE,
+    TM,
+    UNCUT,
+    UX,
+    UY,
+    WX,
+    WY,
+    WZ,
+    XA,
+    lane,
+)
+from neuprim.core.render.cpu.turns import TAU, cos_turns, dsinc_turns, sinc_turns
+
+__all__ = ["DELICATE_SCRATCH", "delicate_chords", "delicate_neurons", "delicate_slopes"]
+
+f = np.float32
+# float64 lanes: chord middle and half chord vector in whitened space
+_Q, _V = (lane(0), lane(1), lane(2)), (lane(3), lane(4), lane(5))
+_Q0, _Q1, _Q2 = _Q
+_V0, _V1, _V2 = _V
+DELICATE_SCRATCH = lane(6)
+
+
+@inline
+def delicate_chords(S, X, bounds, y0, y1, tx, ty, n, p, depth_floor, with_mid, backward):  # type: ignore[no-untyped-def]
+    """As :func:`~neuprim.core.render.cpu.tiles.chords` from a float64 row ``p``, for the pixels of ``bounds``; lanes n: are padding."""
+    at = 0
+    for y in range(y0, y1):
+        dv = ty + y + 0.5 - p[UY]
+        for x in range(bounds[y], bounds[y + TILE]):
+            du = tx + x + 0.5 - p[UX]
+            gx, gy, gz = du * p[EX] + dv * p[EY], du * p[EX + 1] + dv * p[EY + 1], du * p[EX + 2] + dv * p[EY + 2]
+            ex, ey, ez = p[E0] + gx, p[E0 + 1] + gy, p[E0 + 2] + gz
+            mx, my, mz = p[XA] + p[TC] * gx, p[XA + 1] + p[TC] * gy, p[XA + 2] + p[TC] * gz
+            ia = 1.0 / (ex * ex + ey * ey + ez * ez)
+            tm = -(mx * ex + my * ey + mz * ez) * ia
+            px, py, pz = mx + tm * ex, my + tm * ey, mz + tm * ez
+            D = 1.0 - (px * px + py * py + pz * pz)
+            h = np.sqrt(max(D, 0.0) * ia)
+            t0, t1 = tm - h, tm + h
+            uncut = f(1) if t0 > p[NEAR] else f(0)
+            t0 = max(t0, p[NEAR])
+            mid = 0.5 * (t0 + t1)
+            half = max(0.5 * (t1 - t0), 0.0)
+            shift = mid - tm
+            qx, qy, qz = px + shift * ex, py + shift * ey, pz + shift * ez
+            X[at + _Q0], X[at + _Q1], X[at + _Q2] = qx, qy, qz
+            X[at + _V0], X[at + _V1], X[at + _V2] = ex * half, ey * half, ez * half
+            S[QX + at], S[QY + at], S[QZ + at] = f(qx), f(qy), f(qz)
+            S[EXL + at], S[EYL + at], S[EZL + at] = f(ex), f(ey), f(ez)
+            S[HALF + at] = f(half)
+            S[FIELD + at] = f(p[OFFSET])
+            if with_mid:
+                S[MID + at] = f(mid)
+            if backward:
+                S[PX + at], S[PY + at], S[PZ + at] = f(px), f(py), f(pz)
+                S[MID + at], S[TM + at], S[IA + at], S[UNCUT + at] = f(mid), f(tm), f(ia), uncut
+                S[HEIGHT + at], S[SLIDE + at] = f(h), f(0)
+                S[DH + at] = f(0.5 * ia / np.sqrt(max(D, np.float64(depth_floor)) * ia))
+            at += 1
+    for k in range(at, n):  # padding: a chord of length zero, finite everywhere
+        for a in (QX, QY, QZ, EXL, EYL, EZL, HALF, FIELD):
+            S[a + k] = f(0)
+        for a in _Q + _V:
+            X[a + k] = 0.0
+        if with_mid or backward:
+            S[MID + k] = f(0)
+        if backward:
+            for a in (PX, PY, PZ, TM, IA, UNCUT, HEIGHT, SLIDE, DH):
+                S[a + k] = f(0)
+
+
+@inline
+def _reduced(X, k, p, o):  # type: ignore[no-untyped-def]
+    """Phase at the chord's middle and half its change, in turns: both reduced to half a turn, and the second whole."""
+    wx, wy, wz = p[o + WX], p[o + WY], p[o + WZ]
+    u = X[k + _Q0] * wx + X[k + _Q1] * wy + X[k + _Q2] * wz + p[o + PHASE]
+    v = X[k + _V0] * wx + X[k + _V1] * wy + X[k + _V2] * wz
+    return f(u - np.rint(u)), f(v - np.rint(v)), v
+
+
+@inline
+def delicate_neurons(S, X, n, p, neurons):  # type: ignore[no-untyped-def]
+    """FIELD += w2 cos(phase at the middle) sinc(half its change) of every neuron of a float64 row."""
+    for m in range(neurons):
+        o = NEURONS + PER_NEURON * m
+        for k in range(n):
+            r, s, v = _reduced(X, k, p, o)
+            sinc = sinc_turns(s * s)
+            if abs(v) > 0.5:
+                sinc *= f(s / v)
+            S[FIELD + k] += f(p[o + AMPLITUDE]) * cos_turns(r * r) * sinc
+
+
+@inline
+def delicate_slopes(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
+    """The same, and the three products per neuron that the gradients need."""
+    for m in range(neurons):
+        o = NEURONS + PER_NEURON * m
+        for k in range(n):
+            r, s, v = _reduced(X, k, p, o)
+            sinc, slope = sinc_turns(s * s), dsinc_turns(s * s) * f(2) * s
+            if abs(v) > 0.5:
+                sinc *= f(s / v)
+                slope = (cos_turns(s * s) - sinc) * f(1.0 / v)
+            c = cos_turns(r * r)
+            V[m, N_COS + k] = c * sinc
+            V[m, N_SIN + k] = -TAU * TAU * r * sinc_turns(r * r) * sinc
+            V[m, N_DSINC + k] = c * slope
+            S[FIELD + k] += f(p[o + AMPLITUDE]) * c * sinc

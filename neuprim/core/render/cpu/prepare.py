@@ -192,10 +192,10 @@ def prepare_wide(start, stop, which, means, log_scales, quats, W1, b1, w2, b2, R
 
 
 @exact_kernel
-def prepare(
+def prepare(  # type: ignore[no-untyped-def]
     start, stop, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, size, near, turns,
     rows, spans, kinds, order, boxes, depth, status, delicate,
-):  # type: ignore[no-untyped-def] # fmt: skip
+):  # fmt: skip
     """Fill kernel rows, silhouette spans, pixel boxes, view depths and status of primitives ``start:stop``.
 
     cam = (fx, fy, cx, cy); size = (width, height); turns = omega0 / 2 pi. Neurons are stored by rising rate: ``order[i, k]`` is the

@@ -180,7 +180,13 @@ def _check_primitives(tensors: dict[str, Tensor]) -> tuple[int, int]:
     if len(W1) != 3 or W1[0] != n or W1[2] != 3:
         raise _wrong("W1", f"shape {W1}", f"(N, K, 3) with N={n} as in means")
     k = W1[1]
-    shapes = {"log_scales": [(n, 3)], "quats": [(n, 4)], "b1": [(n, k)], "w2": [(n, k)], "b2": [(n, 1), (n,)]}
+    shapes: dict[str, list[tuple[int, ...]]] = {
+        "log_scales": [(n, 3)],
+        "quats": [(n, 4)],
+        "b1": [(n, k)],
+        "w2": [(n, k)],
+        "b2": [(n, 1), (n,)],
+    }
     for name, allowed in shapes.items():
         if tuple(tensors[name].shape) not in allowed:
             wanted = " or ".join(str(s) for s in allowed)

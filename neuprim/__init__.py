@@ -1,3 +1,23 @@
 """neuprim: radiance fields made of splattable neural primitives."""
 
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neuprim.rasterize import rasterize as rasterize
+
 __version__ = "0.1.0"
+__all__ = ["__version__", "rasterize"]
+
+
+def __getattr__(name: str) -> Any:
+    """The functional front door, loaded when first used: ``import neuprim`` alone must not load torch."""
+    if name == "rasterize":
+        from neuprim.rasterize import rasterize
+
+        globals()[name] = rasterize
+        return rasterize
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

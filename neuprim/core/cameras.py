@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuprim.core.errors import DataError
 
-__all__ = ["Camera", "look_at", "opengl_to_viewmat", "orbit"]
+__all__ = ["Camera", "check_viewmat", "look_at", "opengl_to_viewmat", "orbit"]
 
 
 @dataclass(frozen=True)
@@ -55,16 +55,21 @@ class Camera:
             )
         if self.width <= 0 or self.height <= 0:
             raise DataError(f"{where}: image size {self.width}x{self.height}; expected positive")
-        view = self.viewmat.detach().double()
-        if view.shape != (4, 4) or not torch.isfinite(view).all():
-            raise DataError(f"{where}: camera matrix has shape {tuple(view.shape)} or non-finite entries; expected finite 4x4")
-        R = view[:3, :3]
-        error = (R @ R.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
-        if error > 1e-3:
-            raise DataError(f"{where}: camera rotation is singular or scaled (|R R^T - 1| = {error:.2g}); expected a rotation")
-        if torch.linalg.det(R).item() < 0:
-            raise DataError(f"{where}: camera rotation is mirrored (determinant -1); expected a rotation")
+        check_viewmat(self.viewmat, where)
         return self
+
+
+def check_viewmat(viewmat: Tensor, where: str) -> None:
+    """Raise :class:`DataError` naming ``where`` unless ``viewmat`` is a finite (4, 4) matrix with a rotation in its upper left."""
+    view = viewmat.detach().double()
+    if view.shape != (4, 4) or not torch.isfinite(view).all():
+        raise DataError(f"{where}: camera matrix has shape {tuple(view.shape)} or non-finite entries; expected finite 4x4")
+    R = view[:3, :3]
+    error = (R @ R.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
+    if error > 1e-3:
+        raise DataError(f"{where}: camera rotation is singular or scaled (|R R^T - 1| = {error:.2g}); expected a rotation")
+    if torch.linalg.det(R).item() < 0:
+        raise DataError(f"{where}: camera rotation is mirrored (determinant -1); expected a rotation")
 
 
 def opengl_to_viewmat(c2w: Tensor) -> Tensor:

@@ -13,8 +13,8 @@ from typing import Any
 
 from torch import Tensor
 
-from neuprim.core.cameras import Camera
 from neuprim.core.geometry import Geometry
+from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import ParameterSpec, Params
 
 __all__ = [
@@ -165,5 +165,5 @@ class ColourField(Field):
     channels: int
 
     @abstractmethod
-    def lower(self, params: Params, geometry: Geometry, camera: Camera, conditions: Conditions) -> LoweredColour:
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> LoweredColour:
         """The frame's closed form."""

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras import Camera
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.fields import ColourField, Conditions, DensityField, LoweredColour, LoweredDensity
 from neuprim.core.geometry import GEOMETRY_SPECS, Geometry
+from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import InitContext, ParameterSpec
 
 __all__ = ["Lowered", "Primitives"]
@@ -74,7 +74,7 @@ class Primitives:
         """The tensors one field owns."""
         return {s.name: self.params[s.name] for s in field.parameters()}
 
-    def lower(self, camera: Camera, conditions: Conditions) -> Lowered:
+    def lower(self, camera: AnyCamera, conditions: Conditions) -> Lowered:
         """Fold a frame's conditions into closed forms; differentiable."""
         geometry = self.geometry
         return Lowered(

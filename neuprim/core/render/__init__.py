@@ -11,6 +11,7 @@ from neuprim.core.cameras import Camera
 from neuprim.core.errors import BackendUnavailable
 from neuprim.core.fields import Constant, Cosine
 from neuprim.core.primitives import Lowered, Primitives
+from neuprim.core.ray_cameras import AnyCamera, RayCamera
 from neuprim.core.render.output import RenderOutput, RenderStats
 from neuprim.core.render.settings import RenderSettings
 
@@ -19,24 +20,29 @@ __all__ = ["BACKENDS", "RenderOutput", "RenderSettings", "RenderStats", "choose_
 BACKENDS = ("reference", "cpu")
 
 
-def choose_backend(lowered: Lowered, settings: RenderSettings) -> str:
-    """The backend that will draw this model.
+def choose_backend(lowered: Lowered, settings: RenderSettings, camera: AnyCamera | None = None) -> str:
+    """The backend that will draw this model through this camera; without a camera, through a pinhole.
 
     Raises:
-        BackendUnavailable: when the fast backend is asked for by name but does not know the model's forms.
+        BackendUnavailable: when the fast backend is asked for by name but does not know the model's forms or the camera.
     """
     known = isinstance(lowered.density, Cosine) and isinstance(lowered.colour, Constant)
+    pinhole = not isinstance(camera, RayCamera)
     if settings.backend == "auto":
-        return "cpu" if known else "reference"
+        return "cpu" if known and pinhole else "reference"
     if settings.backend == "cpu" and not known:
         forms = f"{type(lowered.density).__name__} density, {type(lowered.colour).__name__} colour"
         raise BackendUnavailable(f"renderer.backend=cpu cannot draw {forms}; it knows Cosine and Constant. Use renderer.backend=reference")
+    if settings.backend == "cpu" and not pinhole:
+        raise BackendUnavailable(
+            "renderer.backend=cpu cannot draw a RayCamera (fisheye, equirectangular); it knows pinhole cameras. Use renderer.backend=reference"
+        )
     return settings.backend
 
 
 def render(
     model: Primitives,
-    camera: Camera,
+    camera: AnyCamera,
     conditions: Mapping[str, Tensor] | None = None,
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
@@ -45,24 +51,28 @@ def render(
 
     Args:
         model: the primitives; each field lowers under ``conditions`` first.
-        camera: the view; rgb is (camera.height, camera.width, C).
+        camera: the view; rgb is (camera.height, camera.width, C). A :class:`RayCamera` (any central projection) is drawn
+            by the reference backend.
         conditions: e.g. ``{"time": tensor(0.5)}``.
         settings: every speed/accuracy knob.
         background: (C,) colour behind everything; None is black.
 
     Raises:
         NonFiniteError: a parameter is NaN or infinite (named, with the primitive).
-        BackendUnavailable: the backend asked for cannot draw this model.
+        BackendUnavailable: the backend asked for cannot draw this model or this camera.
     """
     return render_lowered(model.lower(camera, conditions or {}), camera, settings or RenderSettings(), background)
 
 
-def render_lowered(lowered: Lowered, camera: Camera, settings: RenderSettings, background: Tensor | None = None) -> RenderOutput:
+def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None) -> RenderOutput:
     """Draw a model whose conditions are already folded in."""
-    if choose_backend(lowered, settings) == "cpu":
-        from neuprim.core.render.cpu.backend import render as draw
-    else:
-        from neuprim.core.render.reference import render as draw
+    if choose_backend(lowered, settings, camera) == "cpu":
+        from neuprim.core.render.cpu.backend import render as draw_pinhole
+
+        assert isinstance(camera, Camera), "choose_backend keeps other cameras away"
+        return draw_pinhole(lowered, camera, background, settings)
+    from neuprim.core.render.reference import render as draw
+
     return draw(lowered, camera, background, settings)
 
 

@@ -38,7 +38,7 @@ class RenderOutput:
     Attributes:
         rgb: (H, W, C) in the model's colour space, composited over the background.
         alpha: (H, W) accumulated opacity 1 - T.
-        depth: (H, W) weighted mean camera-z of the chord middles, 0 where nothing is hit; None unless asked for.
+        depth: (H, W) weighted mean camera-z (ray distance for a ``RayCamera``) of the chord middles, 0 where nothing is hit; None unless asked for.
         stats: see :class:`RenderStats`.
     """
 

@@ -12,12 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras import Camera
 from neuprim.core.fields import Constant, Cosine
 from neuprim.core.geometry import quaternion_to_matrix
 from neuprim.core.primitives import Lowered
+from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
-from neuprim.core.render.projection import screen_boxes
+from neuprim.core.render.rays import Rays, pixel_directions, view_of
 from neuprim.core.render.settings import RenderSettings
 
 __all__ = ["pixel_directions", "render"]
@@ -60,15 +60,6 @@ class _Tally(torch.autograd.Function):
         return grad, None, None, None
 
 
-def pixel_directions(camera: Camera) -> Tensor:
-    """(H, W, 3) unit ray directions in camera axes through the pixel centres, float64."""
-    x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
-    y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
-    gy, gx = torch.meshgrid(y, x, indexing="ij")
-    d = torch.stack([gx, gy, torch.ones_like(gx)], -1)
-    return d / d.norm(dim=-1, keepdim=True)
-
-
 def _sinc(z: Tensor) -> Tensor:
     small = z.abs() < 1e-3
     safe = torch.where(small, torch.ones_like(z), z)
@@ -80,7 +71,7 @@ def _sinc(z: Tensor) -> Tensor:
 class _Frame:
     """Per-primitive quantities of one view, in float64, in camera axes."""
 
-    def __init__(self, lowered: Lowered, camera: Camera) -> None:
+    def __init__(self, lowered: Lowered, camera: AnyCamera) -> None:
         g = lowered.geometry
         view = camera.viewmat.double()
         self.rotation = view[:3, :3]
@@ -98,27 +89,22 @@ class _Frame:
         self.start = -(self.whiten @ (self.center / self.m[:, None])[:, :, None])[..., 0]  # camera centre, whitened
 
 
-def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
+def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
     """Render a lowered model; see :func:`neuprim.core.render.render` for shapes. Computes in float64, returns the model's dtype."""
     frame = _Frame(lowered, camera)
     count = lowered.geometry.count
-    directions = pixel_directions(camera)
+    seen = view_of(camera, lowered.geometry, frame.center, settings.near)
     channels = lowered.colour.rgb.shape[1] if isinstance(lowered.colour, Constant) else lowered.colour.channels
-    with torch.no_grad():
-        boxes = screen_boxes(lowered.geometry, camera, settings.near)
-        order = torch.argsort(frame.center[:, 2].detach(), stable=True)
     stats = RenderStats("reference", weight=torch.zeros(count), error_weight=torch.zeros(count))
     rows_of_blocks = []
     for y0 in range(0, camera.height, _BLOCK):
         line = []
         for x0 in range(0, camera.width, _BLOCK):
-            window = directions[y0 : y0 + _BLOCK, x0 : x0 + _BLOCK]
-            h, w = window.shape[:2]
-            b = boxes[order]
-            near_block = (b[:, 0] < x0 + w) & (b[:, 2] > x0) & (b[:, 1] < y0 + h) & (b[:, 3] > y0)
+            h, w = min(_BLOCK, camera.height - y0), min(_BLOCK, camera.width - x0)
+            rays, touched = seen.block(y0, x0, h, w)
             ys, xs = torch.meshgrid(torch.arange(y0, y0 + h), torch.arange(x0, x0 + w), indexing="ij")
             pixels = (ys * camera.width + xs).reshape(-1)
-            out = _trace(lowered, frame, window.reshape(-1, 3), order[near_block], pixels, channels, settings, stats)
+            out = _trace(lowered, frame, rays, touched, pixels, channels, settings, stats)
             line.append(out.reshape(h, w, channels + 2))
         rows_of_blocks.append(torch.cat(line, 1))
     image = torch.cat(rows_of_blocks, 0) if rows_of_blocks else torch.zeros(camera.height, camera.width, channels + 2, dtype=torch.float64)
@@ -134,15 +120,15 @@ def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings
 def _trace(
     lowered: Lowered,
     frame: _Frame,
-    d: Tensor,
+    rays: Rays,
     rows: Tensor,
     pixels: Tensor,
     channels: int,
     settings: RenderSettings,
     stats: RenderStats,
 ) -> Tensor:
-    """(P, channels + 2): premultiplied colour, transmittance and sum of w z of P unit rays ``d`` against depth-sorted ``rows``."""
-    P = d.shape[0]
+    """(P, channels + 2): premultiplied colour, transmittance and sum of w z of P rays against depth-sorted ``rows``."""
+    d, P = rays.directions, len(pixels)
     with torch.no_grad():  # which (primitive, ray) pairs meet at all
         v = frame.whiten[rows].detach() @ d.T  # (R, 3, P)
         p = frame.start[rows].detach()[:, :, None]
@@ -151,7 +137,7 @@ def _trace(
         x = p + tm[:, None] * v
         D = 1 - (x * x).sum(1)
         far = tm + (D.clamp_min(0) / a).sqrt()
-        t_near = settings.near / d[:, 2] / frame.m[rows].detach()[:, None]
+        t_near = rays.near / frame.m[rows].detach()[:, None]
         meet = (D > 0) & (far > t_near)
         i, j = meet.nonzero(as_tuple=True)
     prim = rows[i]
@@ -166,7 +152,7 @@ def _trace(
     x = p + tm[:, None] * v
     h = _FlooredSqrt.apply(1 - (x * x).sum(-1), settings.depth_floor) / a.sqrt()
     m = frame.m[prim]
-    t_near = settings.near / dj[:, 2] / m
+    t_near = rays.near[j] / m
     t0 = torch.maximum(tm - h, t_near)
     t1 = tm + h
     mid, half = (t0 + t1) / 2, (t1 - t0) / 2
@@ -208,5 +194,5 @@ def _trace(
         xw = frame.origin + (mid * m)[:, None] * world_d
         c = lowered.colour.radiance(prim, xw, world_d).double()
         rgb = torch.zeros(P, channels, dtype=torch.float64).index_add(0, j, weights[i, j][:, None] * c)
-    z = torch.zeros(P, dtype=torch.float64).index_add(0, j, weights[i, j] * mid * m * dj[:, 2]) if settings.depth else T[-1] * 0
+    z = torch.zeros(P, dtype=torch.float64).index_add(0, j, weights[i, j] * mid * m * rays.depth[j]) if settings.depth else T[-1] * 0
     return torch.cat([rgb, T[-1][:, None], z[:, None]], -1)

@@ -21,7 +21,7 @@ class RenderSettings:
         alpha_max: opacity clamp of one primitive; at most 0.9999, because the backward pass divides by 1 - alpha.
         alpha_min: a ray-primitive pair fainter than this is skipped.
         transmittance_min: a ray stops after the primitive that takes its transmittance below this.
-        near: camera-z of the near plane, scene units; chords are cut there.
+        near: camera-z of the near plane, scene units; chords are cut there. Ray distance for a ``RayCamera``, which has no z plane.
         depth_floor: lower bound on D = 1 - |x_m|^2 in the backward pass only: gradients grow as D^-1/2 at a silhouette, where float32
             knows D to about 3e-7. At 1e-4 they keep three digits, and one chord in ten thousand is affected.
         depth: whether to accumulate the depth image.

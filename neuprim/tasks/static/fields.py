@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from neuprim.core import sh
-from neuprim.core.cameras import Camera
 from neuprim.core.fields import ColourField, Conditions, Constant
 from neuprim.core.geometry import Geometry
+from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import InitContext, ParameterSpec, Params
 
 __all__ = ["SphericalHarmonics"]
@@ -43,7 +43,7 @@ class SphericalHarmonics(ColourField):
             specs.append(ParameterSpec("sh_rest", (rest, C), 2e-3, lambda c: torch.zeros(c.count, rest, C), group="colour"))
         return specs
 
-    def lower(self, params: Params, geometry: Geometry, camera: Camera, conditions: Conditions) -> Constant:
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         dc = params["sh_dc"]
         if self.active and dc.device.type == "cpu" and dc.dtype == geometry.means.dtype == torch.float32:
             from neuprim.core.sh_cpu import fused_colors  # numba, loaded when first needed

@@ -1,0 +1,261 @@
+"""The functional front door: the renderer's own images and gradients, batched, and every bad input refused by name."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import neuprim
+from neuprim.core.cameras import Camera
+from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, NeuprimError, NonFiniteError
+from neuprim.core.render import RenderSettings, render_lowered
+from neuprim.rasterize import Rasterized
+from tests import scenes
+
+WIDTH, HEIGHT = 40, 30
+CAMERAS = [
+    scenes.camera(WIDTH, HEIGHT),
+    scenes.camera(WIDTH, HEIGHT, distance=2.0, fov=60, shift=(7.5, -3.25)),
+    scenes.camera(WIDTH, HEIGHT, distance=0.4, fov=90),
+]
+BACKENDS = ["cpu", "reference"]
+
+
+def arguments(count: int = 30, seed: int = 7, cameras: list[Camera] | None = None, **kw: Any) -> dict[str, Any]:
+    """Keyword arguments of a valid call."""
+    used = CAMERAS if cameras is None else cameras
+    views = torch.stack([c.viewmat for c in used]) if used else torch.zeros(0, 4, 4)
+    Ks = torch.stack([c.K for c in used]) if used else torch.zeros(0, 3, 3)
+    return {**scenes.tensors(count, seed=seed, **kw), "viewmats": views, "Ks": Ks, "width": WIDTH, "height": HEIGHT}
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("channels", [1, 3, 7])
+def test_equals_the_renderer_camera_by_camera(backend: str, channels: int) -> None:
+    a = arguments(channels=channels)
+    backgrounds = torch.rand(3, channels, generator=torch.Generator().manual_seed(0))
+    out = neuprim.rasterize(**a, backgrounds=backgrounds, backend=backend, depth=True, near=0.05)
+    assert isinstance(out, Rasterized) and out.depth is not None
+    assert out.rgb.shape == (3, HEIGHT, WIDTH, channels) and out.alpha.shape == out.depth.shape == (3, HEIGHT, WIDTH)
+    assert out.rgb.dtype == torch.float32 and [s.backend for s in out.stats] == [backend] * 3
+    settings = RenderSettings(backend=backend, depth=True, near=0.05)  # type: ignore[arg-type]
+    for c, camera in enumerate(CAMERAS):
+        one = render_lowered(scenes.lowered(a), camera, settings, backgrounds[c])
+        assert one.alpha.max() > 0.3
+        assert torch.equal(out.rgb[c], one.rgb) and torch.equal(out.alpha[c], one.alpha) and torch.equal(out.depth[c], one.depth)  # type: ignore[arg-type]
+    shared = neuprim.rasterize(**a, backgrounds=backgrounds[0], backend=backend, near=0.05)
+    assert torch.equal(shared.rgb[0], out.rgb[0]) and not torch.equal(shared.rgb[1], out.rgb[1]) and shared.depth is None
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_b2_may_be_flat_and_omega0_scales_the_phase(backend: str) -> None:
+    a = arguments()
+    first = neuprim.rasterize(**a, backend=backend).rgb
+    assert torch.equal(neuprim.rasterize(**{**a, "b2": a["b2"][:, 0]}, backend=backend).rgb, first)
+    rescaled = {**a, "W1": a["W1"] * 2, "b1": a["b1"] * 2}
+    assert torch.equal(neuprim.rasterize(**rescaled, omega0=15.0, backend=backend).rgb, first)
+    assert not torch.allclose(neuprim.rasterize(**a, omega0=15, backend=backend).rgb, first, atol=1e-2)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_colours_of_each_camera(backend: str) -> None:
+    a = arguments()
+    per_camera = torch.stack([a["colors"], 1 - a["colors"], 0.5 * a["colors"]]).requires_grad_()
+    out = neuprim.rasterize(**{**a, "colors": per_camera}, backend=backend)
+    for c in range(3):
+        alone = neuprim.rasterize(**{**a, "colors": per_camera[c].detach()}, backend=backend)
+        assert torch.equal(out.rgb[c], alone.rgb[c])
+    out.rgb[1].sum().backward()
+    assert per_camera.grad is not None and per_camera.grad[1].abs().max() > 0
+    assert per_camera.grad[0].abs().max() == per_camera.grad[2].abs().max() == 0
+
+
+def grads(backend: str, names: list[str], dtype: torch.dtype) -> dict[str, Tensor]:
+    a = arguments()
+    a["backgrounds"] = torch.tensor([[0.2, 0.4, 0.9]]).expand(3, 3)
+    for k in (*scenes.tensors(1), "backgrounds"):
+        a[k] = a[k].to(dtype)
+    for k in names:
+        a[k] = a[k].clone().requires_grad_()
+    out = neuprim.rasterize(**a, backend=backend, alpha_min=0.0, transmittance_min=0.0)
+    g = torch.Generator().manual_seed(1)
+    (out.rgb * torch.randn(out.rgb.shape, generator=g).to(dtype)).sum().backward()
+    return {k: a[k].grad for k in names}
+
+
+def test_gradients_to_everything_agree_between_the_backends() -> None:
+    names = [*scenes.tensors(1), "viewmats", "backgrounds"]
+    fast, slow = grads("cpu", names, torch.float32), grads("reference", names, torch.float64)
+    for name in names:
+        assert slow[name].abs().max() > 0, name
+        assert fast[name].shape == slow[name].shape
+        assert (fast[name].double() - slow[name]).norm() <= 1e-3 * slow[name].norm(), name
+    assert all(slow["viewmats"][c].abs().max() > 0 for c in range(3))
+
+
+def test_poses_intrinsics_and_backgrounds_against_finite_differences() -> None:
+    cameras = [scenes.camera(7, 5, fov=50, shift=(0.4, -0.2)), scenes.camera(7, 5, distance=0.4, fov=80)]
+    a = {**arguments(5, 11, cameras, neurons=2, radius=0.4, dtype=torch.float64), "width": 7, "height": 5}
+    w = torch.randn(2, 5, 7, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def functional(viewmats: Tensor, numbers: Tensor, backgrounds: Tensor) -> Tensor:
+        fx, fy, cx, cy = numbers.unbind(1)
+        o, i = torch.zeros_like(fx), torch.ones_like(fx)
+        Ks = torch.stack([fx, o, cx, o, fy, cy, o, o, i], -1).reshape(2, 3, 3)
+        knobs = {"alpha_min": 1e-9, "depth_floor": 1e-14, "near": 0.05, "depth": True, "backend": "reference"}
+        out = neuprim.rasterize(**{**a, "viewmats": viewmats, "Ks": Ks}, backgrounds=backgrounds, **knobs)
+        assert out.depth is not None
+        return (torch.cat([out.rgb, out.alpha[..., None], out.depth[..., None]], -1) * w).sum()
+
+    numbers = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=torch.float64)
+    # the last row of a pose is fixed, so differences are taken in its other twelve entries
+    free = a["viewmats"][:, :3].clone()
+    bottom = a["viewmats"][:, 3:]
+    backgrounds = torch.tensor([[0.3, 0.5, 0.1], [0.9, 0.2, 0.4]], dtype=torch.float64)
+    inputs = [x.requires_grad_() for x in (free, numbers, backgrounds)]
+    assert torch.autograd.gradcheck(lambda v, k, b: functional(torch.cat([v, bottom], 1), k, b), inputs, eps=1e-7, atol=5e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "auto"])
+def test_intrinsics_have_no_silent_zero_gradient(backend: str) -> None:
+    a = arguments()
+    a["Ks"].requires_grad_()
+    with pytest.raises(BackendUnavailable, match=r'Ks requires a gradient.*pass backend="reference" or Ks\.detach\(\)'):
+        neuprim.rasterize(**a, backend=backend)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_no_cameras_and_no_primitives(backend: str) -> None:
+    a = arguments(cameras=[])
+    a["means"].requires_grad_()
+    none = neuprim.rasterize(**a, backend=backend, depth=True)
+    assert none.rgb.shape == (0, HEIGHT, WIDTH, 3) and none.alpha.shape == (0, HEIGHT, WIDTH) and none.stats == ()
+    assert none.depth is not None and none.depth.shape == (0, HEIGHT, WIDTH)
+    none.rgb.sum().backward()
+    assert a["means"].grad is not None and a["means"].grad.abs().max() == 0
+    empty = neuprim.rasterize(**arguments(0), backend=backend, backgrounds=torch.tensor([0.5, 0.25, 1.0]))
+    assert torch.equal(empty.rgb, torch.tensor([0.5, 0.25, 1.0]).expand(3, HEIGHT, WIDTH, 3)) and empty.alpha.abs().max() == 0
+
+
+def test_population_statistics_come_back_per_camera() -> None:
+    a = arguments()
+    a["means"].requires_grad_()
+    out = neuprim.rasterize(**a)
+    for stats in out.stats:
+        stats.pixel_error = torch.ones(HEIGHT, WIDTH)
+    out.rgb.sum().backward()
+    for c, stats in enumerate(out.stats):
+        assert stats.weight is not None and stats.error_weight is not None
+        assert stats.weight.sum().item() == pytest.approx(out.alpha[c].sum().item(), rel=1e-4)
+        assert torch.allclose(stats.weight, stats.error_weight)
+
+
+# ---------------------------------------------------------------- bad input
+
+
+def changed(name: str, index: tuple[Any, ...], value: float) -> Any:
+    def change(a: dict[str, Any]) -> None:
+        a[name] = a[name].clone()
+        a[name][index] = value
+
+    return change
+
+
+def put(name: str, value: Any) -> Any:
+    return lambda a: a.update({name: value(a[name]) if callable(value) else value})  # a new name is a setting
+
+
+NAN = float("nan")
+BAD: dict[str, tuple[Any, type[NeuprimError], str]] = {
+    "means flat": (put("means", lambda v: v.flatten()), DataError, r"means has shape \(90,\); expected \(N, 3\)"),
+    "log_scales": (put("log_scales", lambda v: v[:, :1]), DataError, r"log_scales has shape \(30, 1\); expected \(30, 3\)"),
+    "quats": (put("quats", lambda v: v[:, :3]), DataError, r"quats has shape \(30, 3\); expected \(30, 4\)"),
+    "W1": (put("W1", lambda v: v.transpose(1, 2)), DataError, r"W1 has shape \(30, 3, 8\); expected \(N, K, 3\) with N=30"),
+    "b1": (put("b1", lambda v: v[:, :4]), DataError, r"b1 has shape \(30, 4\); expected \(30, 8\).*K=8"),
+    "w2": (put("w2", lambda v: v[:7]), DataError, r"w2 has shape \(7, 8\); expected \(30, 8\)"),
+    "b2": (put("b2", lambda v: v.expand(30, 2)), DataError, r"b2 has shape \(30, 2\); expected \(30, 1\) or \(30,\)"),
+    "colors rows": (put("colors", lambda v: v[:29]), DataError, r"colors has shape \(29, 3\); expected \(N, channels\)"),
+    "colors empty": (put("colors", lambda v: v[:, :0]), DataError, r"colors has shape \(30, 0\).*channels >= 1"),
+    "colors views": (put("colors", lambda v: v.expand(2, 30, 3)), DataError, r"colors has shape \(2, 30, 3\); expected \(3, 30, channels\)"),
+    "type": (put("means", lambda v: v.numpy()), DataError, r"means has type ndarray; expected a torch tensor"),
+    "half": (put("quats", lambda v: v.half()), DataError, r"quats has dtype torch\.float16; expected torch\.float32 or torch\.float64"),
+    "mixed": (put("w2", lambda v: v.double()), DataError, r"w2 has dtype torch\.float64; expected torch\.float32, as means has"),
+    "device": (put("colors", lambda v: v.to("meta")), DataError, r"colors has device meta; expected cpu"),
+    "nan": (changed("b1", (13, 2), NAN), NonFiniteError, r"b1 of primitive 13 is not finite"),
+    "inf": (changed("means", (4, 0), -float("inf")), NonFiniteError, r"means of primitive 4 is not finite"),
+    "zero quat": (changed("quats", (9,), 0.0), NonFiniteError, r"quats of primitive 9 is zero"),
+    "viewmats shape": (put("viewmats", lambda v: v[0]), DataError, r"viewmats has shape \(4, 4\); expected \(C, 4, 4\)"),
+    "viewmats nan": (changed("viewmats", (1, 0, 3), NAN), DataError, r"viewmats\[1\].*non-finite"),
+    "viewmats scaled": (put("viewmats", lambda v: v * 2), DataError, r"viewmats\[0\].*expected a rotation"),
+    "viewmats transposed": (put("viewmats", lambda v: v.transpose(1, 2)), DataError, r"viewmats\[0\] has last row .*expected \[0, 0, 0, 1\]"),
+    "viewmats dtype": (put("viewmats", lambda v: v.long()), DataError, r"viewmats has dtype torch\.int64"),
+    "Ks count": (put("Ks", lambda v: v[:2]), DataError, r"Ks has shape \(2, 3, 3\); expected \(3, 3, 3\)"),
+    "Ks 4x4": (put("Ks", lambda v: torch.eye(4).expand(3, 4, 4)), DataError, r"Ks has shape \(3, 4, 4\)"),
+    "Ks nan": (changed("Ks", (2, 0, 0), NAN), DataError, r"Ks\[2\] has entries .*expected finite"),
+    "Ks skew": (changed("Ks", (1, 0, 1), 0.5), DataError, r"Ks\[1\] has skew K\[0,1\]=0\.5.*not supported"),
+    "Ks last row": (changed("Ks", (0, 2, 2), 2.0), DataError, r"Ks\[0\] has last row \[0\.0, 0\.0, 2\.0\]; expected \[0, 0, 1\]"),
+    "Ks focal": (changed("Ks", (0, 1, 1), -5.0), DataError, r"Ks\[0\] has focal lengths .*fy=-5\.0; expected positive"),
+    "width": (put("width", 0), DataError, r"width has value 0; expected a positive int"),
+    "height": (put("height", 30.0), DataError, r"height has value 30\.0; expected a positive int"),
+    "omega0": (put("omega0", float("inf")), DataError, r"omega0 has value inf; expected a finite number"),
+    "backgrounds": (put("backgrounds", torch.ones(2, 3)), DataError, r"backgrounds has shape \(2, 3\); expected \(3,\) or \(3, 3\)"),
+    "backgrounds nan": (put("backgrounds", torch.full((3,), NAN)), NonFiniteError, r"backgrounds is not finite"),
+    "setting": (put("alpha_mim", 0.1), ConfigError, r"unknown setting 'alpha_mim'; did you mean 'alpha_min'"),
+    "setting value": (put("near", -1.0), ConfigError, r"near=-1\.0: expected a positive distance"),
+    "setting type": (put("near", "close"), ConfigError, r"settings \{'near': 'close'\}"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_is_named(name: str) -> None:
+    change, error, message = BAD[name]
+    a = {**arguments(), "omega0": 30.0, "backgrounds": None}
+    change(a)
+    with pytest.raises(error, match=f"^r(asterize: .*|enderer.){message}"):
+        neuprim.rasterize(**a)
+
+
+@pytest.mark.parametrize("name", ["means", "log_scales", "W1", "w2", "b2", "colors"])
+def test_non_finite_primitives_are_named_by_both_backends(name: str) -> None:
+    for backend in BACKENDS:
+        a = arguments()
+        a[name][13].view(-1)[-1] = NAN
+        with pytest.raises(NonFiniteError, match=rf"{name} of primitive 13 is not finite"):
+            neuprim.rasterize(**a, backend=backend)
+    a = arguments()
+    a["colors"] = a["colors"].repeat(3, 1, 1)
+    a["colors"][2, 5, 0] = NAN
+    with pytest.raises(NonFiniteError, match="colors of primitive 5"):
+        neuprim.rasterize(**a)
+
+
+# ---------------------------------------------------------------- the package, the example
+
+
+def test_importing_the_package_stays_light_and_the_name_stays_a_function() -> None:
+    code = "import sys, neuprim; assert 'torch' not in sys.modules; assert 'rasterize' in dir(neuprim); neuprim.rasterize.__call__; neuprim.nothing"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    assert done.returncode == 1 and "AttributeError: module 'neuprim' has no attribute 'nothing'" in done.stderr
+    assert callable(neuprim.rasterize)
+    module = sys.modules["neuprim.rasterize"]
+    assert callable(module) and list(inspect.signature(module.rasterize).parameters)[:2] == ["means", "log_scales"]  # type: ignore[attr-defined]
+    assert module(**arguments()).rgb.shape == (3, HEIGHT, WIDTH, 3)  # type: ignore[operator]
+
+
+def test_the_example_learns(capsys: pytest.CaptureFixture[str]) -> None:
+    path = Path(__file__).parents[1] / "examples" / "train_your_own.py"
+    spec = importlib.util.spec_from_file_location("train_your_own", path)
+    assert spec is not None and spec.loader is not None
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    losses = example.train(60)
+    assert losses[-1] < 0.5 * losses[0], losses[:: len(losses) - 1]
+    assert capsys.readouterr().out.startswith("step    0  loss")

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neuprim.rasterize import rasterize as rasterize
+    from neuprim.functional import rasterize as rasterize
 
 __version__ = "0.1.0"
 __all__ = ["__version__", "rasterize"]
@@ -12,7 +12,7 @@ __all__ = ["__version__", "rasterize"]
 def __getattr__(name: str) -> Any:
     """The functional front door, loaded when first used: ``import neuprim`` alone must not load torch."""
     if name == "rasterize":
-        from neuprim.rasterize import rasterize
+        from neuprim.functional import rasterize
 
         globals()[name] = rasterize
         return rasterize

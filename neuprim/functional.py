@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -259,13 +257,3 @@ def _check_backgrounds(backgrounds: Tensor | None, views: int, channels: int) ->
     if not bool(torch.isfinite(backgrounds.detach()).all()):
         raise NonFiniteError(f"rasterize: backgrounds is not finite: {backgrounds.detach().flatten()[:8].tolist()}")
     return backgrounds.expand(views, channels).unbind()
-
-
-class _CallableModule(ModuleType):
-    """Importing this module binds it to ``neuprim.rasterize``, over the function of that name: so the module is callable."""
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Rasterized:
-        return rasterize(*args, **kwargs)
-
-
-sys.modules[__name__].__class__ = _CallableModule

@@ -12,6 +12,7 @@ from neuprim.core.errors import BackendUnavailable
 from neuprim.core.fields import Constant, Cosine
 from neuprim.core.primitives import Lowered, Primitives
 from neuprim.core.render.output import RenderOutput, RenderStats
+from neuprim.core.render.samples import render_samples
 from neuprim.core.render.settings import RenderSettings
 
 __all__ = ["BACKENDS", "RenderOutput", "RenderSettings", "RenderStats", "choose_backend", "probe", "render", "render_lowered"]
@@ -63,6 +64,8 @@ def render_lowered(lowered: Lowered, camera: Camera, settings: RenderSettings, b
         from neuprim.core.render.cpu.backend import render as draw
     else:
         from neuprim.core.render.reference import render as draw
+    if settings.samples > 1:
+        return render_samples(draw, lowered, camera, background, settings)
     return draw(lowered, camera, background, settings)
 
 

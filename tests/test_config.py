@@ -91,6 +91,8 @@ def test_interpolation_follows_the_override(toy: Path) -> None:
         (["renderer.backend=cpuu"], "renderer.backend=cpuu: expected auto, reference or cpu"),
         (["renderer.depth=1"], "renderer.depth=1: expected true or false"),
         (["renderer.alpha_max=2"], "renderer.alpha_max=2.0: expected"),
+        (["renderer.sort=depth"], "renderer.sort=depth: expected center or entry"),
+        (["renderer.samples=0"], "renderer.samples=0: expected a whole number of rays per pixel side, 1 to 16"),
         (["scene.size=big"], "scene.size=big: expected a whole number"),
         (["scene.size=true"], "scene.size=true: expected a whole number"),
         (["scene.smooth=3"], "scene.smooth=3: expected true or false"),

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
+from neuprim.core.render.reference import pixel_directions
 from tests import scenes
 
 
@@ -28,7 +29,8 @@ def weights(shape: tuple[int, ...], seed: int) -> Tensor:
 def undecided(t: dict[str, Tensor], camera: Camera, settings: RenderSettings) -> Tensor:
     """(H, W) pixels on which float32 and float64 may rightly fall on different sides of a cut.
 
-    Those whose reference image jumps when alpha_min or transmittance_min moves by 1e-5 (of itself, for the latter 1e-3).
+    Those whose reference image jumps when alpha_min or transmittance_min moves by 1e-5 (of itself, for the latter 1e-3). Where the
+    order is that of entries, also those with :func:`near_ties`.
     """
     wide = scenes.lowered({k: v.detach().double() for k, v in t.items()})
     images = []
@@ -43,7 +45,35 @@ def undecided(t: dict[str, Tensor], camera: Camera, settings: RenderSettings) ->
                 transmittance_min=stop * (1 + sign * 1e-3),
             )
             images.append(render_lowered(wide, camera, moved).alpha)
-    return images[0] != images[1]
+    jumps = images[0] != images[1]
+    return jumps | near_ties(t, camera, settings.near) if settings.sort == "entry" else jumps
+
+
+def entries(t: dict[str, Tensor], camera: Camera, near: float) -> Tensor:
+    """(N, H, W) camera-z at which each pixel's ray enters each ellipsoid, float64: ``near`` where that plane cuts it, inf if missed."""
+    g = scenes.lowered({k: v.detach().double() for k, v in t.items()}).geometry
+    d = pixel_directions(camera)
+    world = d @ camera.viewmat.detach().double()[:3, :3]
+    to_sphere = g.rotations / g.scales[:, None, :]
+    p = ((camera.position.detach().double() - g.means)[:, None] @ to_sphere)[:, 0]
+    result = []
+    for row in range(g.count):
+        v = world @ to_sphere[row]
+        a, b, c = (v * v).sum(-1), v @ p[row], p[row] @ p[row] - 1
+        root = (b * b - a * c).clamp_min(0).sqrt()
+        missed = (b * b - a * c <= 0) | ((root - b) / a * d[..., 2] <= near)
+        result.append(((-b - root) / a * d[..., 2]).clamp_min(near).masked_fill(missed, torch.inf))
+    return torch.stack(result)
+
+
+def near_ties(t: dict[str, Tensor], camera: Camera, near: float, gap: float = 2e-6) -> Tensor:
+    """(H, W) pixels with two entries closer than ``gap`` of their camera-z: float32 may order them the other way.
+
+    That changes a pixel by the opacities' product times the colours' difference. Entries on the near plane are ties, not near ties.
+    """
+    z = entries(t, camera, near).sort(0).values
+    front, back = z[:-1], z[1:]
+    return ((back - front < gap * front) & (back > near) & (back < torch.inf)).any(0)
 
 
 def draw(

@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.errors import BackendUnavailable
+from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.fields import Constant, Cosine
 from neuprim.core.primitives import Lowered, Primitives
 from neuprim.core.ray_cameras import AnyCamera, RayCamera
 from neuprim.core.render.output import RenderOutput, RenderStats
+from neuprim.core.render.samples import render_samples
 from neuprim.core.render.settings import RenderSettings
 
 __all__ = ["BACKENDS", "RenderOutput", "RenderSettings", "RenderStats", "choose_backend", "probe", "render", "render_lowered"]
@@ -66,13 +67,19 @@ def render(
 
 def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None) -> RenderOutput:
     """Draw a model whose conditions are already folded in."""
-    if choose_backend(lowered, settings, camera) == "cpu":
-        from neuprim.core.render.cpu.backend import render as draw_pinhole
+    backend = choose_backend(lowered, settings, camera)
+    if isinstance(camera, RayCamera):
+        from neuprim.core.render.reference import render as draw_rays
 
-        assert isinstance(camera, Camera), "choose_backend keeps other cameras away"
-        return draw_pinhole(lowered, camera, background, settings)
-    from neuprim.core.render.reference import render as draw
-
+        if settings.samples > 1:
+            raise ConfigError(f"renderer.samples={settings.samples}: only pinhole cameras are sampled; give a RayCamera more directions")
+        return draw_rays(lowered, camera, background, settings)
+    if backend == "cpu":
+        from neuprim.core.render.cpu.backend import render as draw
+    else:
+        from neuprim.core.render.reference import render as draw
+    if settings.samples > 1:
+        return render_samples(draw, lowered, camera, background, settings)
     return draw(lowered, camera, background, settings)
 
 

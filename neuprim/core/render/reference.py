@@ -176,8 +176,14 @@ def _trace(
     counts = (optical_depth.detach() > 0) & (alpha.detach() >= settings.alpha_min)
     alpha = torch.where(counts, alpha, torch.zeros_like(alpha))
 
-    # Front to back: composite, then stop once T < T_min. Rows are already sorted by depth.
+    # Front to back: composite, then stop once T < T_min. Rows are already sorted by depth of the centre.
     dense = torch.zeros(len(rows), P, dtype=torch.float64).index_put((i, j), alpha)
+    if settings.sort == "entry":  # every ray by the depth of its entries; those that the near plane cuts are equal, and first
+        with torch.no_grad():
+            entry = torch.where(tm - h > t_near, (tm - h) * m * rays.depth[j], torch.zeros_like(h))
+            keys = torch.full_like(dense, torch.inf).index_put((i, j), entry)
+            by_entry = keys.argsort(dim=0, stable=True)
+        dense = dense.gather(0, by_entry)
     ones = torch.ones(1, P, dtype=torch.float64)
     with torch.no_grad():
         before = torch.cat([ones, (1 - dense).cumprod(0)])[:-1]
@@ -185,6 +191,8 @@ def _trace(
     dense = torch.where(live, dense, torch.zeros_like(dense))
     T = torch.cat([ones, (1 - dense).cumprod(0)])
     weights = dense * T[:-1]
+    if settings.sort == "entry":
+        weights = weights.gather(0, by_entry.argsort(0))
     if weights.requires_grad:
         weights = _Tally.apply(weights, rows, pixels, stats)
 

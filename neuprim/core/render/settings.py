@@ -7,9 +7,10 @@ from typing import Literal
 
 from neuprim.core.errors import ConfigError
 
-__all__ = ["BackendName", "RenderSettings"]
+__all__ = ["BackendName", "RenderSettings", "SortOrder"]
 
 BackendName = Literal["auto", "reference", "cpu"]
+SortOrder = Literal["center", "entry"]
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,10 @@ class RenderSettings:
 
     Attributes:
         backend: "reference" (float64 torch, the oracle), "cpu" (numba) or "auto" (the fastest that can run the model).
+        sort: what is composited front to back. "center": whole primitives by camera-z of their centres, one order for all pixels.
+            "entry": the chords of each pixel by camera-z of where the ray enters them, those cut by the near plane first, and by
+            their centres where entries are equal; no popping when centres swap, but slower (``benchmarks/sorting.py``).
+        samples: rays per pixel side, on a regular grid inside the pixel, averaged: 1 draws through pixel centres, n costs n^2.
         alpha_max: opacity clamp of one primitive; at most 0.9999, because the backward pass divides by 1 - alpha.
         alpha_min: a ray-primitive pair fainter than this is skipped.
         transmittance_min: a ray stops after the primitive that takes its transmittance below this.
@@ -29,6 +34,8 @@ class RenderSettings:
     """
 
     backend: BackendName = "auto"
+    sort: SortOrder = "center"
+    samples: int = 1
     alpha_max: float = 0.99
     alpha_min: float = 1.0 / 255.0
     transmittance_min: float = 1e-4
@@ -45,6 +52,8 @@ class RenderSettings:
             ("near", self.near > 0.0, "a positive distance"),
             ("depth_floor", 0.0 < self.depth_floor < 1.0, "a number in (0, 1)"),
             ("threads", self.threads >= 0, "0 (all cores) or a positive count"),
+            ("sort", self.sort in ("center", "entry"), "center or entry"),
+            ("samples", 1 <= self.samples <= 16, "a whole number of rays per pixel side, 1 to 16"),
             ("backend", self.backend in ("auto", "reference", "cpu"), "auto, reference or cpu"),
         )
         for name, ok, expected in checks:

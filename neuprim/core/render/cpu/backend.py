@@ -16,6 +16,7 @@ from neuprim.core.fields import Constant, Cosine
 from neuprim.core.primitives import Lowered
 from neuprim.core.render.cpu.backward import backward_tiles, sum_rows
 from neuprim.core.render.cpu.binning import TileLists, bin_primitives
+from neuprim.core.render.cpu.entry import backward_tiles_by_entry, composite_tiles_by_entry
 from neuprim.core.render.cpu.forward import composite_tiles
 from neuprim.core.render.cpu.layout import G_ERROR, G_NEURONS, G_WEIGHT, PER_NEURON, SPAN_WIDTH, TILE, gradient_width, row_width
 from neuprim.core.render.cpu.prepare import NON_FINITE, VISIBLE, prepare, prepare_backward, prepare_wide
@@ -161,8 +162,9 @@ class _Rasterize(torch.autograd.Function):
         rgb, T = np.empty((h, w, C), np.float32), np.empty((h, w), np.float32)
         z, last = np.zeros((h, w) if settings.depth else (1, 1), np.float32), np.empty((h, w), np.int32)
         palette = np.ascontiguousarray(tensors["colors"], np.float32)
+        tiles = composite_tiles_by_entry if settings.sort == "entry" else composite_tiles
         lanes = parallel_for(
-            composite_tiles, frame.tiles, frame.chunk, settings.threads, frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
+            tiles, frame.tiles, frame.chunk, settings.threads, frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
             frame.lists.starts, frame.lists.ids, palette, frame.norms, frame.background, frame.limits, settings.depth, frame.neurons,
             rgb, T, z, last,
         )  # fmt: skip
@@ -185,8 +187,9 @@ class _Rasterize(torch.autograd.Function):
         error = np.zeros((h, w), np.float32) if wanted is None else np.ascontiguousarray(wanted.detach().numpy(), np.float32)
         width = gradient_width(frame.neurons, C)
         pair_rows = np.empty((frame.lists.pairs, width), np.float32)
+        tiles = backward_tiles_by_entry if s.sort == "entry" else backward_tiles
         lanes = parallel_for(
-            backward_tiles, frame.tiles, frame.chunk, s.threads, frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
+            tiles, frame.tiles, frame.chunk, s.threads, frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
             frame.lists.starts, frame.lists.ids, ctx.palette, frame.norms, frame.limits, s.depth, frame.neurons,
             ctx.T, ctx.last, grad_rgb, gT, gz, error, pair_rows,
         )  # fmt: skip

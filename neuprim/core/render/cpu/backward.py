@@ -85,7 +85,17 @@ from neuprim.core.render.cpu.layout import (
 from neuprim.core.render.cpu.tiles import chords, compact, row_spans
 from neuprim.core.render.cpu.turns import TAU, cos_turns, one_minus_exp, sinc_turns, slopes_fast, slopes_medium, slopes_slow
 
-__all__ = ["backward_tiles", "sum_rows"]
+__all__ = [
+    "backward_tiles",
+    "chord_gradient",
+    "field_gradient",
+    "neurons_fast",
+    "neurons_medium",
+    "neurons_slow",
+    "opacity",
+    "sum_rows",
+    "two_neurons",
+]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
@@ -124,11 +134,11 @@ def _neurons(slopes):  # type: ignore[no-untyped-def]
     return add
 
 
-_neurons_slow, _neurons_medium, _neurons_fast = _neurons(slopes_slow), _neurons(slopes_medium), _neurons(slopes_fast)
+neurons_slow, neurons_medium, neurons_fast = _neurons(slopes_slow), _neurons(slopes_medium), _neurons(slopes_fast)
 
 
 @inline
-def _opacity(S, n, amin, amax):  # type: ignore[no-untyped-def]
+def opacity(S, n, amin, amax):  # type: ignore[no-untyped-def]
     """ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF) of every lane, with exactly the forward pass's clamp and cut."""
     for k in range(n):
         norm = S[NORM_L + k]
@@ -215,7 +225,7 @@ def _total(sums, first):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _field_gradient(S, n, out):  # type: ignore[no-untyped-def]
+def field_gradient(S, n, out):  # type: ignore[no-untyped-def]
     """From dL/d(2 FIELD HALF) to dL/d FIELD, and the sums for b2 and log m."""
     offset, log_m = f(0), f(0)
     for k in range(n):
@@ -230,7 +240,7 @@ def _field_gradient(S, n, out):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _two_neurons(S, V0, V1, n, p, m, out):  # type: ignore[no-untyped-def]
+def two_neurons(S, V0, V1, n, p, m, out):  # type: ignore[no-untyped-def]
     """Gradients of neurons m and m + 1, and their share of dL/dQ and dL/d(half e); two at a time to share the loads."""
     o = NEURONS + PER_NEURON * m
     ax, ay, az, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + AMPLITUDE]
@@ -268,7 +278,7 @@ def _two_neurons(S, V0, V1, n, p, m, out):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _chord_gradient(S, n, p, out):  # type: ignore[no-untyped-def]
+def chord_gradient(S, n, p, out):  # type: ignore[no-untyped-def]
     """From chord middle, half chord and direction back to the affine ray (E0, EX, EY, XA)."""
     tc = p[TC]
     a0, a1, a2, a3, a4, a5 = f(0), f(0), f(0), f(0), f(0), f(0)
@@ -383,12 +393,12 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                 for m in range(0, neurons, 2):
                     o = NEURONS + PER_NEURON * m
                     if kinds[i, m // 2] == MEDIUM:
-                        _neurons_medium(S, V[m], V[m + 1], n16, p, o)
+                        neurons_medium(S, V[m], V[m + 1], n16, p, o)
                     elif kinds[i, m // 2] == SLOW:
-                        _neurons_slow(S, V[m], V[m + 1], n16, p, o)
+                        neurons_slow(S, V[m], V[m + 1], n16, p, o)
                     else:
-                        _neurons_fast(S, V[m], V[m + 1], n16, p, o)
-            _opacity(S, n16, amin, amax)
+                        neurons_fast(S, V[m], V[m + 1], n16, p, o)
+            opacity(S, n16, amin, amax)
             for k in range(n, n16):
                 S[GRAD + k] = f(0)
             for k in range(n16):
@@ -426,10 +436,10 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             out[G_WEIGHT], out[G_ERROR] = weight, _total(sums, TILE)
             for c in range(C):
                 out[color_at + c] = _total(sums, (2 + c) * TILE)
-            _field_gradient(S, n16, out)
+            field_gradient(S, n16, out)
             for m in range(0, neurons, 2):
-                _two_neurons(S, V[m], V[m + 1], n16, p, m, out)
-            _chord_gradient(S, n16, p, out)
+                two_neurons(S, V[m], V[m + 1], n16, p, m, out)
+            chord_gradient(S, n16, p, out)
     return evaluated
 
 

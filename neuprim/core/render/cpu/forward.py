@@ -43,7 +43,7 @@ from neuprim.core.render.cpu.layout import (
 from neuprim.core.render.cpu.tiles import chords, compact, row_spans
 from neuprim.core.render.cpu.turns import cos_turns, one_minus_exp, sincs_fast, sincs_medium, sincs_slow
 
-__all__ = ["composite_tiles"]
+__all__ = ["composite_tiles", "neurons_fast", "neurons_medium", "neurons_slow"]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
@@ -75,7 +75,7 @@ def _neurons(sincs):  # type: ignore[no-untyped-def]
     return add
 
 
-_neurons_slow, _neurons_medium, _neurons_fast = _neurons(sincs_slow), _neurons(sincs_medium), _neurons(sincs_fast)
+neurons_slow, neurons_medium, neurons_fast = _neurons(sincs_slow), _neurons(sincs_medium), _neurons(sincs_fast)
 
 
 @inline
@@ -169,11 +169,11 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                     for m in range(0, neurons, 2):
                         o = NEURONS + PER_NEURON * m
                         if kinds[i, m // 2] == MEDIUM:
-                            _neurons_medium(S, n16, p, o)
+                            neurons_medium(S, n16, p, o)
                         elif kinds[i, m // 2] == SLOW:
-                            _neurons_slow(S, n16, p, o)
+                            neurons_slow(S, n16, p, o)
                         else:
-                            _neurons_fast(S, n16, p, o)
+                            neurons_fast(S, n16, p, o)
                 _opacity(S, n16, amin, amax)
                 rank = f(q - starts[t] + 1)
                 for y in range(y0, y1):

@@ -1,0 +1,223 @@
+"""``sort = "entry"``: every pixel composites its chords in the order in which its ray enters them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera, look_at
+from neuprim.core.errors import ConfigError
+from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
+from tests import scenes
+from tests.numerics.compare import assert_same_frame, draw, entries
+from tests.numerics.test_backends import CASES, case
+
+ENTRY = RenderSettings(sort="entry", depth=True)
+BACKENDS = ("reference", "cpu")
+
+
+def render(t: dict[str, Tensor], camera: Camera, settings: RenderSettings, backend: str, **knobs: Any) -> RenderOutput:
+    dtype = torch.float64 if backend == "reference" else torch.float32
+    model = scenes.lowered({k: v.to(dtype) for k, v in t.items()})
+    return render_lowered(model, camera, replace(settings, backend=backend, **knobs))  # type: ignore[arg-type]
+
+
+def spheres(means: list[list[float]], radii: list[float], density: list[float]) -> dict[str, Tensor]:
+    """Homogeneous spheres of the colours red, green, blue; ``density`` times the diameter is a central chord's optical depth."""
+    count = len(radii)
+    t = scenes.tensors(count, 0, dtype=torch.float64)
+    t["means"] = torch.tensor(means, dtype=torch.float64)
+    radius = torch.tensor(radii, dtype=torch.float64)
+    t["log_scales"] = radius.log()[:, None].repeat(1, 3)
+    t["quats"][:] = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    t["b2"] = (torch.tensor(density, dtype=torch.float64) * radius)[:, None]
+    t["colors"] = torch.eye(3, dtype=torch.float64)[:count]
+    return t
+
+
+def along_z(size: int = 21, fov: float = 40.0, turn: float = 0.0, distance: float = 3.0) -> Camera:
+    """A camera ``distance`` from the origin on the negative z axis, turned about the y axis by ``turn`` radians."""
+    eye = distance * torch.tensor([math.sin(turn), 0.0, -math.cos(turn)], dtype=torch.float64)
+    f = 0.5 * size / math.tan(math.radians(fov) / 2)
+    return Camera(look_at(eye, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])), f, f, size / 2, size / 2, size, size)
+
+
+# ---------------------------------------------------------------- cpu against reference
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_cpu_equals_reference(name: str) -> None:
+    t, camera, settings = case(name)
+    fast, slow = assert_same_frame(t, camera, replace(settings, sort="entry"))
+    assert slow.output.alpha.max() > 0.1, "the view must show something"
+    seen, other = slow.output.stats, fast.output.stats
+    assert seen.weight is not None and seen.error_weight is not None and other.weight is not None and other.error_weight is not None
+    # the sums run over all pixels, undecided ones too: a pair on the other side of a cut, or a pair of near ties
+    assert (other.weight - seen.weight).abs().max() <= 2e-5 * seen.weight.max() + 4 / 255
+    assert (other.error_weight - seen.error_weight).abs().max() <= 2e-5 * seen.error_weight.max() + 1e-4
+    assert torch.equal(other.weight > 0.05, seen.weight > 0.05)
+
+
+def test_the_cases_show_another_image_than_the_order_of_centres() -> None:
+    t, camera, settings = case("K=8 C=3")
+    for backend in BACKENDS:
+        images = [render(t, camera, settings, backend, sort=s).rgb for s in ("center", "entry")]
+        assert (images[0] - images[1]).abs().max() > 0.02
+
+
+def test_float64_pixels_are_sorted_too() -> None:
+    """Needles and discs near the camera, which the cpu backend draws in float64."""
+    t = scenes.tensors(40, 4, seed=2, radius=0.3)
+    t["log_scales"][:, 0] -= 4.0
+    camera = scenes.camera(40, 30, distance=0.5, fov=60)
+    assert render(t, camera, ENTRY, "cpu").stats.extra["delicate"] > 3
+    assert_same_frame(t, camera, replace(ENTRY, depth_floor=1e-3))
+
+
+def test_any_number_of_threads_gives_the_same_bits() -> None:
+    t, camera = scenes.tensors(1500, 5, seed=3, radius=0.06), scenes.camera(100, 70)
+    frames = [draw("cpu", t, camera, replace(ENTRY, threads=n)) for n in (1, 2, 3)]
+    for other in frames[1:]:
+        for image in ("rgb", "alpha", "depth"):
+            assert torch.equal(getattr(frames[0].output, image), getattr(other.output, image)), image
+        for name, grad in frames[0].grads.items():
+            assert torch.equal(grad, other.grads[name]), name
+        for sums in ("weight", "error_weight"):
+            assert torch.equal(getattr(frames[0].output.stats, sums), getattr(other.output.stats, sums)), sums
+    assert frames[0].output.alpha.max() > 0.5
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_nothing_to_draw(backend: str) -> None:
+    t = scenes.tensors(20)
+    t["means"] += 50.0
+    for model in (t, {k: v[:0] for k, v in t.items()}):
+        out = render(model, scenes.camera(20, 17), ENTRY, backend)
+        assert out.alpha.abs().max() == 0
+
+
+# ---------------------------------------------------------------- the order
+
+
+def by_hand(t: dict[str, Tensor], camera: Camera, s: RenderSettings) -> tuple[Tensor, Tensor]:
+    """(rgb, alpha) composited pixel by pixel from frames of one primitive each, sorted by :func:`entries`, ties by depth of the centre."""
+    depth = t["means"].double() @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+    by_centre = {k: v[depth.argsort(stable=True)] for k, v in t.items()}
+    alone = torch.stack([render({k: v[n : n + 1] for k, v in by_centre.items()}, camera, s, "reference").alpha for n in range(len(depth))])
+    z = entries(by_centre, camera, s.near)
+    rgb, alpha = torch.zeros(camera.height, camera.width, 3, dtype=torch.float64), torch.zeros(camera.height, camera.width).double()
+    for y in range(camera.height):
+        for x in range(camera.width):
+            T = 1.0
+            for n in z[:, y, x].sort(stable=True).indices.tolist():
+                a = float(alone[n, y, x])
+                rgb[y, x] += T * a * by_centre["colors"][n].double()
+                T *= 1 - a
+                if T < s.transmittance_min:
+                    break
+            alpha[y, x] = 1 - T
+    return rgb, alpha
+
+
+@pytest.mark.parametrize(
+    ("distance", "extra", "knobs"),
+    [
+        (3.0, 0.0, {}),
+        (0.3, 0.0, {"near": 0.05}),
+        (3.0, 0.0, {"near": 3.0}),
+        (3.0, 1.0, {"transmittance_min": 0.3}),
+        (3.0, 0.0, {"alpha_min": 0.2}),
+        (3.0, 1.0, {"alpha_max": 0.3}),
+    ],
+)
+def test_against_the_order_by_hand(distance: float, extra: float, knobs: dict[str, float]) -> None:
+    t = scenes.tensors(25, 3, seed=21, radius=0.35)
+    t["b2"] += extra
+    camera = scenes.camera(14, 10, distance=distance, fov=45 if distance > 1 else 90, shift=(0.8, 0.4))
+    settings = replace(ENTRY, **knobs)  # type: ignore[arg-type]
+    rgb, alpha = by_hand(t, camera, settings)
+    for backend, bound in (("reference", 1e-11), ("cpu", 1e-5)):
+        out = render(t, camera, settings, backend)
+        assert (out.rgb.double() - rgb).abs().max() < bound and (out.alpha.double() - alpha).abs().max() < bound, backend
+
+
+def needle_and_sphere() -> dict[str, Tensor]:
+    """A long red needle that reaches far towards the camera passes in front of a green sphere whose centre is nearer than its own."""
+    t = spheres([[0.0, 0.0, 0.0], [-0.3, 0.0, -0.05]], [1.0, 0.15], [8.0, 40.0])
+    angle = math.radians(20)  # the needle lies in the x-z plane, its near end at x = -sin(angle), z = -cos(angle)
+    t["log_scales"][0] = torch.tensor([0.1, 0.1, 1.0]).log()
+    t["quats"][:] = torch.tensor([math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0])
+    return t
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_entry_is_right_where_the_order_of_centres_is_wrong(backend: str) -> None:
+    t = needle_and_sphere()
+    camera = along_z(41, 30.0)
+    z = entries(t, camera, 0.01)
+    both = (z < torch.inf).all(0)
+    front = both & (z[0] < z[1])  # the needle enters first; the centres say that the sphere comes first
+    assert front.sum() > 10
+    settings = replace(ENTRY, alpha_min=0.0)
+    right, wrong = (render(t, camera, settings, backend, sort=s) for s in ("entry", "center"))
+    alone = [render({k: v[n : n + 1] for k, v in t.items()}, camera, settings, backend).alpha for n in range(2)]
+    expected = torch.stack([alone[0], (1 - alone[0]) * alone[1]], -1)
+    assert (right.rgb[..., :2] - expected)[front].abs().max() < 1e-6
+    assert (wrong.rgb[..., :2] - expected)[front].abs().max() > 0.5
+    assert (right.alpha - wrong.alpha).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_no_popping(backend: str) -> None:
+    """A small sphere beside the middle of a large one: turning the camera by 2e-8 radians swaps their centres' depths."""
+    t = spheres([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]], [0.8, 0.2], [1.0, 4.0])
+    settings = replace(ENTRY, alpha_min=0.0)
+    jump = {}
+    for sort in ("center", "entry"):
+        before, after = (render(t, along_z(turn=turn), settings, backend, sort=sort).rgb for turn in (-1e-8, 1e-8))
+        jump[sort] = (before - after).abs().max().item()
+    assert jump["center"] > 0.1 and jump["entry"] < 1e-5, jump
+    # and over a sweep through the swap no step is larger than the steps beside it suggest
+    frames = [render(t, along_z(turn=0.01 * k + 0.005), settings, backend).rgb for k in range(-3, 3)]
+    steps = [(b - a).abs().mean().item() for a, b in pairwise(frames)]
+    assert max(steps) < 1.5 * min(steps)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_chords_that_the_near_plane_cuts_keep_the_order_of_centres(backend: str) -> None:
+    """The camera is inside three spheres: all entries lie on the near plane."""
+    t = spheres([[0.3, 0.0, 0.4], [-0.2, 0.1, -0.1], [0.0, -0.2, 0.9]], [4.5, 4.0, 5.0], [0.2, 0.3, 0.25])
+    t = {k: v.float() for k, v in t.items()}
+    camera = along_z()
+    assert (entries(t, camera, 0.01) == 0.01).all()
+    for order in ([0, 1, 2], [2, 0, 1]):
+        model = {k: v[order] for k, v in t.items()}
+        first, second = (render(model, camera, ENTRY, backend, sort=s) for s in ("center", "entry"))
+        assert (first.rgb - second.rgb).abs().max() < 1e-6 and first.rgb.amin(0).amin(0).min() > 0.02
+    fourth = {k: torch.cat([v, v[:1]]) for k, v in t.items()}  # a small sphere in front of all their centres, not cut, comes last
+    fourth["means"][3], fourth["log_scales"][3], fourth["colors"][3] = torch.tensor([0.0, 0.0, -2.5]), math.log(0.2), torch.ones(3)
+    fourth["b2"][3] = 50.0
+    out = render(fourth, camera, ENTRY, backend).rgb[10, 10]
+    alone = render(t, camera, ENTRY, backend)
+    assert torch.allclose(out, alone.rgb[10, 10] + (1 - alone.alpha[10, 10]) * 0.99, atol=1e-5)
+
+
+@pytest.mark.parametrize("sort", ["center", "entry"])
+def test_coincident_primitives_keep_their_index_order(sort: str) -> None:
+    t = scenes.tensors(12, 2, seed=4, radius=0.4)
+    t = {k: torch.cat([v, v]) for k, v in t.items()}
+    t["colors"][12:] = 1 - t["colors"][12:]
+    camera, settings = scenes.camera(33, 25), replace(ENTRY, sort=sort)
+    fast, slow = (render(t, camera, settings, backend, alpha_min=0.0).rgb for backend in ("cpu", "reference"))
+    assert (fast - slow).abs().max() < 1e-5
+
+
+def test_settings_that_do_not_exist_are_named() -> None:
+    with pytest.raises(ConfigError, match=r"renderer\.sort='depth': expected center or entry"):
+        RenderSettings(sort="depth")  # type: ignore[arg-type]

@@ -1,0 +1,98 @@
+"""Several rays per pixel: the mean of a finer image, with gradients and training statistics."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib import import_module
+
+import pytest
+import torch
+from torch import Tensor
+
+from neuprim.core.errors import ConfigError
+from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
+from tests import scenes
+
+SETTINGS = RenderSettings(depth=True)
+SKY = torch.tensor([0.3, 0.6, 0.1])
+CAMERA = scenes.camera(20, 15, shift=(2.3, -1.1))
+
+
+def frame(t: dict[str, Tensor], settings: RenderSettings, scale: int = 1) -> RenderOutput:
+    return render_lowered(scenes.lowered(t), CAMERA.resized(20 * scale, 15 * scale), settings, SKY)
+
+
+def leaves() -> dict[str, Tensor]:
+    return {k: v.requires_grad_() for k, v in scenes.tensors(40, 4, seed=6).items()}
+
+
+def blocks(image: Tensor, n: int) -> Tensor:
+    """(15, 20, n * n) sub-pixels of every pixel."""
+    return torch.stack([image[a::n, b::n] for a in range(n) for b in range(n)], -1)
+
+
+@pytest.mark.parametrize("sort", ["center", "entry"])
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("n", [2, 3])
+def test_means_of_a_finer_image(backend: str, sort: str, n: int) -> None:
+    settings = replace(SETTINGS, backend=backend, sort=sort)  # type: ignore[arg-type]
+    first, second = leaves(), leaves()
+    out, fine = frame(first, replace(settings, samples=n)), frame(second, settings, n)
+    assert out.rgb.shape == (15, 20, 3) and out.alpha.shape == (15, 20) and out.depth is not None and fine.depth is not None
+    rgb, alpha = torch.stack([blocks(fine.rgb[..., c], n).mean(-1) for c in range(3)], -1), blocks(fine.alpha, n)
+    depth = (blocks(fine.depth, n) * alpha).sum(-1) / alpha.sum(-1).clamp_min(1e-30)
+    assert (out.rgb - rgb).abs().max() < 1e-6 and (out.alpha - alpha.mean(-1)).abs().max() < 1e-6
+    assert (out.depth - depth).abs().max() < 2e-6
+    plain = frame(leaves(), settings)
+    assert (plain.rgb - out.rgb).abs().max() > 0.02, "edges must be smoother than with one ray"
+    weight = torch.randn(15, 20, 3, generator=torch.Generator().manual_seed(0))
+    error = torch.rand(15, 20, generator=torch.Generator().manual_seed(1))
+    out.stats.pixel_error = error
+    fine.stats.pixel_error = error.repeat_interleave(n, 0).repeat_interleave(n, 1)
+    assert torch.equal(out.stats.pixel_error, error)
+    (out.rgb * weight).sum().backward()
+    (rgb * weight).sum().backward()
+    for k in first:
+        assert torch.allclose(first[k].grad, second[k].grad, rtol=1e-4, atol=1e-6), k  # type: ignore[arg-type]
+    a, b = out.stats, fine.stats
+    assert a.weight is not None and b.weight is not None and a.error_weight is not None and b.error_weight is not None
+    assert torch.allclose(a.weight, b.weight / n**2) and torch.allclose(a.error_weight, b.error_weight / n**2)
+    assert a.backend == backend and a.pairs == b.pairs
+
+
+def test_statistics_compare_with_one_ray_per_pixel() -> None:
+    sums = []
+    for n in (1, 3):
+        out = frame(leaves(), replace(SETTINGS, samples=n))
+        out.stats.pixel_error = torch.full((15, 20), 0.5)
+        out.rgb.sum().backward()
+        assert out.stats.weight is not None and out.stats.error_weight is not None
+        assert torch.allclose(out.stats.error_weight, 0.5 * out.stats.weight, rtol=1e-5)
+        sums.append(out.stats.weight)
+    assert sums[0].sum() == pytest.approx(sums[1].sum().item(), rel=0.03)
+    assert (sums[0] - sums[1]).abs().max() < 0.1 * sums[0].max()
+
+
+def test_statistics_may_be_written() -> None:
+    """As any frame's: what is set is what is read."""
+    stats = frame(leaves(), replace(SETTINGS, samples=2)).stats
+    stats.weight, stats.error_weight = torch.full((40,), 3.0), torch.full((40,), 2.0)
+    assert torch.equal(stats.weight, torch.full((40,), 3.0)) and torch.equal(stats.error_weight, torch.full((40,), 2.0))
+    stats.pixel_error = None
+    assert stats.pixel_error is None
+
+
+@pytest.mark.parametrize("value", [0, -1, 17])
+def test_counts_out_of_range_are_named(value: int) -> None:
+    with pytest.raises(ConfigError, match=rf"renderer\.samples={value}: expected a whole number"):
+        RenderSettings(samples=value)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_one_sample_is_the_backend_itself(backend: str) -> None:
+    draw = import_module(f"neuprim.core.render.{'cpu.backend' if backend == 'cpu' else 'reference'}").render
+    t = scenes.tensors(40, 4, seed=6)
+    settings = replace(SETTINGS, backend=backend, samples=1)  # type: ignore[arg-type]
+    out, direct = frame(t, settings), draw(scenes.lowered(t), CAMERA, SKY, settings)
+    assert torch.equal(out.rgb, direct.rgb) and torch.equal(out.alpha, direct.alpha) and torch.equal(out.depth, direct.depth)
+    assert type(out.stats) is type(direct.stats)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.errors import BackendUnavailable, DataError
+from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
 from neuprim.core.ray_cameras import RayCamera
 from neuprim.core.render import RenderSettings, choose_backend, render, render_lowered
 from neuprim.core.render.rays import pixel_directions, view_of
@@ -206,3 +206,22 @@ def test_a_task_s_model_through_a_fisheye() -> None:
 def test_impossible_cameras_are_refused(make: object, message: str) -> None:
     with pytest.raises(DataError, match=message):
         make()  # type: ignore[operator]
+
+
+def test_more_samples_are_refused_by_name() -> None:
+    camera = RayCamera.equirectangular(8, 4, torch.eye(4, dtype=torch.float64))
+    with pytest.raises(ConfigError, match=r"renderer\.samples=2: only pinhole cameras"):
+        render_lowered(scenes.lowered(scenes.tensors(3)), camera, RenderSettings(samples=2))
+
+
+def test_entry_order_is_by_distance() -> None:
+    """Two overlapping spheres whose centres and entries disagree: behind the camera, where z would turn the order round."""
+    t = {k: v.double() for k, v in scenes.tensors(2, 0).items()}
+    t["means"] = torch.tensor([[0.0, 0.0, -3.0], [0.0, 0.0, -3.5]], dtype=torch.float64)
+    t["log_scales"] = torch.tensor([[0.5] * 3, [1.5] * 3], dtype=torch.float64).log()
+    t["quats"], t["b2"] = torch.tensor([[1.0, 0, 0, 0]] * 2).double(), torch.full((2, 1), 3.0, dtype=torch.float64)
+    t["colors"] = torch.tensor([[1.0, 0, 0], [0, 1.0, 0]], dtype=torch.float64)
+    camera = RayCamera(torch.eye(4, dtype=torch.float64), torch.tensor([[[0.0, 0.0, -1.0]]], dtype=torch.float64))
+    images = {s: render_lowered(scenes.lowered(t), camera, RenderSettings(sort=s)).rgb[0, 0] for s in ("center", "entry")}  # type: ignore[arg-type]
+    assert images["center"][0] > 0.9 > 0.1 > images["center"][1]  # the red centre is nearer,
+    assert images["entry"][1] > 0.9 > 0.1 > images["entry"][0]  # the green sphere is entered at 2.0, the red one at 2.5

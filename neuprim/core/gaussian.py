@@ -52,7 +52,7 @@ class GaussianDensity(DensityField):
         return {"deviations": self.deviations}
 
     def parameters(self) -> list[ParameterSpec]:
-        return [ParameterSpec("log_amplitude", (1,), 2e-2, self._initial, "exp")]
+        return [ParameterSpec("log_amplitude", (1,), 1e-1, self._initial, "exp")]
 
     def _initial(self, ctx: InitContext) -> Tensor:
         alpha = 0.1 if ctx.settings.get("mode", "opaque") == "paper" else float(ctx.settings.get("alpha", 0.8))  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -52,9 +53,11 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
         density, colour = task.build({**vars(config.model), "options": config.options}, dataset)
         progress.preparing("starting points", 0.0)
         model = initial_model(density, colour, dataset, config.model, config.seed)
-        trainer = Trainer(
-            model, dataset, task.loss({**vars(config.train), "options": config.options}), config.train, config.renderer, config.seed
-        )
+        # A preset has rates for every density and colour of its task; the trainer refuses names that the model does not have.
+        others = task.parameter_names() - model.params.keys()
+        settings = replace(config.train, rates={k: v for k, v in config.train.rates.items() if k not in others})
+        loss = task.loss({**vars(config.train), "options": config.options})
+        trainer = Trainer(model, dataset, loss, settings, config.renderer, config.seed)
         saved = directory / "checkpoint.safetensors"
         if config.resume and saved.exists():
             header, tensors = checkpoint.read(saved, "checkpoint")

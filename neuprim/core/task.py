@@ -75,6 +75,20 @@ class TaskSpec:
     fields: Mapping[str, type] | None = None
     """Class name -> field class, so that a saved model can be rebuilt from its header."""
 
+    def parameter_names(self) -> set[str]:
+        """Names of the parameters that the task's fields have at their default settings.
+
+        A preset may give rates for all of them, although a model has only one of the densities and one of the colours.
+        Fields that cannot be made without settings are left out.
+        """
+        names = set()
+        for field in (self.fields or {}).values():
+            try:
+                names |= {spec.name for spec in field().parameters()}
+            except TypeError:  # a required setting
+                continue
+        return names
+
     def scene(self, name: str) -> SceneSpec:
         """The scene of that name; KeyError if there is none."""
         return {s.name: s for s in self.scenes}[name]

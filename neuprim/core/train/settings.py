@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from neuprim.core.errors import ConfigError
 
@@ -16,13 +16,15 @@ class ModelSettings:
 
     Attributes:
         primitives: primitives at the start (and throughout, unless population control grows them).
-        neurons: hidden width K of the cosine density, 0..16; 0 is a constant density.
+        density: "cosine", the neural density, or "gaussian", the classical baseline, which runs on the reference backend alone.
+        neurons: hidden width K of the cosine density, 0..16; 0 is a constant density. A Gaussian has none.
         sh_degree: spherical-harmonics degree of the colour, 0..3.
         sh_every: fraction of the budget after which one more SH band is unlocked; 0 unlocks all at once.
         init: free settings of the fields' initialisers, see the preset files.
     """
 
     primitives: int = 2000
+    density: Literal["cosine", "gaussian"] = "cosine"
     neurons: int = 8
     sh_degree: int = 3
     sh_every: float = 0.1

@@ -8,6 +8,7 @@ from typing import Any
 from neuprim.core.cosine import CosineDensity
 from neuprim.core.data import Dataset
 from neuprim.core.fields import ColourField, DensityField
+from neuprim.core.gaussian import GaussianDensity
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim.tasks.static.fields import SphericalHarmonics
@@ -16,7 +17,8 @@ __all__ = ["TASK"]
 
 
 def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
-    return CosineDensity(model["neurons"]), SphericalHarmonics(model["sh_degree"], dataset.channels, model["sh_every"])
+    density = GaussianDensity() if model["density"] == "gaussian" else CosineDensity(model["neurons"])
+    return density, SphericalHarmonics(model["sh_degree"], dataset.channels, model["sh_every"])
 
 
 # Loaders are imported when used: each pulls in a library of its own.
@@ -59,5 +61,5 @@ TASK = TaskSpec(
     ),
     build=_build,
     loss=photometric,
-    fields={"CosineDensity": CosineDensity, "SphericalHarmonics": SphericalHarmonics},
+    fields={"CosineDensity": CosineDensity, "GaussianDensity": GaussianDensity, "SphericalHarmonics": SphericalHarmonics},
 )

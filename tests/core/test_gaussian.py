@@ -1,0 +1,280 @@
+"""The Gaussian density: its closed line integral against quadrature, its mass, and the way it trains like any other field."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+from torch import Tensor
+
+import neuprim.run as running
+from neuprim.config import compose
+from neuprim.core import checkpoint
+from neuprim.core.errors import BackendUnavailable, CheckpointError, ConfigError
+from neuprim.core.fields import Opaque
+from neuprim.core.gaussian import GaussianDensity, bell_integral
+from neuprim.core.geometry import Geometry
+from neuprim.core.primitives import Primitives
+from neuprim.core.render import RenderSettings, render
+from neuprim.core.schema import InitContext
+from neuprim.core.train.population import Gradient, Relocate, split
+from neuprim.core.train.settings import PopulationSettings
+from neuprim.tasks.static import TASK
+from neuprim.tasks.static.fields import SphericalHarmonics
+from tests import scenes
+from tests.core import tiny
+
+
+def tensors(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> dict[str, Tensor]:
+    t = scenes.tensors(count, 0, seed=seed, dtype=dtype)
+    return {
+        **{k: t[k] for k in ("means", "log_scales", "quats")},
+        "log_amplitude": (t["b2"].abs() + 0.1).log(),
+        "sh_dc": t["colors"] * 4 - 2,
+    }
+
+
+def geometry(t: dict[str, Tensor]) -> Geometry:
+    return Geometry(t["means"], t["log_scales"], t["quats"])
+
+
+def model(count: int = 20, dtype: torch.dtype = torch.float64) -> Primitives:
+    t = tensors(count, 3, dtype)
+    return Primitives(GaussianDensity(), SphericalHarmonics(0), {k: v.requires_grad_() for k, v in t.items()})
+
+
+def integral(field: GaussianDensity, t: dict[str, Tensor], prim: Tensor, o: Tensor, d: Tensor, t0: Tensor, t1: Tensor) -> Tensor:
+    form = field.lower(t, geometry(t), {})
+    assert isinstance(form, Opaque)
+    return form.line_integral(prim, o, d, t0, t1)
+
+
+def chords(t: dict[str, Tensor], distance: float, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(o, d, t0, t1): one ray per primitive that meets it, ``distance`` scene units away."""
+    gen = torch.Generator().manual_seed(seed)
+    g, n = geometry(t), len(t["means"])
+    d = torch.nn.functional.normalize(torch.randn(n, 3, generator=gen, dtype=torch.float64), dim=1)
+    u = torch.nn.functional.normalize(torch.randn(n, 3, generator=gen, dtype=torch.float64), dim=1)
+    inside = g.means + (g.rotations @ (g.scales * u * torch.rand(n, 1, generator=gen, dtype=torch.float64))[:, :, None])[..., 0]
+    o = inside - distance * d
+    to_sphere = g.rotations.transpose(1, 2) / g.scales[:, :, None]
+    y, v = (to_sphere @ (inside - g.means)[:, :, None])[..., 0], (to_sphere @ d[:, :, None])[..., 0]
+    a, b = (v * v).sum(1), (y * v).sum(1)
+    root = (b * b + a * (1 - (y * y).sum(1))).sqrt()
+    return o, d, distance + (-b - root) / a, distance + (-b + root) / a
+
+
+def quadrature(field: GaussianDensity, t: dict[str, Tensor], o: Tensor, d: Tensor, t0: Tensor, t1: Tensor) -> Tensor:
+    x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(120))
+    half = (t1 - t0) / 2
+    s = (t0 + t1)[:, None] / 2 + half[:, None] * x
+    points = (o[:, None] + s[..., None] * d[:, None]).reshape(-1, 3)
+    rows = torch.arange(len(o)).repeat_interleave(len(x))
+    return (field.density(t, geometry(t), rows, points, {}).reshape(s.shape) @ w) * half
+
+
+# ---------------------------------------------------------------- the closed form
+
+
+@pytest.mark.parametrize("deviations", [0.5, 3.0, 6.0, 10.0])
+@pytest.mark.parametrize("distance", [0.0, 3.0, 1e3])
+def test_line_integral_equals_quadrature(deviations: float, distance: float) -> None:
+    """Whole chords and pieces of them, such as the near plane leaves: error relative to S = kappa/m x length.
+
+    The points of the quadrature themselves lie only to distance x 1e-16 where they should, hence the last factor.
+    """
+    field, t = GaussianDensity(deviations), tensors(200)
+    o, d, t0, t1 = chords(t, distance)
+    prim = torch.arange(200)
+    for low, high in ((0.0, 1.0), (0.3, 1.0), (0.45, 0.55), (0.9, 1.0), (0.0, 0.2), (0.6, 0.6001)):
+        a, b = t0 + low * (t1 - t0), t0 + high * (t1 - t0)
+        found, expected = integral(field, t, prim, o, d, a, b), quadrature(field, t, o, d, a, b)
+        S = (t["log_amplitude"][:, 0] - geometry(t).log_length_scale).exp() * (b - a)
+        assert ((found - expected).abs() / S).max() <= 1e-12 * max(1.0, distance)
+        assert (expected / S).max() > 0.05 or (low, high) != (0.0, 1.0), "the rays must meet something"
+
+
+def test_bell_integral_keeps_its_digits_everywhere() -> None:
+    """Against Gauss-Legendre on the interval, relative to the integral itself, in the far tails and on the seams of the three forms."""
+    x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(100))
+    u, half = torch.meshgrid(
+        torch.linspace(-7, 7, 57, dtype=torch.float64), torch.logspace(-9, 0.3, 80, dtype=torch.float64), indexing="ij"
+    )
+    u, half = u.reshape(-1), half.reshape(-1)
+    expected = (-((u[:, None] + half[:, None] * x) ** 2)).exp() @ w * half
+    found = bell_integral(u, half)
+    assert (found / expected - 1).abs().max() <= 1e-12
+    assert expected.min() < 1e-28, "the tails must be far"
+    assert torch.equal(bell_integral(-u, half), found)
+    assert torch.equal(bell_integral(u, torch.zeros_like(u)), torch.zeros_like(u))
+    naive = math.sqrt(math.pi) / 2 * (torch.erf(u + half) - torch.erf(u - half))
+    assert (naive / expected - 1).abs().max() > 0.5, "the plain difference loses everything"
+
+
+def test_gradients_are_finite_differences() -> None:
+    field, t = GaussianDensity(), tensors(12)
+    o, d, t0, t1 = chords(t, 2.0)
+    names = ("means", "log_scales", "quats", "log_amplitude")
+    prim = torch.arange(12)
+    middle = t0 + 0.7 * (t1 - t0)
+
+    def both(*values: Tensor) -> Tensor:
+        now = dict(zip(names, values[:4], strict=True))
+        o, d, a, b = values[4:]
+        whole = integral(field, now, prim, o, d, a, b)
+        return torch.cat([whole, integral(field, now, prim, o, d, middle, b), integral(field, now, prim, o, d, middle, middle + 1e-3)])
+
+    inputs = [v.clone().requires_grad_() for v in (*(t[n] for n in names), o, d, t0, t1)]
+    assert torch.autograd.gradcheck(both, inputs, atol=1e-7, rtol=1e-5)
+    u = torch.tensor([0.0, 0.5, -3.0, 2.0, 0.1, -6.0], dtype=torch.float64, requires_grad=True)
+    w = torch.tensor([1.0, 0.5001, 0.5, 0.01, 0.01, 0.4], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(bell_integral, [u, w], atol=1e-8)
+
+
+def mass(t: dict[str, Tensor]) -> Tensor:
+    """Up to one constant, the integral of sigma over space: kappa/m prod s."""
+    return (t["log_amplitude"][:, 0] - geometry(t).log_length_scale + t["log_scales"].sum(1)).exp()
+
+
+@pytest.mark.parametrize("deviations", [1.0, 3.0])
+def test_total_mass(deviations: float) -> None:
+    """kappa/m prod s (2 pi)^(3/2)/c^3 (erf(c/sqrt 2) - sqrt(2/pi) c exp(-c^2/2)), summed over a grid of parallel rays."""
+    field, t = GaussianDensity(deviations), tensors(1, seed=4)
+    n = 400
+    line = (torch.arange(n, dtype=torch.float64) + 0.5) / n * 2 - 1
+    a, b = torch.meshgrid(line, line, indexing="ij")
+    D = 1 - (a * a + b * b).reshape(-1)
+    y = torch.stack([a.reshape(-1), b.reshape(-1), torch.zeros(n * n, dtype=torch.float64)], 1)[D > 0]
+    g = geometry(t)
+    o = g.means + (g.scales * y) @ g.rotations[0].T
+    d = g.rotations[0, :, 2].expand_as(o)
+    half = g.scales[0, 2] * D[D > 0].sqrt()
+    depth = integral(field, t, torch.zeros(len(o), dtype=torch.int64), o, d, -half, half)
+    found = depth.sum() * g.scales[0, 0] * g.scales[0, 1] * (2 / n) ** 2
+    c = deviations
+    share = math.erf(c / math.sqrt(2)) - math.sqrt(2 / math.pi) * c * math.exp(-c * c / 2)
+    assert found.item() == pytest.approx(mass(t).item() * (2 * math.pi) ** 1.5 / c**3 * share, rel=1e-3)
+
+
+# ---------------------------------------------------------------- a field like any other
+
+
+def test_parameters_and_start() -> None:
+    field = GaussianDensity()
+    whole = Primitives(field, SphericalHarmonics(3), {**tensors(2), "sh_rest": torch.zeros(2, 15, 3), "sh_dc": torch.zeros(2, 3)})
+    assert whole.parameters_per_primitive == 11 + 48
+    unit = {"means": torch.zeros(1, 3), "log_scales": torch.zeros(1, 3), "quats": torch.tensor([[1.0, 0, 0, 0]])}
+    for settings, alpha in (({"alpha": 0.7}, 0.7), ({}, 0.8), ({"mode": "paper"}, 0.1)):
+        context = InitContext(unit["means"], torch.ones(1), torch.ones(1, 3), torch.Generator(), settings)
+        start = {**unit, "log_amplitude": field.parameters()[0].init(context)}
+        ends = torch.tensor([1.0]), torch.tensor([3.0])
+        depth = integral(field, start, torch.tensor([0]), torch.tensor([[-2.0, 0, 0]]), torch.tensor([[1.0, 0, 0]]), *ends)
+        assert 1 - math.exp(-depth.item()) == pytest.approx(alpha, rel=1e-6)
+
+
+@pytest.mark.parametrize("deviations", [0.0, 11, -3, float("nan"), "3", True, None])
+def test_impossible_supports(deviations: object) -> None:
+    with pytest.raises(ValueError, match=r"expected 0\.5\.\.10"):
+        GaussianDensity(deviations)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("factors", [(0.6, 0.9), (1 / 1.6, 1 / 1.6)])
+def test_split_keeps_the_mass_of_the_pair(factors: tuple[float, float]) -> None:
+    m = model()
+    children = split(m, torch.arange(20), 0.5, *factors)
+    pair = mass(children)[:20] + mass(children)[20:]
+    before = mass({k: v.detach() for k, v in m.params.items()})
+    assert torch.allclose(pair, before, rtol=1e-12, atol=0)
+    in_place = m.density.on_split(m.of(m.density), m.geometry, m.geometry)
+    assert torch.allclose(2 * in_place["log_amplitude"].exp(), m.params["log_amplitude"].exp(), rtol=1e-14, atol=0)
+
+
+def test_scaled_density() -> None:
+    t, field = tensors(6), GaussianDensity()
+    factor = torch.tensor([0.5, 1.0, 3.0, 1e-6, 7.0, 0.0], dtype=torch.float64)
+    scaled = field.scale_density({"log_amplitude": t["log_amplitude"]}, factor)
+    rows, x = torch.arange(6), t["means"] + 0.01
+    before, after = (field.density(p, geometry(t), rows, x, {}) for p in (t, {**t, **scaled}))
+    assert torch.allclose(after, factor * before, rtol=1e-12, atol=1e-25)
+    assert torch.isfinite(scaled["log_amplitude"]).all()
+    with pytest.raises(ValueError, match="negative"):
+        field.scale_density({"log_amplitude": t["log_amplitude"]}, -factor)
+
+
+def test_every_strategy_of_population() -> None:
+    m = model()
+    camera = scenes.camera(32, 24)
+    for strategy in (Relocate(PopulationSettings(fraction=0.2)), Gradient(PopulationSettings(grow_threshold=0.0, clone_scale=0.1))):
+        output = render(m, camera, {}, RenderSettings())
+        output.stats.pixel_error = torch.ones(24, 32)
+        output.rgb.square().mean().backward()
+        strategy.observe(m, output.stats)
+        change = strategy.intervene(m, 1.0)
+        assert change is not None
+        assert all(bool(torch.isfinite(v).all()) for v in change.params.values())
+        assert len(change.params["log_amplitude"]) == len(change.origin) >= 20
+
+
+def test_renders_through_the_reference_backend() -> None:
+    m = model(dtype=torch.float32)
+    output = render(m, scenes.camera(), {}, RenderSettings(backend="auto"))
+    assert output.stats.backend == "reference" and output.rgb.dtype == torch.float32
+    assert 0.2 < output.alpha.max() <= 1
+    with pytest.raises(BackendUnavailable, match="Opaque density"):
+        render(m, scenes.camera(), {}, RenderSettings(backend="cpu"))
+
+
+def test_checkpoint(tmp_path: Path) -> None:
+    path = tmp_path / "model.safetensors"
+    m = Primitives(GaussianDensity(2.5), SphericalHarmonics(0), tensors(5, dtype=torch.float32))
+    checkpoint.save_model(path, m, "static", {})
+    again, _ = checkpoint.load_model(path, TASK)
+    assert isinstance(again.density, GaussianDensity) and again.density.deviations == 2.5
+    assert all(torch.equal(again.params[k], v) for k, v in m.params.items())
+    m.density.deviations = 99.0  # type: ignore[attr-defined]
+    checkpoint.save_model(path, m, "static", {})
+    with pytest.raises(CheckpointError, match="standard deviations"):
+        checkpoint.load_model(path, TASK)
+
+
+# ---------------------------------------------------------------- runs
+
+
+@pytest.mark.parametrize(("preset", "strategy"), [("quick", "relocate"), ("paper", "gradient")])
+def test_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str, strategy: str) -> None:
+    monkeypatch.setattr(running, "_ORBIT_FRAMES", 2)
+    scene, out = tiny.write_blender(tmp_path / "two"), tmp_path / "run"
+    words = [
+        "task=static", "scene=blender", f"scene.path={scene}", f"preset={preset}", "model.density=gaussian", "model.primitives=30",
+        "model.sh_degree=1", "train.iterations=120", "train.max_seconds=null", "train.log_every=5", "train.population.every=20",
+        f"train.population.strategy={strategy}", "train.population.start=0", f"output_dir={out}",
+    ]  # fmt: skip
+    running.run(compose(words), Console(quiet=True))
+    lines = [json.loads(text) for text in (out / "metrics.jsonl").read_text().splitlines()]
+    losses = [line["loss"] for line in lines]
+    assert sum(losses[-4:]) < 0.7 * sum(losses[:4])
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["backend"] == "reference" and metrics["parameters_per_primitive"] == 11 + 12
+    header, _ = checkpoint.read(out / "model.safetensors", "model")
+    assert header["density"] == {"class": "GaussianDensity", "settings": {"deviations": 3.0}}
+
+
+def test_rates_are_still_checked(tmp_path: Path) -> None:
+    """A preset's rates for other densities are passed over, a name that no field has is refused."""
+    scene = tiny.write_blender(tmp_path / "two")
+    words = [
+        "scene=blender",
+        f"scene.path={scene}",
+        "model.density=gaussian",
+        f"output_dir={tmp_path / 'run'}",
+        "train.rates.log_amplitud=1",
+    ]
+    with pytest.raises(ConfigError, match=r"train\.rates\.log_amplitud: no such parameter; did you mean 'log_amplitude'"):
+        running.run(compose(words), Console(quiet=True))
+    with pytest.raises(ConfigError, match=r"model\.density=gausian: expected cosine or gaussian"):
+        compose(["model.density=gausian"])

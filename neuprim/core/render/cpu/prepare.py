@@ -58,16 +58,17 @@ VISIBLE, CULLED, NON_FINITE = 0, 1, 2
 _FLOAT32_MAX = 3.0e38
 
 # Where the pixel stage leaves float32 (measured by benchmarks/numerics.py): whitened coordinates beyond this many radii of the
-# thinnest axis, neurons beyond this many turns per half chord, anchors this many pixels away.
-_DELICATE_RADII, _DELICATE_TURNS, _DELICATE_PIXELS = 8.0, 4.0, 16384.0
+# thinnest axis, neurons beyond this many turns per half chord, anchors this many pixels away, axes this unequal (gradients).
+_DELICATE_RADII, _DELICATE_TURNS, _DELICATE_PIXELS, _DELICATE_RATIO = 8.0, 4.0, 16384.0, 256.0
 
 strict = njit(error_model="numpy", forceinline=True)
 
 
 @strict
 def _rotation(q, out):  # type: ignore[no-untyped-def]
-    n = 1.0 / np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    w, x, y, z = q[0] * n, q[1] * n, q[2] * n, q[3] * n
+    w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])  # float32 squares would scale the rotation
+    n = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w * n, x * n, y * n, z * n
     out[0, 0] = 1 - 2 * (y * y + z * z)
     out[0, 1] = 2 * (x * y - w * z)
     out[0, 2] = 2 * (x * z + w * y)
@@ -191,10 +192,10 @@ def prepare_wide(start, stop, which, means, log_scales, quats, W1, b1, w2, b2, R
 
 
 @exact_kernel
-def prepare(
+def prepare(  # type: ignore[no-untyped-def]
     start, stop, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, size, near, turns,
     rows, spans, kinds, order, boxes, depth, status, delicate,
-):  # type: ignore[no-untyped-def] # fmt: skip
+):  # fmt: skip
     """Fill kernel rows, silhouette spans, pixel boxes, view depths and status of primitives ``start:stop``.
 
     cam = (fx, fy, cx, cy); size = (width, height); turns = omega0 / 2 pi. Neurons are stored by rising rate: ``order[i, k]`` is the
@@ -215,6 +216,7 @@ def prepare(
         tc = row[TC]
         delicate[i] = (K > 0 and rate[K - 1] > _DELICATE_TURNS) or max(abs(row[UX]), abs(row[UY])) > _DELICATE_PIXELS
         delicate[i] |= max(abs(xa[0]), abs(xa[1]), abs(xa[2])) > _DELICATE_RADII  # far from the camera's anchor, in the thinnest axis
+        delicate[i] |= min(axes[0], axes[1], axes[2]) * _DELICATE_RATIO < 1.0
         depth[i] = c[2]
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
         if not finite:

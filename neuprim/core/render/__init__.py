@@ -12,6 +12,7 @@ from neuprim.core.errors import BackendUnavailable
 from neuprim.core.fields import Constant, Cosine
 from neuprim.core.primitives import Lowered, Primitives
 from neuprim.core.render.output import RenderOutput, RenderStats
+from neuprim.core.render.refusals import refuse_non_finite
 from neuprim.core.render.settings import RenderSettings
 
 __all__ = ["BACKENDS", "RenderOutput", "RenderSettings", "RenderStats", "choose_backend", "probe", "render", "render_lowered"]
@@ -58,11 +59,13 @@ def render(
 
 
 def render_lowered(lowered: Lowered, camera: Camera, settings: RenderSettings, background: Tensor | None = None) -> RenderOutput:
-    """Draw a model whose conditions are already folded in."""
+    """Draw a model whose conditions are already folded in; refuses what is not finite, see :func:`render`."""
     if choose_backend(lowered, settings) == "cpu":
         from neuprim.core.render.cpu.backend import render as draw
     else:
         from neuprim.core.render.reference import render as draw
+
+        refuse_non_finite(lowered)
     return draw(lowered, camera, background, settings)
 
 

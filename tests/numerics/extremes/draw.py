@@ -15,7 +15,7 @@ from tests import scenes
 from tests.numerics.extremes.measure import OPEN, Case
 from tests.numerics.extremes.oracle import Integrals, long_integrals
 
-__all__ = ["SIZE", "crowd", "cut", "grazing", "log_uniform", "signed", "single"]
+__all__ = ["SIZE", "aimed", "crowd", "cut", "grazing", "log_uniform", "normalised", "primitive", "signed", "single"]
 
 SIZE = 24  # pixels on a side
 

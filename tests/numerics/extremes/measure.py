@@ -19,7 +19,7 @@ from tests import scenes
 from tests.numerics.compare import undecided
 from tests.numerics.extremes.oracle import Integrals, long_integrals
 
-__all__ = ["Case", "Errors", "compare", "drawn", "gradient_errors", "integral_errors"]
+__all__ = ["Case", "Errors", "compare", "drawn", "gradient_errors", "gradients", "integral_errors"]
 
 OPEN = RenderSettings(alpha_min=0.0, transmittance_min=0.0, alpha_max=0.9999)
 SOLID = 0.45  # shorter chords, as a share of the central one, are thin: D < 0.2, or cut by a near plane
@@ -113,10 +113,11 @@ def integral_errors(case: Case, backend: str, exact: Integrals | None = None) ->
     return Errors(float(share.max()), float(rim.max()), 0.0, "", where, int(exact.hit.sum()), wide, 1)
 
 
-def _gradients(case: Case, backend: str, seed: int, keep: Tensor) -> list[dict[str, Tensor]]:
+def gradients(case: Case, backend: str, seed: int, keep: Tensor | None = None) -> list[dict[str, Tensor]]:
     """Gradients of a few random functionals of rgb and alpha."""
     g = torch.Generator().manual_seed(seed)
     h, w, C = case.camera.height, case.camera.width, case.tensors["colors"].shape[1]
+    keep = torch.ones(h, w, 1, dtype=torch.float64) if keep is None else keep
     leaves = {k: v.detach().clone().requires_grad_() for k, v in case.tensors.items()}
     out = render_lowered(scenes.lowered(leaves), case.camera, replace(case.settings, backend=backend))  # type: ignore[arg-type]
     grads = []
@@ -135,8 +136,8 @@ def gradient_errors(case: Case, backend: str, seed: int = 0, skip: Tensor | None
     keep = torch.ones(case.camera.height, case.camera.width, 1, dtype=torch.float64)
     if skip is not None:
         keep[skip] = 0
-    exact = _gradients(case.cast("float64"), "reference", seed, keep)
-    found = _gradients(case, backend, seed, keep)
+    exact = gradients(case.cast("float64"), "reference", seed, keep)
+    found = gradients(case, backend, seed, keep)
     worst, name = 0.0, ""
     for key in case.tensors:
         n = case.tensors[key].shape[0]

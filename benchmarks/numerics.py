@@ -35,15 +35,16 @@ def main() -> int:
     args = parser.parse_args()
     torch.set_num_threads(1)
     results = []
+    cases = args.cases or (3 if args.coarse else 40)
     print(table([]), flush=True)
-    for result in sweep(args.cases or (3 if args.coarse else 40), args.regions):
+    for result in sweep(cases, args.regions):
         print(result.line(), flush=True)
         results.append(result)
     if not results:
         print(f"no region contains {args.regions}", file=sys.stderr)
         return 2
     if args.markdown:
-        args.markdown.write_text(document(results))
+        args.markdown.write_text(document(results, cases))
     broken = [r for r in results if r.broken]
     for r in broken:
         print(f"broken: {r.label}: {', '.join(r.broken)}", file=sys.stderr)

@@ -13,6 +13,7 @@ from neuprim.core.fields import Constant, Cosine
 from neuprim.core.primitives import Lowered, Primitives
 from neuprim.core.ray_cameras import AnyCamera, RayCamera
 from neuprim.core.render.output import RenderOutput, RenderStats
+from neuprim.core.render.refusals import refuse_non_finite
 from neuprim.core.render.samples import render_samples
 from neuprim.core.render.settings import RenderSettings
 
@@ -66,21 +67,18 @@ def render(
 
 
 def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None) -> RenderOutput:
-    """Draw a model whose conditions are already folded in."""
-    backend = choose_backend(lowered, settings, camera)
-    if isinstance(camera, RayCamera):
-        from neuprim.core.render.reference import render as draw_rays
-
-        if settings.samples > 1:
-            raise ConfigError(f"renderer.samples={settings.samples}: only pinhole cameras are sampled; give a RayCamera more directions")
-        return draw_rays(lowered, camera, background, settings)
-    if backend == "cpu":
+    """Draw a model whose conditions are already folded in; refuses what is not finite, see :func:`render`."""
+    if choose_backend(lowered, settings, camera) == "cpu":  # which checks while it prepares
         from neuprim.core.render.cpu.backend import render as draw
     else:
         from neuprim.core.render.reference import render as draw
+
+        refuse_non_finite(lowered)
     if settings.samples > 1:
+        if isinstance(camera, RayCamera):
+            raise ConfigError(f"renderer.samples={settings.samples}: only pinhole cameras are sampled; give a RayCamera more directions")
         return render_samples(draw, lowered, camera, background, settings)
-    return draw(lowered, camera, background, settings)
+    return draw(lowered, camera, background, settings)  # type: ignore[arg-type]
 
 
 def probe(name: str) -> str | None:

@@ -57,9 +57,12 @@ __all__ = ["CULLED", "NON_FINITE", "VISIBLE", "prepare", "prepare_backward", "pr
 VISIBLE, CULLED, NON_FINITE = 0, 1, 2
 _FLOAT32_MAX = 3.0e38
 
-# Where the pixel stage leaves float32 (measured by benchmarks/numerics.py): whitened coordinates beyond this many radii of the
-# thinnest axis, neurons beyond this many turns per half chord, anchors this many pixels away, axes this unequal (gradients).
-_DELICATE_RADII, _DELICATE_TURNS, _DELICATE_PIXELS, _DELICATE_RATIO = 8.0, 4.0, 16384.0, 256.0
+# Where the pixel stage leaves float32 (bounds found with benchmarks/numerics.py).
+_DELICATE_RADII = 8.0  # terms of a point on the ray this many radii of the thinnest axis long: they cancel
+_DELICATE_ANCHOR = 2.0  # the same of the centre seen from an anchor at the camera
+_DELICATE_TURNS = 4.0  # of a neuron over half a chord
+_DELICATE_PIXELS = 16384.0  # from the corner of the image to the anchor
+_DELICATE_RATIO = 256.0  # of the axes; for the gradients
 
 strict = njit(error_model="numpy", forceinline=True)
 
@@ -215,7 +218,7 @@ def prepare(  # type: ignore[no-untyped-def]
             rows[i, j] = row[j]
         tc = row[TC]
         delicate[i] = (K > 0 and rate[K - 1] > _DELICATE_TURNS) or max(abs(row[UX]), abs(row[UY])) > _DELICATE_PIXELS
-        delicate[i] |= max(abs(xa[0]), abs(xa[1]), abs(xa[2])) > _DELICATE_RADII  # far from the camera's anchor, in the thinnest axis
+        delicate[i] |= max(abs(xa[0]), abs(xa[1]), abs(xa[2])) > _DELICATE_ANCHOR  # centre far from the anchor, in the thinnest axis
         delicate[i] |= min(axes[0], axes[1], axes[2]) * _DELICATE_RATIO < 1.0
         depth[i] = c[2]
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
@@ -267,9 +270,16 @@ def prepare(  # type: ignore[no-untyped-def]
                 if peak > 0.0:
                     span[SKEW], span[XC], span[YC] = -q4 / q3, -(q1 + q4 * yc) / q3, yc
                     span[HX], span[HY] = np.sqrt(peak) / -q3, np.sqrt(-peak / d2)
-                    # what sliding the origin leaves over, s G, at the silhouette's rim
-                    slide = abs(row[TU]) * span[HX] + abs(row[TV]) * span[HY]
-                    delicate[i] |= slide * (np.sqrt(_dot(ex, ex)) * span[HX] + np.sqrt(_dot(ey, ey)) * span[HY]) > _DELICATE_RADII
+                    # the pixel offsets that meet the silhouette on the screen
+                    tall = min(abs(yc) + span[HY], max(abs(0.5 - row[UY]), abs(size[1] - 0.5 - row[UY])))
+                    broad = abs(span[XC]) + abs(span[SKEW]) * (abs(yc) + span[HY]) + span[HX]
+                    broad = min(broad, max(abs(0.5 - row[UX]), abs(size[0] - 0.5 - row[UX])))
+                    # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted needle
+                    # each is many radii of its thin axis, and they cancel
+                    slide = abs(row[TU]) * broad + abs(row[TV]) * tall
+                    delicate[i] |= slide * (np.sqrt(_dot(ex, ex)) * broad + np.sqrt(_dot(ey, ey)) * tall) > _DELICATE_RADII
+                    for a in range(3):
+                        delicate[i] |= abs(row[XU + a]) * broad + abs(row[XV + a]) * tall > _DELICATE_RADII
         if delicate[i]:  # the float64 rows do not slide
             for a in range(3):
                 rows[i, XU + a], rows[i, XV + a] = tc * ex[a], tc * ey[a]

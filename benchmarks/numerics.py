@@ -1,0 +1,56 @@
+"""Worst errors of every backend over the named extremes of the input space.
+
+    python benchmarks/numerics.py [--coarse] [--cases N] [--regions NAME ...] [--markdown FILE]
+
+Prints one line per region, backend and precision; exits with status 1 when a bound is broken. A backend and precision is
+"cpu float32", "reference float32" (float32 parameters, float64 inside) or "reference float64". The oracle runs in extended
+precision and shares no code with the backends; gradients are compared with the float64 reference's.
+
+- error/S: of the optical depth of a chord, S = (2h/m)(|b2| + sum |w2|), on chords of at least 0.45 of the central one.
+- thin: on shorter chords, misses included, error/S x (S/S_c)^2, S_c the central chord's S.
+- gradient: error of a parameter's gradient over the gradient's norm, over four random functionals of the image.
+
+--markdown writes the table with an introduction; docs/numerical_limits.md is made that way.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from tests.numerics.extremes.sweep import document, sweep, table
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--coarse", action="store_true", help="3 cases per region instead of 40")
+    parser.add_argument("--cases", type=int, help="cases per region")
+    parser.add_argument("--regions", nargs="*", default=[], help="only regions whose name contains one of these")
+    parser.add_argument("--markdown", type=Path, help="write the documentation page here")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    results = []
+    cases = args.cases or (3 if args.coarse else 40)
+    print(table([]), flush=True)
+    for result in sweep(cases, args.regions):
+        print(result.line(), flush=True)
+        results.append(result)
+    if not results:
+        print(f"no region contains {args.regions}", file=sys.stderr)
+        return 2
+    if args.markdown:
+        args.markdown.write_text(document(results, cases))
+    broken = [r for r in results if r.broken]
+    for r in broken:
+        print(f"broken: {r.label}: {', '.join(r.broken)}", file=sys.stderr)
+    print(f"{len(results)} rows, {len(broken)} broken")
+    return 1 if broken else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,185 @@
+"""How far a backend is from the oracle on one case, in the units of the bounds.
+
+Optical depth is read from a colour channel of colour 1 over black, which keeps float32's relative precision where alpha is
+small: I = -log1p(-alpha), up to I = 1.5; beyond, the error of alpha itself counts. What one rounding of alpha explains is not
+counted against a float32 image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.render import RenderSettings, render_lowered
+from tests import scenes
+from tests.numerics.compare import undecided
+from tests.numerics.extremes.oracle import Integrals, long_integrals
+
+__all__ = ["Case", "Errors", "compare", "drawn", "gradient_errors", "gradients", "integral_errors"]
+
+OPEN = RenderSettings(alpha_min=0.0, transmittance_min=0.0, alpha_max=0.9999)
+SOLID = 0.45  # shorter chords, as a share of the central one, are thin: D < 0.2, or cut by a near plane
+OPAQUE = 1.5  # optical depth beyond which alpha is compared instead
+RIM = 1e-6  # |D| below which float32 may not know whether a ray meets an ellipsoid
+FUNCTIONALS = 4
+
+
+@dataclass
+class Case:
+    """Primitives, a camera, settings. ``name`` tells cases of a region apart."""
+
+    tensors: dict[str, Tensor]
+    camera: Camera
+    settings: RenderSettings = OPEN
+    name: str = ""
+
+    def cast(self, precision: str) -> Case:
+        dtype = torch.float64 if precision == "float64" else torch.float32
+        return replace(self, tensors={k: v.to(dtype) for k, v in self.tensors.items()})
+
+
+@dataclass
+class Errors:
+    """Worst of some cases.
+
+    Attributes:
+        forward: |dI|/S on solid chords.
+        thin: |dI|/S (S/S_c)^2 on thin ones, S_c the central chord's S, and the same for hits missed and misses hit.
+        at: S/S_c where ``forward`` was found.
+        gradient: error of a parameter's gradient over the gradient's norm; ``parameter`` is the worst one.
+        hits: pixels compared.
+        wide: primitives that the cpu backend drew in float64.
+    """
+
+    forward: float = 0.0
+    thin: float = 0.0
+    gradient: float = 0.0
+    parameter: str = ""
+    at: float = 1.0
+    hits: int = 0
+    wide: int = 0
+    primitives: int = 0
+    worst: dict[str, str] = field(default_factory=dict)
+
+    def absorb(self, other: Errors, name: str) -> None:
+        if not other.forward <= self.forward:
+            self.forward, self.at, self.worst["forward"] = other.forward, other.at, name
+        if not other.thin <= self.thin:
+            self.thin, self.worst["thin"] = other.thin, name
+        if not other.gradient <= self.gradient:
+            self.gradient, self.parameter, self.worst["gradient"] = other.gradient, other.parameter, name
+        self.hits, self.wide, self.primitives = (
+            self.hits + other.hits,
+            self.wide + other.wide,
+            self.primitives + other.primitives,
+        )
+
+
+def drawn(case: Case, backend: str) -> tuple[np.ndarray, int]:  # type: ignore[type-arg]
+    """(H, W) opacity of the one primitive, float64, and how many primitives were drawn in float64."""
+    t = dict(case.tensors)
+    t["colors"] = torch.ones_like(t["colors"][:, :1])
+    with torch.no_grad():
+        out = render_lowered(scenes.lowered(t), case.camera, replace(case.settings, backend=backend))  # type: ignore[arg-type]
+    return out.rgb[..., 0].double().numpy(), int(out.stats.extra.get("delicate", 0))
+
+
+def integral_errors(case: Case, backend: str, exact: Integrals | None = None) -> Errors:
+    """Worst |dI|/S over the pixels of a case of one primitive."""
+    exact = exact or long_integrals(case.tensors, 0, case.camera, case.settings.near)
+    alpha, wide = drawn(case, backend)
+    low, high = case.settings.alpha_min, case.settings.alpha_max
+    true = np.maximum(exact.depth, 0)
+    opacity = -np.expm1(-true)
+    true = np.where(opacity < low, 0, -np.log1p(-np.minimum(opacity, high)))
+    undecided = (low > 0) & (np.abs(opacity - low) < 1e-6)  # float32 may rightly fall on the other side of the cut
+    found = -np.log1p(-np.minimum(alpha, np.nextafter(1, 0)))
+    # where little light is left, alpha has too few digits to read I from: its own error is compared
+    error = np.where(true > OPAQUE, np.abs(alpha - np.minimum(opacity, high)), np.abs(found - true))
+    error = np.where(undecided, 0, error)
+    if case.tensors["means"].dtype == torch.float32:
+        error = np.maximum(error - 2.0**-24 * alpha / (1 - np.minimum(alpha, 0.99999)), 0)
+    error = np.where(np.isfinite(alpha), error, np.inf)
+    # float32 knows D = 1 - |x_m|^2 to about 1e-7, and dI/S = dD/2D: thin chords get a law of their own
+    short = (exact.scale < SOLID * exact.central) & (exact.D > -1)
+    share = np.where(short | ~exact.hit, 0, error / np.where(exact.hit, exact.scale, 1)).astype(np.float64)
+    rim = np.where(short | ~exact.hit, error * np.maximum(exact.scale, error) / exact.central**2, 0).astype(np.float64)
+    at = np.unravel_index(np.argmax(share), share.shape)
+    where = float((exact.scale / exact.central)[at])
+    return Errors(float(share.max()), float(rim.max()), 0.0, "", where, int(exact.hit.sum()), wide, 1)
+
+
+def gradients(case: Case, backend: str, seed: int, keep: Tensor | None = None) -> list[dict[str, Tensor]]:
+    """Gradients of a few random functionals of rgb and alpha."""
+    g = torch.Generator().manual_seed(seed)
+    h, w, C = case.camera.height, case.camera.width, case.tensors["colors"].shape[1]
+    keep = torch.ones(h, w, 1, dtype=torch.float64) if keep is None else keep
+    leaves = {k: v.detach().clone().requires_grad_() for k, v in case.tensors.items()}
+    out = render_lowered(scenes.lowered(leaves), case.camera, replace(case.settings, backend=backend))  # type: ignore[arg-type]
+    grads = []
+    for _ in range(FUNCTIONALS):
+        rgb, alpha = ((torch.randn(h, w, n, generator=g, dtype=torch.float64) * keep).to(out.rgb.dtype) for n in (C, 1))
+        found = torch.autograd.grad((out.rgb, out.alpha), list(leaves.values()), (rgb, alpha[..., 0]), retain_graph=True, allow_unused=True)
+        grads.append({k: torch.zeros_like(v) if x is None else x for (k, v), x in zip(leaves.items(), found, strict=True)})
+    return grads
+
+
+def gradient_errors(case: Case, backend: str, seed: int = 0, skip: Tensor | None = None) -> tuple[float, str]:
+    """Worst over parameters and primitives of |error|/|row|, against the float64 reference.
+
+    Both norms run over several random functionals, because the gradient of a single number may cancel by chance.
+    """
+    keep = torch.ones(case.camera.height, case.camera.width, 1, dtype=torch.float64)
+    if skip is not None:
+        keep[skip] = 0
+    exact = gradients(case.cast("float64"), "reference", seed, keep)
+    found = gradients(case, backend, seed, keep)
+    worst, name = 0.0, ""
+    for key in case.tensors:
+        n = case.tensors[key].shape[0]
+        a, b = (torch.stack([g[key].double().reshape(n, -1) for g in grads], 1).reshape(n, -1) for grads in (found, exact))
+        error, norm = (a - b).norm(dim=1), b.norm(dim=1)
+        share = torch.where(error == 0, torch.zeros_like(error), error / norm.clamp_min(1e-300))
+        share = torch.where(torch.isfinite(a).all(1), share, torch.full_like(share, float("inf")))
+        if share.numel() and float(share.max()) > worst:
+            worst, name = float(share.max()), key
+    return worst, name
+
+
+def frame_errors(case: Case, backend: str) -> tuple[Errors, Tensor]:
+    """Worst difference of the images of several primitives from the float64 reference's, and the pixels left out.
+
+    Left out are those on which float32 and float64 may rightly fall on different sides of a cut.
+    """
+    exact = case.cast("float64")
+    with torch.no_grad():
+        images = [
+            render_lowered(scenes.lowered(c.tensors), c.camera, replace(c.settings, backend=name))  # type: ignore[arg-type]
+            for c, name in ((case, backend), (exact, "reference"))
+        ]
+    skip = undecided(exact.tensors, exact.camera, exact.settings)
+    difference = torch.maximum((images[0].rgb.double() - images[1].rgb).abs().amax(-1), (images[0].alpha.double() - images[1].alpha).abs())
+    difference = torch.where(torch.isfinite(difference), difference, torch.full_like(difference, float("inf")))
+    kept = torch.where(skip, torch.zeros_like(difference), difference)
+    hits = int((images[1].alpha > 0).sum())
+    return Errors(
+        float(kept.max()), hits=hits, wide=int(images[0].stats.extra.get("delicate", 0)), primitives=len(case.tensors["means"])
+    ), skip
+
+
+def compare(case: Case, backend: str, precision: str, whole: bool, gradients: bool) -> Errors:
+    """Everything about one case on one backend."""
+    case = case.cast(precision)
+    if whole:
+        errors, skip = frame_errors(case, backend)
+    else:
+        exact = long_integrals(case.tensors, 0, case.camera, case.settings.near)
+        errors = integral_errors(case, backend, exact)
+        skip = torch.from_numpy((np.abs(exact.D) < RIM).astype(np.bool_))
+    if gradients:
+        errors.gradient, errors.parameter = gradient_errors(case, backend, skip=skip)
+    return errors

@@ -1,0 +1,107 @@
+"""The named regions: what each varies, and the bounds it must keep."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tests.numerics.extremes.draw import crowd, cut, grazing, log_uniform, signed, single
+from tests.numerics.extremes.measure import Case
+
+__all__ = ["FORWARD", "GRADIENT", "REGIONS", "THIN", "Region"]
+
+FORWARD, GRADIENT, THIN = 1e-6, 1e-3, 4e-7
+IMAGE = 5e-6  # of a pixel under tens of primitives, whose errors add up
+
+
+@dataclass(frozen=True)
+class Region:
+    """A part of the input space.
+
+    Attributes:
+        make: draws one case.
+        forward, gradient, thin: bounds (see :class:`~tests.numerics.extremes.measure.Errors`).
+        reason: why a bound is wider than the usual one; empty where none is.
+        whole: cases have several primitives: their images are compared, not single integrals.
+    """
+
+    name: str
+    make: Callable[[np.random.Generator], Case]
+    forward: float = FORWARD
+    gradient: float = GRADIENT
+    thin: float = THIN
+    reason: str = ""
+    whole: bool = False
+
+    def case(self, number: int) -> Case:
+        """Case ``number`` of this region; the same on every machine."""
+        case = self.make(np.random.default_rng([zlib.crc32(self.name.encode()), number]))
+        return replace(case, name=f"{self.name} #{number}")
+
+
+def _distances() -> list[Region]:
+    out = []
+    for d in (1e-2, 1e-1, 0.5, 1.0, 2.0, 10.0, 1e2, 1e3, 1e4, 1e5):
+        fov = 90.0 if d < 1 else None
+        out.append(Region(f"distance/radius {d:g}", lambda r, d=d, fov=fov: single(r, distance=(d, d), fov=fov)))  # type: ignore[misc]
+    return out
+
+
+def _rates() -> list[Region]:
+    values = (0.0, 1e-12, 1e-6, 1e-3, 1.0, 10.0, 1e2, 1e3)
+    return [Region(f"phase rate {v:g} rad per chord", lambda r, v=v: single(r, rate=v, neurons=int(r.choice([1, 8])))) for v in values]  # type: ignore[misc]
+
+
+def _ratios() -> list[Region]:
+    out = []
+    for q in (1.0, 1e1, 1e2, 1e3, 1e4):
+        for kind in ("needle", "disc") if q > 1 else ("any",):
+            out.append(
+                Region(
+                    f"axis ratio {q:g}, {kind}",
+                    lambda r, q=q, kind=kind: single(r, ratio=(q, q), kind=kind, pixels=(0.3, 12.0), distance=(1.5, 20.0)),  # type: ignore[misc]
+                )
+            )
+    return out
+
+
+REGIONS: tuple[Region, ...] = (
+    Region("everyday", lambda r: single(r)),
+    *_distances(),
+    *_rates(),
+    *_ratios(),
+    Region("needles and discs, far", lambda r: single(r, ratio=(1e2, 1e4), distance=(1e2, 1e5), pixels=(0.3, 12.0))),
+    Region("needles and discs, inside or near", lambda r: single(r, ratio=(1e2, 1e4), distance=(1e-2, 1.5), pixels=(0.01, 12.0))),
+    Region("needles and discs, fast neurons", lambda r: single(r, ratio=(10.0, 1e3), rate=(10.0, 1e3), pixels=(0.3, 12.0))),
+    Region("sub-pixel", lambda r: single(r, distance=(5.0, 1e4), pixels=(1e-3, 0.5), minimum=1)),
+    Region("screen-filling", lambda r: single(r, distance=(1.2, 3.0), pixels=(30.0, 1e4))),
+    Region("field of view 120", lambda r: single(r, distance=(0.5, 4.0), fov=120.0, minimum=2)),
+    Region("field of view 160", lambda r: single(r, distance=(0.5, 4.0), fov=160.0, minimum=1)),
+    Region("principal point at the border", lambda r: single(r, off=0.5)),
+    Region("principal point far outside", lambda r: single(r, off=log_uniform(r, 2.0, 500.0))),
+    Region("near plane through the chord", lambda r: single(r, distance=(0.02, 1.0), ratio=(1.2, 20.0), fov=80.0)),
+    Region("faint", lambda r: single(r, depth=1e-6)),
+    Region("scales 1e-20", lambda r: single(r, scale=1e-20)),
+    Region("scales 1e-8", lambda r: single(r, scale=1e-8)),
+    Region("scales 1e8", lambda r: single(r, scale=1e8)),
+    Region("scales 1e20", lambda r: single(r, scale=1e20)),
+    Region("far from the scene's origin", lambda r: single(r, mean=1e4)),
+    Region("grazing", grazing),
+    Region("negative densities", signed),
+    Region("dense", lambda r: single(r, depth=log_uniform(r, 5.0, 50.0))),
+    Region("huge densities", lambda r: single(r, depth=log_uniform(r, 1e3, 1e30))),
+    Region("alpha at alpha_min", lambda r: cut(r, alpha_min=0.3)),
+    Region("alpha at alpha_max", lambda r: cut(r, alpha_max=0.4)),
+    Region(
+        "transmittance at its cut",
+        lambda r: crowd(r, 30, transmittance_min=1e-4, alpha_min=1 / 255, alpha_max=0.99),
+        forward=IMAGE,
+        whole=True,
+    ),
+    Region("equal depths", lambda r: crowd(r, 8, equal=True), forward=IMAGE, whole=True),
+    Region("crowd", lambda r: crowd(r, 60, alpha_min=1 / 255, transmittance_min=1e-4), forward=IMAGE, whole=True),
+    Region("everything at once", lambda r: single(r, (0.02, 1e5), (1.2, 1e4), rate=(0.1, 1e2), pixels=(0.1, 30.0))),
+)

@@ -1,0 +1,37 @@
+"""Cases that once broke a bound, by the reason they did."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["FOUND", "SWEPT", "Draw"]
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One primitive and camera by their proportions; see ``tests/numerics/extremes/draw.py`` for the meaning."""
+
+    seed: int
+    distance: float
+    ratio: float
+    kind: str
+    neurons: int
+    rate: float
+    pixels: float
+    off: float
+    depth: float
+    offset: float
+
+
+FOUND: dict[str, Draw] = {}
+"""What hypothesis found."""
+
+SWEPT: dict[str, tuple[str, int]] = {
+    "the quaternion's norm rounded to float32": ("axis ratio 10000, needle", 5),
+    "a slanted needle, whose two offset terms cancel": ("axis ratio 100, needle", 5),
+    "a slanted needle from afar": ("needles and discs, far", 15),
+    "a disc around the camera": ("needles and discs, inside or near", 20),
+    "the camera a few radii from a wide view's rim": ("field of view 160", 21),
+    "a rim pixel with D = 4e-6": ("grazing", 1),
+}
+"""What the sweep found: region and number of the case."""

@@ -1,0 +1,44 @@
+"""The coarse sweep of the named extremes, and the oracle behind it against fifty digits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.numerics.extremes.oracle import long_integrals, mp_integral
+from tests.numerics.extremes.regions import REGIONS, Region
+from tests.numerics.extremes.sweep import BACKENDS, measure
+
+COARSE = 3
+SINGLE = [r for r in REGIONS if not r.whole]
+
+
+@pytest.mark.parametrize("region", REGIONS, ids=lambda r: r.name)
+def test_bounds_hold(region: Region) -> None:
+    for backend, precision in BACKENDS:
+        result = measure(region, backend, precision, 1 if region.whole else COARSE)
+        assert not result.broken, f"{result.label}: {result.broken}"
+
+
+@pytest.mark.parametrize("region", SINGLE, ids=lambda r: r.name)
+def test_the_oracle_agrees_with_fifty_digits(region: Region) -> None:
+    """Another form of the integral, on the three most different pixels of a case: the largest and smallest D and the largest I."""
+    case = region.case(0)
+    exact = long_integrals(case.tensors, 0, case.camera, case.settings.near)
+    hit = exact.hit
+    picks = {int(np.argmax(np.where(hit, key, -np.inf))) for key in (exact.D, -exact.D, np.abs(exact.depth))}
+    for at in picks:
+        y, x = divmod(at, case.camera.width)
+        depth, scale = mp_integral(case.tensors, 0, case.camera, case.settings.near, x, y)
+        assert scale > 0
+        # what longdouble leaves at distance/radius 1e5 x axis ratio 1e4, over the chord's own D
+        share = 2e-9 / float(exact.D[y, x])
+        assert abs(float(depth - mp_number(exact.depth[y, x]))) <= share * float(scale)
+        assert abs(float(scale - mp_number(exact.scale[y, x]))) <= share * float(scale)
+
+
+def mp_number(value: np.longdouble) -> object:
+    import mpmath
+
+    high = float(value)
+    return mpmath.mpf(high) + mpmath.mpf(float(value - np.longdouble(high)))

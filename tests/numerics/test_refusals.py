@@ -1,0 +1,114 @@
+"""Numbers that are not numbers, or leave every range: refused by name on both backends, or drawn finite."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from neuprim.core import sh
+from neuprim.core.cosine import CosineDensity
+from neuprim.core.errors import NonFiniteError
+from neuprim.core.primitives import Primitives
+from neuprim.core.render import RenderSettings, render, render_lowered
+from neuprim.tasks.static.fields import SphericalHarmonics
+from tests import scenes
+
+BACKENDS = ["cpu", "reference"]
+NAMES = ["means", "log_scales", "quats", "W1", "b1", "w2", "b2"]
+
+
+def settings(backend: str) -> RenderSettings:
+    return RenderSettings(backend=backend)  # type: ignore[arg-type]
+
+
+def model(count: int = 20) -> Primitives:
+    t = scenes.tensors(count)
+    params = {k: v for k, v in t.items() if k != "colors"}
+    params["sh_dc"] = t["colors"]
+    params["sh_rest"] = torch.zeros(count, 15, 3)
+    return Primitives(CosineDensity(8), SphericalHarmonics(3), params)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("name", [*NAMES, "colors"])
+def test_not_a_number_is_refused_by_name(backend: str, name: str, value: float) -> None:
+    t = scenes.tensors(20)
+    t[name][13].view(-1)[-1] = value
+    with pytest.raises(NonFiniteError, match=rf"\b{name} of primitive 13\b"):
+        render_lowered(scenes.lowered(t), scenes.camera(20, 20), settings(backend))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", [*NAMES, "sh_dc", "sh_rest"])
+def test_a_whole_model_is_refused_by_name(backend: str, name: str) -> None:
+    m = model()
+    m.params[name][7].view(-1)[0] = float("nan")
+    named = "colors" if name.startswith("sh") else name
+    with pytest.raises(NonFiniteError, match=rf"\b({name}|{named}) of primitive 7\b"):
+        render(m, scenes.camera(20, 20), settings=settings(backend))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_zero_quaternion_is_refused_by_name(backend: str) -> None:
+    t = scenes.tensors(20)
+    t["quats"][7] = 0
+    with pytest.raises(NonFiniteError, match=r"quats of primitive 7 is zero"):
+        render_lowered(scenes.lowered(t), scenes.camera(20, 20), settings(backend))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("value", [1000.0, 3e38, -3e38])
+def test_scales_that_overflow_are_refused_by_name(backend: str, value: float) -> None:
+    t = scenes.tensors(20)
+    t["log_scales"][3] = value
+    with pytest.raises(NonFiniteError, match=r"log_scales of primitive 3\b"):
+        render_lowered(scenes.lowered(t), scenes.camera(20, 20), settings(backend))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", [*NAMES, "colors"])
+def test_denormals_are_drawn(backend: str, name: str) -> None:
+    t = {k: v.requires_grad_() for k, v in scenes.tensors(20).items()}
+    with torch.no_grad():
+        t[name][5] = 1e-42
+    out = render_lowered(scenes.lowered(t), scenes.camera(20, 20), settings(backend))
+    assert torch.isfinite(out.rgb).all() and out.alpha.max() > 0.2
+    out.rgb.sum().backward()
+    for k, v in t.items():
+        if k != "quats" or name != "quats":  # the gradient of a direction grows as one over its length
+            assert v.grad is not None and torch.isfinite(v.grad).all(), k
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("value", [1e30, -1e30])
+def test_spherical_harmonics_far_outside_their_range_are_drawn(backend: str, value: float) -> None:
+    m = model()
+    m.params["sh_rest"][4] = value
+    out = render(m, scenes.camera(20, 20), settings=settings(backend))
+    assert torch.isfinite(out.rgb).all() and torch.isfinite(out.alpha).all()
+    assert out.alpha.max() > 0.2
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_spherical_harmonics_that_overflow_are_refused_by_name(backend: str) -> None:
+    m = model()
+    camera = scenes.camera(20, 20)
+    way = m.params["means"][4] - camera.position.float()
+    m.params["sh_rest"][4] = 3e38 * sh.basis(way / way.norm(), 3)[1:, None].sign()  # every band adds up
+    with pytest.raises(NonFiniteError, match=r"of primitive 4\b"):
+        render(m, camera, settings=settings(backend))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_no_primitives(backend: str) -> None:
+    m = model()
+    empty = Primitives(m.density, m.colour, {k: v[:0].clone().requires_grad_() for k, v in m.params.items()})
+    background = torch.tensor([0.5, 0.25, 1.0], requires_grad=True)
+    out = render(empty, scenes.camera(20, 17), settings=settings(backend), background=background)
+    assert torch.equal(out.rgb, background.detach().expand(17, 20, 3)) and out.alpha.abs().max() == 0
+    out.rgb.sum().backward()
+    grad: Any = background.grad
+    assert torch.equal(grad, torch.full((3,), 340.0))

@@ -28,6 +28,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import torch
 from static_quality import cpu_name, spread
+from tables import between_markers
 
 from neuprim.config import compose
 from neuprim.core.checkpoint import save_model
@@ -39,7 +40,6 @@ HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "expressivity.json"
 DOCS = HERE.parent / "docs" / "expressivity.md"
 PICTURE = HERE.parent / "docs" / "pictures" / "expressivity.png"
-MARKERS = ("<!-- expressivity -->", "<!-- /expressivity -->")
 KEYS = ("psnr", "psnr_worst", "ssim", "iterations", "parameters", "parameters_per_primitive", "primitives", "backend", "seed")
 
 
@@ -159,13 +159,6 @@ def table(results: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n\n" + note
 
 
-def write_docs(results: dict[str, Any]) -> None:
-    text = DOCS.read_text()
-    head, rest = text.split(MARKERS[0], 1)
-    _, tail = rest.split(MARKERS[1], 1)
-    DOCS.write_text(f"{head}{MARKERS[0]}\n{table(results)}\n{MARKERS[1]}{tail}")
-
-
 # ---------------------------------------------------------------- the whole
 
 
@@ -229,7 +222,7 @@ def main() -> None:
     results = json.loads(RESULTS.read_text())
     print(table(results))
     if args.docs:
-        write_docs(results)
+        between_markers(DOCS, "expressivity", table(results))
 
 
 if __name__ == "__main__":

@@ -4,10 +4,10 @@
 
 DIR holds the numba study this backend grew out of (common.py, numk_fi.py): both draw the same primitives from the same camera,
 alternating in one process, and the ratio of their fastest rounds is printed (below 1 this backend is faster). Preparation and
-binning are inside on both sides; three colours, no depth. Absolute times are of this machine in its present mood: only ratios travel.
+binning are inside on both sides; a step is forward, backward and Adam on all parameters; three colours, no depth. Absolute times are of this machine in its present mood: only ratios travel.
 
-Flops are counted by one rule on both sides: 420 per evaluated lane forward, 1,100 backward (K = 8). --record adds the result to
-benchmarks/results/render.json.
+Flops are counted by one rule: 420 per evaluated lane forward, 1,100 backward (K = 8). --record writes the result to
+benchmarks/results/render.json and docs/performance.md.
 """
 
 from __future__ import annotations
@@ -24,17 +24,22 @@ from typing import Any
 import numpy as np
 import torch
 from numba import njit
+from static_quality import cpu_name
+from tables import PERFORMANCE, Table, between_markers
 
 from neuprim.core.cameras import Camera
 from neuprim.core.fields import Constant, Cosine
 from neuprim.core.geometry import Geometry
 from neuprim.core.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
+from neuprim.core.render.cpu import layout
 from neuprim.core.render.cpu.layout import SPAN_WIDTH, gradient_width, row_width
+from neuprim.core.schema import ParameterSpec
+from neuprim.core.train.optimizer import RowAdam
 
 RESULTS = Path(__file__).parent / "results" / "render.json"
 FLOPS = {"forward": 420, "backward": 1100}
-Pair = tuple[Callable[[], Any], Callable[[], Any]]
+Passes = tuple[Callable[[], None], Callable[[], None], Callable[[], None]]
 
 
 def random_scene(count: int, seed: int = 0, overlap: float = 30.0, rate: float = 4.0) -> dict[str, torch.Tensor]:
@@ -92,71 +97,83 @@ def _count_hits(E0, EX, EY, XA, tc, anchor, boxes):  # type: ignore[no-untyped-d
 
 
 def true_hits(lowered: Lowered, camera: Camera) -> int:
-    """Rays that really meet a primitive, of all (pixel, primitive) pairs."""
-    from neuprim.core.render.cpu import layout
-    from neuprim.core.render.cpu.backend import _Rasterize  # the frame a forward pass keeps
-
-    g, d = lowered.geometry, lowered.density
-    assert isinstance(d, Cosine) and isinstance(lowered.colour, Constant)
-    out = render_lowered(lowered, camera, RenderSettings(backend="cpu"), torch.zeros(3))
-    node = out.rgb.grad_fn
-    while node is not None and not hasattr(node, "frame"):
+    """Rays that really meet a primitive, of all (pixel, primitive) pairs; counted in the frame that a forward pass keeps."""
+    node = render_lowered(lowered, camera, RenderSettings(backend="cpu"), torch.zeros(3)).rgb.grad_fn
+    while not hasattr(node, "frame"):
+        assert node is not None, "the backend keeps its frame in the graph"
         node = node.next_functions[0][0]
-    assert node is not None, _Rasterize
-    frame = node.frame  # type: ignore[attr-defined]
+    frame = node.frame
     rows = frame.rows.astype(np.float64)
     parts = [rows[:, c : c + 3] for c in (layout.E0, layout.EX, layout.EY, layout.XA)]
-    del g, d
     return int(_count_hits(*parts, rows[:, layout.TC], rows[:, [layout.UX, layout.UY]], frame.boxes))
 
 
-def ours(lowered: Lowered, camera: Camera, threads: int) -> tuple[Pair, dict[str, int]]:
+def ours(lowered: Lowered, camera: Camera, threads: int) -> tuple[Passes, dict[str, int]]:
     settings, background = RenderSettings(backend="cpu", threads=threads), torch.zeros(3)
     g_rgb = torch.ones(camera.height, camera.width, 3)
     kept = render_lowered(lowered, camera, settings, background)
-    leaves = [lowered.geometry.means, lowered.geometry.log_scales, lowered.geometry.quats, lowered.colour.rgb]  # type: ignore[union-attr]
-    leaves += [lowered.density.W1, lowered.density.b1, lowered.density.w2, lowered.density.b2]  # type: ignore[union-attr]
+    g, d, c = lowered.geometry, lowered.density, lowered.colour
+    assert isinstance(d, Cosine) and isinstance(c, Constant)
+    params = {"means": g.means, "log_scales": g.log_scales, "quats": g.quats, "W1": d.W1, "b1": d.b1, "w2": d.w2, "b2": d.b2, "rgb": c.rgb}
+    specs = [ParameterSpec(n, tuple(v.shape[1:]), 0.0, lambda context: torch.empty(0)) for n, v in params.items()]
+    adam = RowAdam(specs, params)
 
     def forward() -> None:
         with torch.no_grad():
             render_lowered(lowered, camera, settings, background)
 
     def backward() -> None:
-        torch.autograd.grad(kept.rgb, leaves, g_rgb, retain_graph=True)
+        torch.autograd.grad(kept.rgb, list(params.values()), g_rgb, retain_graph=True)
+
+    def step() -> None:
+        for value in params.values():
+            value.grad = None
+        render_lowered(lowered, camera, settings, background).rgb.backward(g_rgb)
+        adam.step(params, dict.fromkeys(params, 0.0))  # the scene stays as it is
 
     backward()
-    lanes = {k: int(kept.stats.extra[f"{k}_lanes"]) for k in FLOPS}
-    return (forward, backward), {**lanes, "pairs": kept.stats.pairs}
+    lanes = {k: int(kept.stats.extra[f"{k}_lanes"]) for k in ("forward", "backward")}
+    return (forward, backward, step), {**lanes, "pairs": kept.stats.pairs}
 
 
-def study(folder: Path, p: dict[str, torch.Tensor], size: int, threads: int) -> Pair:
-    """The study's preparation (torch, float64), binning (numpy) and kernels (numba)."""
+def study(folder: Path, p: dict[str, torch.Tensor], size: int, threads: int) -> Passes:
+    """The study's preparation (torch), binning (numpy), kernels (numba) and torch's Adam, on float32 parameters."""
     sys.path.insert(0, str(folder))
     import common
     import numk_fi
 
     cam = common.camera(size, size)
     g_rgb = np.ones((size, size, 3), np.float32)
-    leaves = {k: v.clone().requires_grad_() for k, v in p.items()}
+    leaves = {k: v.float().requires_grad_() for k, v in p.items()}
+    adam = torch.optim.Adam(leaves.values(), lr=0.0)
 
-    def forward() -> Any:
-        with torch.no_grad():
-            rows, centre = common.preprocess(p, cam)
-            kernel = numk_fi.K().setup(rows, common.bounds(p, cam), centre, cam)
+    def draw() -> tuple[Any, torch.Tensor]:
+        rows, centre = common.preprocess(leaves, cam)
+        kernel = numk_fi.K().setup(rows, common.bounds(leaves, cam), centre, cam)
         kernel.fwd(threads)
-        return kernel
+        return kernel, rows
 
-    rows, _ = common.preprocess(leaves, cam)
-    kept = forward()
+    def forward() -> None:
+        with torch.no_grad():
+            draw()
+
+    kept, kept_rows = draw()
 
     def backward() -> None:
         kept.bwd(g_rgb, threads)
-        torch.autograd.grad(rows, list(leaves.values()), torch.from_numpy(kept.G), retain_graph=True)
+        torch.autograd.grad(kept_rows, list(leaves.values()), torch.from_numpy(kept.G), retain_graph=True)
 
-    return forward, backward
+    def step() -> None:
+        adam.zero_grad()
+        kernel, rows = draw()
+        kernel.bwd(g_rgb, threads)
+        rows.backward(torch.from_numpy(kernel.G))
+        adam.step()
+
+    return forward, backward, step
 
 
-def fastest(pairs: list[Callable[[], Any]], rounds: int) -> list[float]:
+def fastest(pairs: list[Callable[[], None]], rounds: int) -> list[float]:
     """Fastest of ``rounds`` runs of each, taken in turns so that all meet the same noise; one run each beforehand."""
     for run in pairs:
         run()
@@ -180,12 +197,12 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     rows = []
-    print(
-        f"rate {args.rate} rad per axis; per primitive {4 * row_width(8) + 4 * SPAN_WIDTH} bytes of rows and spans, per pair 8 bytes, ",
-        end="",
+    memory = (
+        f"Per primitive {4 * row_width(8) + 4 * SPAN_WIDTH} bytes of rows and spans and per pair 8 bytes of lists; a backward pass takes "
+        f"{4 * gradient_width(8, 3)} bytes more for each (K = 8, three colours)."
     )
-    print(f"with gradients {4 * gradient_width(8, 3)} bytes more per pair and per primitive (K = 8)")
-    print("| scene | threads | pass | ms | ns/lane | lanes/hit | GFLOP/s | ratio |\n| --- | --- | --- | --- | --- | --- | --- | --- |")
+    print(memory)
+    table = Table("scene", "largest rate", "threads", "pass", "ms", "ns/lane", "lanes/hit", "GFLOP/s", "ratio")
     for text in args.scenes:
         count, size = (int(x) for x in text.split("x"))
         p, camera = random_scene(count, rate=args.rate), view(size)
@@ -194,22 +211,22 @@ def main() -> None:
         for threads in args.threads:
             mine, counts = ours(lowered, camera, threads)
             other = study(args.against, p, size, threads) if args.against else None
-            for i, name in enumerate(FLOPS):
+            for i, name in enumerate((*FLOPS, "step")):
                 times = fastest([mine[i], *([other[i]] if other else [])], args.rounds)
-                lanes = counts[name]
                 row: dict[str, Any] = {"scene": text, "rate": args.rate, "threads": threads, "pass": name, "ms": times[0] * 1e3}
-                row |= {"ns_per_lane": times[0] / lanes * 1e9 * threads, "lanes_per_hit": lanes / hits}
-                row |= {"gflops": lanes * FLOPS[name] / times[0] / 1e9, "ratio": times[0] / times[1] if other else None}
+                row["ratio"] = times[0] / times[1] if other else None
+                lanes = counts["forward"] + counts["backward"] if name == "step" else counts[name]
+                flops = sum(counts[k] * FLOPS[k] for k in FLOPS) if name == "step" else lanes * FLOPS[name]
+                row |= {"ns_per_lane": times[0] / lanes * 1e9 * threads, "lanes_per_hit": counts["forward"] / hits}
+                row["gflops"] = flops / times[0] / 1e9
                 ratio = "" if row["ratio"] is None else f"{row['ratio']:.2f}"
-                print(
-                    f"| {text} | {threads} | {name} | {row['ms']:.1f} | {row['ns_per_lane']:.1f} | {row['lanes_per_hit']:.2f} "
-                    f"| {row['gflops']:.0f} | {ratio} |",
-                    flush=True,
-                )
+                cells = (f"{row['ms']:.1f}", f"{row['ns_per_lane']:.1f}", f"{row['lanes_per_hit']:.2f}", f"{row['gflops']:.0f}", ratio)
+                table.row(text, f"{args.rate:g}", threads, name, *cells)
                 rows.append(row)
     if args.record:
         RESULTS.parent.mkdir(exist_ok=True)
-        RESULTS.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
+        RESULTS.write_text(json.dumps({"cpu": cpu_name(), "against": bool(args.against), "rows": rows}, indent=1) + "\n")
+        between_markers(PERFORMANCE, "render", f"{table}\n\n{cpu_name()}. {memory}")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
 
 Random scenes whose primitives shrink as they multiply, so that a ray meets about the same number of them ("overlap": how many
 times they would cover the unit cube's face). Every point is the fastest of a few frames. Times are of this machine; the shape of
-the curves is what travels. --record writes benchmarks/results/scaling.json and docs/pictures/scaling.png.
+the curves is what travels. --record writes benchmarks/results/scaling.json, docs/performance.md and docs/pictures/scaling.png.
 """
 
 from __future__ import annotations
@@ -21,9 +21,12 @@ from typing import Any
 
 import torch
 from render import lower, random_scene, view
+from static_quality import cpu_name
+from tables import PERFORMANCE, Table, between_markers
 
 from neuprim.core.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
+from neuprim.core.render.cpu.threads import core_count
 
 HERE = Path(__file__).parent
 RESULTS, PICTURE = HERE / "results" / "scaling.json", HERE.parent / "docs" / "pictures" / "scaling.png"
@@ -67,7 +70,7 @@ def _peak() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def series(points: list[tuple[int, int, float]], label: str, threads: int) -> list[dict[str, Any]]:
+def series(points: list[tuple[int, int, float]], label: str, threads: int, table: Table) -> list[dict[str, Any]]:
     rows = []
     for count, size, overlap in points:
         lowered = lower(random_scene(count, overlap=overlap))
@@ -116,20 +119,24 @@ def main() -> None:
     if args.one:
         one_frame(args.one[0], args.one[1], bool(args.one[2]), args.threads)
         return
-    print(
-        "| series | primitives | image | overlap | pairs | forward ms | forward + backward ms |\n| --- | --- | --- | --- | --- | --- | --- |"
-    )
+    table = Table("series", "primitives", "image", "overlap", "pairs", "forward ms", "forward + backward ms")
     counts = [n for n in (1000, 3000, 10_000, 30_000, 100_000, 300_000, 1_000_000) if n <= args.most]
-    rows = series([(n, 400, 30.0) for n in counts], "primitives", args.threads)
-    rows += series([(20_000, s, 30.0) for s in (100, 200, 400, 800)], "pixels", args.threads)
-    rows += series([(20_000, 400, o) for o in (3.0, 10.0, 30.0, 100.0)], "overlap", args.threads)
-    peaks = {f"{n}x800 {'forward' if not b else 'both'}": memory(n, 800, b, args.threads) for n in (1000, args.most) for b in (False, True)}
+    rows = series([(n, 400, 30.0) for n in counts], "primitives", args.threads, table)
+    rows += series([(20_000, s, 30.0) for s in (100, 200, 400, 800)], "pixels", args.threads, table)
+    rows += series([(20_000, 400, o) for o in (3.0, 10.0, 30.0, 100.0)], "overlap", args.threads, table)
+    peaks = {
+        f"{n} primitives at 800x800, {'forward and backward' if b else 'forward'}": memory(n, 800, b, args.threads)
+        for n in (1000, args.most)
+        for b in (False, True)
+    }
+    memories = Table("peak memory of a process that draws", "GB")
     for name, peak in peaks.items():
-        print(f"peak memory {name}: {peak / 1e9:.2f} GB")
+        memories.row(name, f"{peak / 1e9:.2f}")
     if args.record:
         RESULTS.parent.mkdir(exist_ok=True)
         RESULTS.write_text(json.dumps({"rows": rows, "peak_bytes": peaks}, indent=1) + "\n")
         draw(rows)
+        between_markers(PERFORMANCE, "scaling", f"{memories}\n\nTimes on {core_count()} threads of {cpu_name()}.\n\n{table}")
     worst = max(peaks.values())
     if worst > MEMORY_BOUND:
         raise SystemExit(f"peak memory {worst / 1e9:.2f} GB exceeds {MEMORY_BOUND / 1e9:g} GB")

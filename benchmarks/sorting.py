@@ -6,8 +6,8 @@ Draws a random scene of overlapping primitives (benchmarks/render.py) and, with 
 test views. Errors are those of an image ``size`` pixels wide against the marched sum of densities (neuprim.core.render.joint):
 "order" keeps every primitive's opacity, so that only the order differs; "field" is the sum of the densities as they are, clamped
 at zero, so that it also counts the renderer's clamps and cuts. Times are ratios to sort=center at the full size, the fastest of
-``rounds``, taken in turns in one process; the backward column is the backward pass alone. --record adds the table to
-benchmarks/results/sorting.json.
+``rounds``, taken in turns in one process; the backward column is the backward pass alone. --record writes the table to
+benchmarks/results/sorting.json and docs/performance.md.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from typing import Any
 
 import torch
 from render import fastest, lower, random_scene, view
+from tables import PERFORMANCE, Table, between_markers
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
@@ -87,9 +88,7 @@ def main() -> None:
     if args.run:
         scenes[f"run {args.run.name}, view {args.view}"] = from_run(args.run, args.view)
     rows = []
-    print(
-        "| scene | drawn with | order: PSNR, mean abs | field: PSNR, mean abs | forward | backward |\n| --- | --- | --- | --- | --- | --- |"
-    )
+    table = Table("scene", "drawn with", "order: PSNR, mean abs", "field: PSNR, mean abs", "forward", "backward")
     for name, (lowered, camera, background) in scenes.items():
         small = camera.resized(args.size, max(1, round(camera.height * args.size / camera.width)))
         order, field = (sorting_errors(lowered, small, settings, background, args.steps, keep) for keep in ("opacity", "density"))
@@ -101,11 +100,12 @@ def main() -> None:
                 found = [e[settings.sort if "sort" not in knobs else knobs["sort"]] for e in (order, field)]
                 cells = [f"{e.psnr:.2f} dB, {e.mean_abs:.5f}" for e in found]
                 row |= {k: {"psnr": e.psnr, "mean_abs": e.mean_abs} for k, e in zip(("order", "field"), found, strict=True)}
-            print(f"| {name} | {variant} | {cells[0]} | {cells[1]} | {row['forward']:.2f} | {row['backward']:.2f} |", flush=True)
+            table.row(name, variant, *cells, f"{row['forward']:.2f}", f"{row['backward']:.2f}")
             rows.append(row)
     if args.record:
         RESULTS.parent.mkdir(exist_ok=True)
         RESULTS.write_text(json.dumps({"size": args.size, "steps": args.steps, "rows": rows}, indent=1) + "\n")
+        between_markers(PERFORMANCE, "sorting", str(table))
 
 
 if __name__ == "__main__":

@@ -19,10 +19,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from tables import ROOT, between_markers
+
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "static_quality.json"
 ROWS = ("1000x60", "2000x60", "5000x120", "5000x300", "2000x60xK0", "5000x120xK0")
-MARKERS = ("<!-- static-quality -->", "<!-- /static-quality -->")
 
 
 def one_run(scene: Path, primitives: int, seconds: int, neurons: int, seed: int) -> dict[str, Any]:
@@ -98,11 +99,7 @@ def main() -> None:
             print(table(results), flush=True)
     results = json.loads(RESULTS.read_text())
     if args.readme:
-        readme = HERE.parent / "README.md"
-        text = readme.read_text()
-        head, rest = text.split(MARKERS[0], 1)
-        _, tail = rest.split(MARKERS[1], 1)
-        readme.write_text(f"{head}{MARKERS[0]}\n{table(results)}\n{MARKERS[1]}{tail}")
+        between_markers(ROOT / "README.md", "static-quality", table(results))
     elif not args.scene:
         print(table(results))
 

@@ -1,0 +1,32 @@
+"""Tables in README and docs: printed as they grow, and put between their markers so that no number is typed by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PERFORMANCE = ROOT / "docs" / "performance.md"
+
+
+def between_markers(page: Path, name: str, text: str) -> None:
+    """Replace what stands between <!-- name --> and <!-- /name -->."""
+    first, last = f"<!-- {name} -->", f"<!-- /{name} -->"
+    head, rest = page.read_text().split(first, 1)
+    _, tail = rest.split(last, 1)
+    page.write_text(f"{head}{first}\n{text.rstrip()}\n{last}{tail}")
+
+
+class Table:
+    """A Markdown table that prints every row as it comes."""
+
+    def __init__(self, *columns: str) -> None:
+        self.lines: list[str] = []
+        self.row(*columns)
+        self.row(*["---"] * len(columns))
+
+    def row(self, *cells: object) -> None:
+        self.lines.append("| " + " | ".join(str(c) for c in cells) + " |")
+        print(self.lines[-1], flush=True)
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines)

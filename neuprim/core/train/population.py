@@ -149,13 +149,12 @@ class Gradient(Population):
         super().__init__(settings)
         self.total: Tensor | None = None
         self.seen: Tensor | None = None
-        self.views = 0
 
     def observe(self, model: Primitives, stats: RenderStats) -> None:
         if stats.weight is None:
             return
         if self.total is None or self.seen is None:
-            self.total, self.seen, self.views = torch.zeros(model.count), torch.zeros(model.count), 0
+            self.total, self.seen = torch.zeros(model.count), torch.zeros(model.count)
         saw = stats.weight > 0
         norm = torch.zeros(model.count)
         for name in model.of(model.density):
@@ -164,7 +163,6 @@ class Gradient(Population):
                 norm += grad.reshape(model.count, -1).norm(dim=1)
         self.total += torch.where(saw, norm, torch.zeros_like(norm))
         self.seen += saw
-        self.views += 1
 
     def intervene(self, model: Primitives, extent: float) -> Change | None:
         if self.total is None or self.seen is None:
@@ -205,12 +203,11 @@ class Gradient(Population):
     def state(self) -> dict[str, Tensor]:
         if self.total is None or self.seen is None:
             return {}
-        return {"total": self.total, "seen": self.seen, "views": torch.tensor(self.views)}
+        return {"total": self.total, "seen": self.seen}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         self.total = state["total"].clone() if "total" in state else None
         self.seen = state["seen"].clone() if "seen" in state else None
-        self.views = int(state["views"]) if "views" in state else 0
 
 
 def make_population(settings: PopulationSettings) -> Population:

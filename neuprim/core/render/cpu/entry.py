@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from neuprim.core.render.cpu.backward import chord_gradient, field_gradient, opacity, two_neurons
 from neuprim.core.render.cpu.backward import neurons_fast as slopes_fast
 from neuprim.core.render.cpu.backward import neurons_medium as slopes_medium
 from neuprim.core.render.cpu.backward import neurons_slow as slopes_slow
+from neuprim.core.render.cpu.backward import opacity
 from neuprim.core.render.cpu.compile import inline, kernel
 from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH, delicate_chords, delicate_neurons, delicate_slopes
 from neuprim.core.render.cpu.forward import neurons_fast, neurons_medium, neurons_slow
+from neuprim.core.render.cpu.gradients import chord_gradient, field_gradient, two_neurons
 from neuprim.core.render.cpu.layout import (
     ALPHA,
     ANCHOR_Z,

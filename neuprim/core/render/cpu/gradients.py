@@ -1,0 +1,162 @@
+"""From dL/d(2 FIELD HALF) of every lane back to one gradient row: shared by both orders of compositing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neuprim.core.render.cpu.compile import inline
+from neuprim.core.render.cpu.layout import (
+    AMPLITUDE,
+    DH,
+    DU,
+    DV,
+    E0,
+    EX,
+    EXL,
+    EY,
+    EYL,
+    EZL,
+    FIELD,
+    G_LOG_M,
+    G_NEURONS,
+    G_OFFSET,
+    GEX,
+    GEY,
+    GEZ,
+    GF,
+    GMID,
+    GQX,
+    GQY,
+    GQZ,
+    GRAD,
+    HALF,
+    HEIGHT,
+    IA,
+    MID,
+    N_COS,
+    N_DSINC,
+    N_SIN,
+    NEURONS,
+    PER_NEURON,
+    PHASE,
+    PX,
+    PY,
+    PZ,
+    QX,
+    QY,
+    QZ,
+    SLIDE,
+    TC,
+    TM,
+    UNCUT,
+    WX,
+    WY,
+    WZ,
+    XA,
+)
+
+__all__ = ["chord_gradient", "field_gradient", "two_neurons"]
+
+f = np.float32
+
+
+@inline
+def field_gradient(S, n, out):  # type: ignore[no-untyped-def]
+    """From dL/d(2 FIELD HALF) to dL/d FIELD, and the sums for b2 and log m."""
+    offset, log_m = f(0), f(0)
+    for k in range(n):
+        g = f(2) * S[GRAD + k]
+        gf = g * S[HALF + k]
+        S[GRAD + k], S[GF + k] = g, gf
+        offset += gf
+        log_m += gf * S[FIELD + k]
+        S[GQX + k], S[GQY + k], S[GQZ + k] = f(0), f(0), f(0)
+        S[GEX + k], S[GEY + k], S[GEZ + k] = f(0), f(0), f(0)
+    out[G_OFFSET], out[G_LOG_M] = offset, log_m
+
+
+@inline
+def two_neurons(S, V0, V1, n, p, m, out):  # type: ignore[no-untyped-def]
+    """Gradients of neurons m and m + 1, and their share of dL/dQ and dL/d(half e); two at a time to share the loads."""
+    o = NEURONS + PER_NEURON * m
+    ax, ay, az, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + AMPLITUDE]
+    o2 = o + PER_NEURON
+    bx, by, bz, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + AMPLITUDE]
+    s0, s1, s2, s3, s4 = f(0), f(0), f(0), f(0), f(0)
+    r0, r1, r2, r3, r4 = f(0), f(0), f(0), f(0), f(0)
+    for k in range(n):
+        gf, half = S[GF + k], S[HALF + k]
+        qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
+        ex, ey, ez = S[EXL + k] * half, S[EYL + k] * half, S[EZL + k] * half
+        s0 += gf * V0[N_COS + k]
+        u = gf * aa * V0[N_SIN + k]
+        v = gf * aa * V0[N_DSINC + k]
+        s1 += u
+        s2 += u * qx + v * ex
+        s3 += u * qy + v * ey
+        s4 += u * qz + v * ez
+        r0 += gf * V1[N_COS + k]
+        u1 = gf * ba * V1[N_SIN + k]
+        v1 = gf * ba * V1[N_DSINC + k]
+        r1 += u1
+        r2 += u1 * qx + v1 * ex
+        r3 += u1 * qy + v1 * ey
+        r4 += u1 * qz + v1 * ez
+        S[GQX + k] += u * ax + u1 * bx
+        S[GQY + k] += u * ay + u1 * by
+        S[GQZ + k] += u * az + u1 * bz
+        S[GEX + k] += v * ax + v1 * bx
+        S[GEY + k] += v * ay + v1 * by
+        S[GEZ + k] += v * az + v1 * bz
+    o, o2 = G_NEURONS + PER_NEURON * m, G_NEURONS + PER_NEURON * (m + 1)
+    out[o + AMPLITUDE], out[o + PHASE], out[o + WX], out[o + WY], out[o + WZ] = s0, s1, s2, s3, s4
+    out[o2 + AMPLITUDE], out[o2 + PHASE], out[o2 + WX], out[o2 + WY], out[o2 + WZ] = r0, r1, r2, r3, r4
+
+
+@inline
+def chord_gradient(S, n, p, out):  # type: ignore[no-untyped-def]
+    """From chord middle, half chord and direction back to the affine ray (E0, EX, EY, XA)."""
+    tc = p[TC]
+    a0, a1, a2, a3, a4, a5 = f(0), f(0), f(0), f(0), f(0), f(0)
+    a6, a7, a8, a9, b0, b1 = f(0), f(0), f(0), f(0), f(0), f(0)
+    for k in range(n):
+        half, ex, ey, ez = S[HALF + k], S[EXL + k], S[EYL + k], S[EZL + k]
+        mid, tm, ia, uncut, dh = S[MID + k], S[TM + k], S[IA + k], S[UNCUT + k], S[DH + k]
+        px, py, pz, h, slide = S[PX + k], S[PY + k], S[PZ + k], S[HEIGHT + k], S[SLIDE + k]
+        gqx, gqy, gqz = S[GQX + k], S[GQY + k], S[GQZ + k]
+        vx, vy, vz = S[GEX + k], S[GEY + k], S[GEZ + k]
+        g_half = vx * ex + vy * ey + vz * ez + S[GRAD + k] * S[FIELD + k]
+        gex, gey, gez = vx * half + mid * gqx, vy * half + mid * gqy, vz * half + mid * gqz
+        g_mid = gqx * ex + gqy * ey + gqz * ez + S[GMID + k]
+        gt1 = (g_mid + g_half) * f(0.5)
+        gt0 = (g_mid - g_half) * f(0.5) * uncut
+        g_tm, g_h = gt0 + gt1, gt1 - gt0  # t0 = tm - h, t1 = tm + h
+        gD = g_h * dh  # dh/dD with D floored
+        gA = -(g_h * h * f(0.5) + g_tm * tm) * ia  # via a = e.e, h = sqrt(D/a), tm = -(m.e)/a
+        gB = -g_tm * ia
+        m2 = f(-2) * gD  # D = 1 - |p|^2, and |p| = |m + tm e| does not change with tm
+        gmx, gmy, gmz = gqx + m2 * px + gB * ex, gqy + m2 * py + gB * ey, gqz + m2 * pz + gB * ez
+        # the ray's origin is m = p - tm e
+        gA2 = f(2) * gA - gB * tm
+        gp = tm * m2 + gB
+        gex += gp * px + gA2 * ex
+        gey += gp * py + gA2 * ey
+        gez += gp * pz + gA2 * ez
+        du, dv, reach = S[DU + k], S[DV + k], tc + slide
+        hx, hy, hz = gex + reach * gmx, gey + reach * gmy, gez + reach * gmz
+        a0 += gex + slide * gmx
+        a1 += gey + slide * gmy
+        a2 += gez + slide * gmz
+        a3 += du * hx
+        a4 += du * hy
+        a5 += du * hz
+        a6 += dv * hx
+        a7 += dv * hy
+        a8 += dv * hz
+        a9 += gmx
+        b0 += gmy
+        b1 += gmz
+    out[E0], out[E0 + 1], out[E0 + 2] = a0, a1, a2
+    out[EX], out[EX + 1], out[EX + 2] = a3, a4, a5
+    out[EY], out[EY + 1], out[EY + 2] = a6, a7, a8
+    out[XA], out[XA + 1], out[XA + 2] = a9, b0, b1

@@ -9,18 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.render.cpu.compile import exact_kernel, inline, kernel
-from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH, delicate_chords, delicate_slopes
+from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH
 from neuprim.core.render.cpu.gradients import chord_gradient, field_gradient, two_neurons
 from neuprim.core.render.cpu.layout import (
     ALPHA,
-    AMPLITUDE,
     ANCHOR_Z,
     BACKWARD_SCRATCH,
     BEHIND,
     ERR,
-    EXL,
-    EYL,
-    EZL,
     FIELD,
     G_COLOR,
     G_ERROR,
@@ -31,84 +27,30 @@ from neuprim.core.render.cpu.layout import (
     GZ,
     HALF,
     LAST,
-    MEDIUM,
     MID,
-    N_COS,
-    N_DSINC,
-    N_SIN,
     NEURON_SCRATCH,
-    NEURONS,
     NORM,
     NORM_L,
     OVER,
     PER_NEURON,
-    PHASE,
     PIXELS,
-    QX,
-    QY,
-    QZ,
     SLIDE,
     SLOPE,
-    SLOW,
     T_,
     TILE,
     UNIT,
     UX,
     UY,
-    WX,
-    WY,
-    WZ,
 )
-from neuprim.core.render.cpu.tiles import chords, compact, row_spans
-from neuprim.core.render.cpu.turns import TAU, cos_turns, one_minus_exp, sinc_turns, slopes_fast, slopes_medium, slopes_slow
+from neuprim.core.render.cpu.neurons import field_with_slopes
+from neuprim.core.render.cpu.tiles import compact, row_spans
+from neuprim.core.render.cpu.turns import one_minus_exp
 
-__all__ = [
-    "backward_tiles",
-    "neurons_fast",
-    "neurons_medium",
-    "neurons_slow",
-    "opacity",
-    "sum_rows",
-]
+__all__ = ["backward_tiles", "opacity", "sum_rows"]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(TILE).astype(np.float32)
-
-
-def _neurons(slopes):  # type: ignore[no-untyped-def]
-    """Forward value of two neurons, and the three products of each that the gradients need, with the sinc of their range of rates."""
-
-    @inline
-    def add(S, V0, V1, n, p, o):  # type: ignore[no-untyped-def]
-        ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
-        o2 = o + PER_NEURON
-        bx, by, bz, bb, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + PHASE], p[o2 + AMPLITUDE]
-        for k in range(n):
-            half = S[HALF + k]
-            ex, ey, ez = S[EXL + k], S[EYL + k], S[EZL + k]
-            qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
-            v = (ex * ax + ey * ay + ez * az) * half
-            u = qx * ax + qy * ay + qz * az + ab
-            r = u - np.rint(u)
-            v1 = (ex * bx + ey * by + ez * bz) * half
-            u1 = qx * bx + qy * by + qz * bz + bb
-            r1 = u1 - np.rint(u1)
-            sinc, slope, sinc1, slope1 = slopes(v, v1)
-            z, z1 = r * r, r1 * r1
-            c, c1 = cos_turns(z), cos_turns(z1)
-            V0[N_COS + k] = c * sinc
-            V0[N_SIN + k] = -TAU * TAU * r * sinc_turns(z) * sinc
-            V0[N_DSINC + k] = c * slope
-            V1[N_COS + k] = c1 * sinc1
-            V1[N_SIN + k] = -TAU * TAU * r1 * sinc_turns(z1) * sinc1
-            V1[N_DSINC + k] = c1 * slope1
-            S[FIELD + k] += c * sinc * aa + c1 * sinc1 * ba
-
-    return add
-
-
-neurons_slow, neurons_medium, neurons_fast = _neurons(slopes_slow), _neurons(slopes_medium), _neurons(slopes_fast)
 
 
 @inline
@@ -256,20 +198,7 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                 continue
             n16 = ((n + 15) // 16) * 16
             evaluated += n16
-            if slots[i] >= 0:
-                exact = wide[slots[i]]
-                delicate_chords(S, D, bounds, y0, y1, tx, ty, n16, exact, floor, False, True)
-                delicate_slopes(S, D, V, n16, exact, neurons)
-            else:
-                chords(S, n16, p, floor, False, True)
-                for m in range(0, neurons, 2):
-                    o = NEURONS + PER_NEURON * m
-                    if kinds[i, m // 2] == MEDIUM:
-                        neurons_medium(S, V[m], V[m + 1], n16, p, o)
-                    elif kinds[i, m // 2] == SLOW:
-                        neurons_slow(S, V[m], V[m + 1], n16, p, o)
-                    else:
-                        neurons_fast(S, V[m], V[m + 1], n16, p, o)
+            field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor)
             opacity(S, n16, amin, amax)
             for k in range(n, n16):
                 S[GRAD + k] = f(0)

@@ -13,13 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from neuprim.core.render.cpu.backward import neurons_fast as slopes_fast
-from neuprim.core.render.cpu.backward import neurons_medium as slopes_medium
-from neuprim.core.render.cpu.backward import neurons_slow as slopes_slow
 from neuprim.core.render.cpu.backward import opacity
 from neuprim.core.render.cpu.compile import inline, kernel
-from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH, delicate_chords, delicate_neurons, delicate_slopes
-from neuprim.core.render.cpu.forward import neurons_fast, neurons_medium, neurons_slow
+from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH
 from neuprim.core.render.cpu.gradients import chord_gradient, field_gradient, two_neurons
 from neuprim.core.render.cpu.layout import (
     ALPHA,
@@ -31,23 +27,21 @@ from neuprim.core.render.cpu.layout import (
     GMID,
     GRAD,
     HALF,
-    MEDIUM,
     MID,
     NEURON_SCRATCH,
-    NEURONS,
     NORM,
     PER_NEURON,
     PIXELS,
     SLIDE,
     SLOPE,
-    SLOW,
     TILE,
     UNCUT,
     UNIT,
     UX,
     UY,
 )
-from neuprim.core.render.cpu.tiles import chords, compact, row_spans
+from neuprim.core.render.cpu.neurons import field_values, field_with_slopes
+from neuprim.core.render.cpu.tiles import compact, row_spans
 
 __all__ = ["backward_tiles_by_entry", "composite_tiles_by_entry"]
 
@@ -103,20 +97,7 @@ def _list_hits(  # type: ignore[no-untyped-def]
             continue
         n16 = ((n + 15) // 16) * 16
         evaluated += n16
-        if slots[i] >= 0:
-            exact = wide[slots[i]]
-            delicate_chords(S, D, bounds, y0, y1, tx, ty, n16, exact, floor, False, True)
-            delicate_neurons(S, D, n16, exact, neurons)
-        else:
-            chords(S, n16, p, floor, False, True)
-            for m in range(0, neurons, 2):
-                o = NEURONS + PER_NEURON * m
-                if kinds[i, m // 2] == MEDIUM:
-                    neurons_medium(S, n16, p, o)
-                elif kinds[i, m // 2] == SLOW:
-                    neurons_slow(S, n16, p, o)
-                else:
-                    neurons_fast(S, n16, p, o)
+        field_values(S, D, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, False, True)
         opacity(S, n16, amin, amax)
         anchor, unit = p[ANCHOR_Z], p[UNIT]
         for y in range(y0, y1):
@@ -307,20 +288,7 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
             n, y0, y1 = _lanes_of(S, state, offset, bounds, rows_live, spans[i], boxes[i], p, tx, ty)
             n16 = ((n + 15) // 16) * 16
             evaluated += n16
-            if slots[i] >= 0:
-                exact = wide[slots[i]]
-                delicate_chords(S, D, bounds, y0, y1, tx, ty, n16, exact, floor, False, True)
-                delicate_slopes(S, D, V, n16, exact, neurons)
-            else:
-                chords(S, n16, p, floor, False, True)
-                for m in range(0, neurons, 2):
-                    o = NEURONS + PER_NEURON * m
-                    if kinds[i, m // 2] == MEDIUM:
-                        slopes_medium(S, V[m], V[m + 1], n16, p, o)
-                    elif kinds[i, m // 2] == SLOW:
-                        slopes_slow(S, V[m], V[m + 1], n16, p, o)
-                    else:
-                        slopes_fast(S, V[m], V[m + 1], n16, p, o)
+            field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor)
             for k in range(n16):
                 S[GRAD + k], S[GMID + k] = f(0), f(0)
             for s in range(starts_of[q - first], starts_of[q - first + 1]):

@@ -5,77 +5,36 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.render.cpu.compile import inline, kernel
-from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH, delicate_chords, delicate_neurons
+from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH
 from neuprim.core.render.cpu.layout import (
     ALPHA,
-    AMPLITUDE,
     ANCHOR_Z,
     COLOR,
-    EXL,
-    EYL,
-    EZL,
     FIELD,
     FORWARD_SCRATCH,
     HALF,
     LAST,
-    MEDIUM,
     MID,
-    NEURONS,
     NORM,
     NORM_L,
-    PER_NEURON,
-    PHASE,
     PIXELS,
-    QX,
-    QY,
-    QZ,
-    SLOW,
     T_,
     TILE,
     UNIT,
     UX,
     UY,
-    WX,
-    WY,
-    WZ,
     ZSUM,
 )
-from neuprim.core.render.cpu.tiles import chords, compact, row_spans
-from neuprim.core.render.cpu.turns import cos_turns, one_minus_exp, sincs_fast, sincs_medium, sincs_slow
+from neuprim.core.render.cpu.neurons import field_values
+from neuprim.core.render.cpu.tiles import compact, row_spans
+from neuprim.core.render.cpu.turns import one_minus_exp
 
-__all__ = ["composite_tiles", "neurons_fast", "neurons_medium", "neurons_slow"]
+__all__ = ["composite_tiles"]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(TILE).astype(np.float32)
 _LIVE_EVERY = 4  # pairs between two counts of live pixels: a dead row costs a few lanes, a count costs a reduction per row
-
-
-def _neurons(sincs):  # type: ignore[no-untyped-def]
-    """FIELD += w2 cos(phase at the middle) sinc(rate x half chord) of two neurons, with the sinc of their range of rates."""
-
-    @inline
-    def add(S, n, p, o):  # type: ignore[no-untyped-def]
-        ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
-        o2 = o + PER_NEURON
-        bx, by, bz, bb, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + PHASE], p[o2 + AMPLITUDE]
-        for k in range(n):
-            half = S[HALF + k]
-            ex, ey, ez = S[EXL + k], S[EYL + k], S[EZL + k]
-            qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
-            v = (ex * ax + ey * ay + ez * az) * half
-            u = qx * ax + qy * ay + qz * az + ab
-            r = u - np.rint(u)
-            v1 = (ex * bx + ey * by + ez * bz) * half
-            u1 = qx * bx + qy * by + qz * bz + bb
-            r1 = u1 - np.rint(u1)
-            sinc, sinc1 = sincs(v, v1)
-            S[FIELD + k] += cos_turns(r * r) * sinc * aa + cos_turns(r1 * r1) * sinc1 * ba
-
-    return add
-
-
-neurons_slow, neurons_medium, neurons_fast = _neurons(sincs_slow), _neurons(sincs_medium), _neurons(sincs_fast)
 
 
 @inline
@@ -160,20 +119,7 @@ def composite_tiles(  # type: ignore[no-untyped-def]
             if n > 0:
                 n16 = ((n + 15) // 16) * 16
                 evaluated += n16
-                if slots[i] >= 0:
-                    exact = wide[slots[i]]
-                    delicate_chords(S, D, bounds, y0, y1, tx, ty, n16, exact, floor, with_depth, False)
-                    delicate_neurons(S, D, n16, exact, neurons)
-                else:
-                    chords(S, n16, p, floor, with_depth, False)
-                    for m in range(0, neurons, 2):
-                        o = NEURONS + PER_NEURON * m
-                        if kinds[i, m // 2] == MEDIUM:
-                            neurons_medium(S, n16, p, o)
-                        elif kinds[i, m // 2] == SLOW:
-                            neurons_slow(S, n16, p, o)
-                        else:
-                            neurons_fast(S, n16, p, o)
+                field_values(S, D, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, with_depth, False)
                 _opacity(S, n16, amin, amax)
                 rank = f(q - starts[t] + 1)
                 for y in range(y0, y1):

@@ -1,0 +1,149 @@
+"""A pair's field: the mean density over every lane's chord, and for the backward pass its slopes.
+
+What forward and backward, in either order of compositing, evaluate per (tile, primitive) pair once its pixels are gathered.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neuprim.core.render.cpu.compile import inline
+from neuprim.core.render.cpu.delicate import delicate_chords, delicate_neurons, delicate_slopes
+from neuprim.core.render.cpu.layout import (
+    AMPLITUDE,
+    EXL,
+    EYL,
+    EZL,
+    FIELD,
+    HALF,
+    MEDIUM,
+    N_COS,
+    N_DSINC,
+    N_SIN,
+    NEURONS,
+    PER_NEURON,
+    PHASE,
+    QX,
+    QY,
+    QZ,
+    SLOW,
+    WX,
+    WY,
+    WZ,
+)
+from neuprim.core.render.cpu.tiles import chords
+from neuprim.core.render.cpu.turns import (
+    TAU,
+    cos_turns,
+    sinc_turns,
+    sincs_fast,
+    sincs_medium,
+    sincs_slow,
+    slopes_fast,
+    slopes_medium,
+    slopes_slow,
+)
+
+__all__ = ["field_values", "field_with_slopes"]
+
+f = np.float32
+
+
+def _values(sincs):  # type: ignore[no-untyped-def]
+    """FIELD += w2 cos(phase at the middle) sinc(rate x half chord) of two neurons, with the sinc of their range of rates."""
+
+    @inline
+    def add(S, n, p, o):  # type: ignore[no-untyped-def]
+        ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
+        o2 = o + PER_NEURON
+        bx, by, bz, bb, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + PHASE], p[o2 + AMPLITUDE]
+        for k in range(n):
+            half = S[HALF + k]
+            ex, ey, ez = S[EXL + k], S[EYL + k], S[EZL + k]
+            qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
+            v = (ex * ax + ey * ay + ez * az) * half
+            u = qx * ax + qy * ay + qz * az + ab
+            r = u - np.rint(u)
+            v1 = (ex * bx + ey * by + ez * bz) * half
+            u1 = qx * bx + qy * by + qz * bz + bb
+            r1 = u1 - np.rint(u1)
+            sinc, sinc1 = sincs(v, v1)
+            S[FIELD + k] += cos_turns(r * r) * sinc * aa + cos_turns(r1 * r1) * sinc1 * ba
+
+    return add
+
+
+_values_slow, _values_medium, _values_fast = _values(sincs_slow), _values(sincs_medium), _values(sincs_fast)
+
+
+def _slopes(slopes):  # type: ignore[no-untyped-def]
+    """Forward value of two neurons, and the three products of each that the gradients need, with the sinc of their range of rates."""
+
+    @inline
+    def add(S, V0, V1, n, p, o):  # type: ignore[no-untyped-def]
+        ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
+        o2 = o + PER_NEURON
+        bx, by, bz, bb, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + PHASE], p[o2 + AMPLITUDE]
+        for k in range(n):
+            half = S[HALF + k]
+            ex, ey, ez = S[EXL + k], S[EYL + k], S[EZL + k]
+            qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
+            v = (ex * ax + ey * ay + ez * az) * half
+            u = qx * ax + qy * ay + qz * az + ab
+            r = u - np.rint(u)
+            v1 = (ex * bx + ey * by + ez * bz) * half
+            u1 = qx * bx + qy * by + qz * bz + bb
+            r1 = u1 - np.rint(u1)
+            sinc, slope, sinc1, slope1 = slopes(v, v1)
+            z, z1 = r * r, r1 * r1
+            c, c1 = cos_turns(z), cos_turns(z1)
+            V0[N_COS + k] = c * sinc
+            V0[N_SIN + k] = -TAU * TAU * r * sinc_turns(z) * sinc
+            V0[N_DSINC + k] = c * slope
+            V1[N_COS + k] = c1 * sinc1
+            V1[N_SIN + k] = -TAU * TAU * r1 * sinc_turns(z1) * sinc1
+            V1[N_DSINC + k] = c1 * slope1
+            S[FIELD + k] += c * sinc * aa + c1 * sinc1 * ba
+
+    return add
+
+
+_slopes_slow, _slopes_medium, _slopes_fast = _slopes(slopes_slow), _slopes(slopes_medium), _slopes(slopes_fast)
+
+
+@inline
+def field_values(S, D, n, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, with_mid, backward):  # type: ignore[no-untyped-def]
+    """Chords and FIELD of ``n`` lanes of primitive ``i``, in float64 where the primitive is delicate; see :func:`~tiles.chords`."""
+    if slots[i] >= 0:
+        delicate_chords(S, D, bounds, y0, y1, tx, ty, n, wide[slots[i]], floor, with_mid, backward)
+        delicate_neurons(S, D, n, wide[slots[i]], neurons)
+    else:
+        p = rows[i]
+        chords(S, n, p, floor, with_mid, backward)
+        for m in range(0, neurons, 2):
+            o = NEURONS + PER_NEURON * m
+            if kinds[i, m // 2] == MEDIUM:
+                _values_medium(S, n, p, o)
+            elif kinds[i, m // 2] == SLOW:
+                _values_slow(S, n, p, o)
+            else:
+                _values_fast(S, n, p, o)
+
+
+@inline
+def field_with_slopes(S, D, V, n, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor):  # type: ignore[no-untyped-def]
+    """The same for the backward pass: also the three products per neuron, in ``V``, that the gradients need."""
+    if slots[i] >= 0:
+        delicate_chords(S, D, bounds, y0, y1, tx, ty, n, wide[slots[i]], floor, False, True)
+        delicate_slopes(S, D, V, n, wide[slots[i]], neurons)
+    else:
+        p = rows[i]
+        chords(S, n, p, floor, False, True)
+        for m in range(0, neurons, 2):
+            o = NEURONS + PER_NEURON * m
+            if kinds[i, m // 2] == MEDIUM:
+                _slopes_medium(S, V[m], V[m + 1], n, p, o)
+            elif kinds[i, m // 2] == SLOW:
+                _slopes_slow(S, V[m], V[m + 1], n, p, o)
+            else:
+                _slopes_fast(S, V[m], V[m + 1], n, p, o)

@@ -59,10 +59,11 @@ _FLOAT32_MAX = 3.0e38
 
 # Where the pixel stage leaves float32 (bounds found with benchmarks/numerics.py).
 _DELICATE_RADII = 8.0  # terms of a point on the ray this many radii of the thinnest axis long: they cancel
-_DELICATE_ANCHOR = 2.0  # the same of the centre seen from an anchor at the camera
+_DELICATE_ANCHOR = 1.25  # the same of the centre seen from an anchor at the camera: most cameras outside, but near
 _DELICATE_TURNS = 4.0  # of a neuron over half a chord
 _DELICATE_PIXELS = 16384.0  # from the corner of the image to the anchor
 _DELICATE_RATIO = 256.0  # of the axes; for the gradients
+_DELICATE_RATIO_NEAR = 16.0  # of the axes of a primitive anchored at the camera, which its chords pass closely
 
 strict = njit(error_model="numpy", forceinline=True)
 
@@ -218,8 +219,9 @@ def prepare(  # type: ignore[no-untyped-def]
             rows[i, j] = row[j]
         tc = row[TC]
         delicate[i] = (K > 0 and rate[K - 1] > _DELICATE_TURNS) or max(abs(row[UX]), abs(row[UY])) > _DELICATE_PIXELS
-        delicate[i] |= max(abs(xa[0]), abs(xa[1]), abs(xa[2])) > _DELICATE_ANCHOR  # centre far from the anchor, in the thinnest axis
-        delicate[i] |= min(axes[0], axes[1], axes[2]) * _DELICATE_RATIO < 1.0
+        delicate[i] |= _dot(xa, xa) > _DELICATE_ANCHOR**2  # centre far from the anchor, in the thinnest axis
+        thinnest = min(axes[0], axes[1], axes[2])
+        delicate[i] |= thinnest * (_DELICATE_RATIO_NEAR if tc == 0.0 else _DELICATE_RATIO) < 1.0
         depth[i] = c[2]
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
         if not finite:

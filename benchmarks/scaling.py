@@ -78,10 +78,7 @@ def series(points: list[tuple[int, int, float]], label: str, threads: int, table
         row["forward_ms"], row["pairs"] = milliseconds(lowered, size, threads, backward=False)
         row["both_ms"], _ = milliseconds(lowered, size, threads, backward=True)
         rows.append(row)
-        print(
-            f"| {label} | {count} | {size}x{size} | {overlap:g} | {row['pairs']} | {row['forward_ms']:.1f} | {row['both_ms']:.1f} |",
-            flush=True,
-        )
+        table.row(label, count, f"{size}x{size}", f"{overlap:g}", row["pairs"], f"{row['forward_ms']:.1f}", f"{row['both_ms']:.1f}")
     return rows
 
 

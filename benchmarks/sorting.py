@@ -38,8 +38,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-def from_run(folder: Path, index: int) -> tuple[Lowered, Camera, Tensor]:
-    """The model of a finished run, as leaves that take gradients, one of its test cameras, and its background."""
+def from_run(folder: Path, index: int) -> tuple[str, tuple[Lowered, Camera, Tensor]]:
+    """The model of a finished run, as leaves that take gradients, one of its test cameras, and its background; named."""
     from neuprim.evaluate import load_dataset, load_run
 
     config, task, model, _ = load_run(folder)
@@ -47,7 +47,8 @@ def from_run(folder: Path, index: int) -> tuple[Lowered, Camera, Tensor]:
     shot = dataset.test.view(index)
     for value in model.params.values():
         value.requires_grad_()
-    return model.lower(shot.camera, shot.conditions), shot.camera, dataset.background
+    name = f"{dataset.name}, {model.count} primitives, view {index}"
+    return name, (model.lower(shot.camera, shot.conditions), shot.camera, dataset.background)
 
 
 def ratios(lowered: Lowered, camera: Camera, background: Tensor, settings: RenderSettings, rounds: int) -> dict[str, list[float]]:
@@ -86,7 +87,8 @@ def main() -> None:
     settings = RenderSettings(threads=args.threads)
     scenes = {f"random {args.scene}": (lower(random_scene(count)), view(size), torch.zeros(3))}
     if args.run:
-        scenes[f"run {args.run.name}, view {args.view}"] = from_run(args.run, args.view)
+        name, scene = from_run(args.run, args.view)
+        scenes[name] = scene
     rows = []
     table = Table("scene", "drawn with", "order: PSNR, mean abs", "field: PSNR, mean abs", "forward", "backward")
     for name, (lowered, camera, background) in scenes.items():

@@ -147,6 +147,17 @@ def test_many_leaves_in_few_bytes_are_refused_before_they_take_memory(tmp_path: 
     assert read_grid(path, "density").active_voxels == 0
 
 
+def test_many_tiles_in_few_bytes_count_too(tmp_path: Path) -> None:
+    """One node may hold 32,768 tiles, equal ones in few bytes; in memory they take 21 bytes each."""
+    values = struct.pack("<32768f", *range(32768))
+    chunk = zlib.compress(values)
+    tree = struct.pack("<ifII3i", 1, 0, 0, 1, 0, 0, 0) + bytes(4096) + b"\xff" * 4096 + b"\0" + struct.pack("<q", len(chunk)) + chunk
+    path = one_grid(tmp_path / "a.vdb", tree, b"", flags=3)
+    refused(lambda: read_grid(path, "density", max_bytes=32768 * 21 - 1), "a.vdb", "'density'", "tiles", str(32768 * 21 - 1))
+    grid = read_grid(path, "density", max_bytes=32768 * 21)
+    assert len(grid.tiles) == 32768 and grid.active_voxels == 4096**3 and grid.range == (0.0, 32767.0)
+
+
 def test_an_instance_of_itself(tmp_path: Path) -> None:
     path = one_grid(tmp_path / "a.vdb", b"", b"", parent="density")
     refused(lambda: read_grid(path, "density"), "a.vdb", "shares the tree")

@@ -126,7 +126,9 @@ def read_all(path: Path) -> int:
     for entry in header.grids:
         if entry.undecodable() is None:
             grid = read_grid(path, entry.name, level_sets=True, max_bytes=2**28)
-            _ = grid.bounds, grid.world_bounds(), grid.active_voxels, grid.range, grid.non_finite, grid.dense_bytes
+            _ = grid.bounds, grid.world_bounds(), grid.active_voxels, grid.range, grid.non_finite
+            if grid.dense_bytes < 2**20:
+                grid.to_dense()
     return len(header.grids)
 
 

@@ -152,7 +152,7 @@ class Grid:
     @cached_property
     def active_voxels(self) -> int:
         """How many voxels are active, those of active tiles included."""
-        inside = sum(int(size) ** 3 for size in self.tiles.sizes[self.tiles.active])
+        inside = sum(size**3 * int(np.count_nonzero(self.tiles.sizes[self.tiles.active] == size)) for size in TILE_SIZES)
         return int(np.count_nonzero(self.masks)) + inside
 
     @cached_property

@@ -13,7 +13,7 @@ from neuprim.core.vdb.tree import TreeReader
 __all__ = ["LEAF_LIMIT", "read_grid"]
 
 LEAF_LIMIT = 4 * 2**30
-"""Most bytes of decoded leaves that :func:`read_grid` takes unless told otherwise: 4 GiB."""
+"""Most bytes of decoded leaves and tiles that :func:`read_grid` takes unless told otherwise: 4 GiB."""
 
 
 def read_grid(path: Path, name: str, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False) -> Grid:
@@ -22,7 +22,7 @@ def read_grid(path: Path, name: str, *, max_bytes: int = LEAF_LIMIT, level_sets:
     Args:
         path: an OpenVDB file of version 222 to 224.
         name: the grid, as :func:`~neuprim.core.vdb.header.read_header` lists it.
-        max_bytes: most memory for its leaves; more is refused before it is taken.
+        max_bytes: most memory for its leaves and tiles; more is refused before it is taken.
         level_sets: read signed distances too, for inspection.
 
     Raises:

@@ -57,14 +57,14 @@ class TreeReader:
         block: where the leaf buffers begin.
         flags, half, channels: how values are stored.
         what: the grid, for messages.
-        max_bytes: most memory for the decoded leaves.
+        max_bytes: most memory for the decoded leaves and tiles.
 
     Attributes:
         background: () or (3,) float32.
         origins, values, masks, tiles: as in :class:`~neuprim.core.vdb.grid.Grid`.
 
     Raises:
-        DataError: truncated, inconsistent or damaged, or leaves that take more than ``max_bytes``.
+        DataError: truncated, inconsistent or damaged, or leaves and tiles that take more than ``max_bytes``.
         BackendUnavailable: Blosc chunks, but no package ``blosc``.
     """
 
@@ -80,13 +80,15 @@ class TreeReader:
         self._unpack = unpacker(flags)
         self._leaf_origins: list[np.ndarray] = []
         self._tiles: list[tuple[np.ndarray, int, np.ndarray, np.ndarray]] = []
+        self._limit = max_bytes
+        self._left = max_bytes  # what tiles have not taken yet
         self._topology()
         self.origins = np.concatenate(self._leaf_origins) if self._leaf_origins else np.zeros((0, 3), np.int32)
         self.tiles = self._collect_tiles(channels)
         count = len(self.origins)
         size = count * _LEAF * (self._full_size + 1)
-        if size > max_bytes:
-            raise cursor.fail(f"{what} has {count} leaves, which take {size} bytes in memory; at most {max_bytes} are allowed")
+        if size > self._left:
+            raise cursor.fail(f"{what} has {count} leaves, which take {size} bytes in memory; at most {self._left} are allowed")
         self.values = np.empty((count, _LEAF, *self._shape), np.float32)
         self.masks = np.empty((count, _LEAF), bool)
         for first in range(0, count, _CHUNK):
@@ -145,6 +147,9 @@ class TreeReader:
         different = (values != self.background).any(-1) if self._shape else values != self.background
         kept = active | different  # the others are what is nowhere stored
         if kept.any():
+            self._left -= int(np.count_nonzero(kept)) * (17 + self._full_size)
+            if self._left < 0:
+                raise self._cursor.fail(f"{self._what} has tiles that take more bytes in memory than the {self._limit} allowed")
             self._tiles.append((origins[kept], size, values[kept], active[kept]))
 
     def _collect_tiles(self, channels: int) -> Tiles:

@@ -149,7 +149,7 @@ class _TreeWriter:
 
     def _check(self) -> None:
         grid, tiles = self._grid, self._grid.tiles
-        if (grid.origins % 8).any() or (tiles.origins % tiles.sizes[:, None]).any() or not np.isin(tiles.sizes, TILE_SIZES).all():
+        if not np.isin(tiles.sizes, TILE_SIZES).all() or (grid.origins % 8).any() or (tiles.origins % tiles.sizes[:, None]).any():
             raise DataError(f"{self._where}: leaves and tiles must start at multiples of their size (8, 128 or 4096 voxels)")
         places = np.concatenate([np.c_[grid.origins, np.full(len(grid.origins), 8)], np.c_[tiles.origins, tiles.sizes]]).astype(np.int64)
         for size in TILE_SIZES:

@@ -159,10 +159,10 @@ class Grid:
     def bounds(self) -> Bounds | None:
         """The box of all active voxels, in indices; None if there is none."""
         lows, highs = [], []
-        used = self.masks.any((1, 2, 3)) if len(self.masks) else np.zeros(0, bool)
+        used = np.asarray(self.masks.any((1, 2, 3)))
         if used.any():
             masks, origins = self.masks[used], self.origins[used].astype(np.int64)
-            axes = [masks.any(tuple(a for a in (1, 2, 3) if a != axis)) for axis in (1, 2, 3)]
+            axes = [np.asarray(masks.any(other)) for other in ((2, 3), (1, 3), (1, 2))]
             lows.append((origins + np.stack([a.argmax(1) for a in axes], 1)).min(0))
             highs.append((origins + 8 - np.stack([a[:, ::-1].argmax(1) for a in axes], 1)).max(0))
         if self.tiles.active.any():

@@ -89,8 +89,8 @@ class TreeReader:
         size = count * _LEAF * (self._full_size + 1)
         if size > self._left:
             raise cursor.fail(f"{what} has {count} leaves, which take {size} bytes in memory; at most {self._left} are allowed")
-        self.values = np.empty((count, _LEAF, *self._shape), np.float32)
-        self.masks = np.empty((count, _LEAF), bool)
+        self.values: np.ndarray = np.empty((count, _LEAF, *self._shape), np.float32)
+        self.masks: np.ndarray = np.empty((count, _LEAF), bool)
         for first in range(0, count, _CHUNK):
             self._leaves(first, min(first + _CHUNK, count))
         if self._buffers.at != self._buffers.end:

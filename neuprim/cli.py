@@ -121,6 +121,11 @@ def _parsers(with_tasks: bool) -> tuple[Parser, dict[str, argparse.ArgumentParse
     render.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
     render.add_argument("--frames", type=_count, default=60, metavar="N", help="frames of an orbit (default: 60)")
 
+    vdb = command("vdb", _vdb, "look into OpenVDB files", "`info` lists grids: type, transform, bounds, active voxels, values, memory.")
+    vdb.add_argument("action", choices=("info",), metavar="info", help="what to do")
+    vdb.add_argument("path", type=Path, metavar="FILE|DIR", help="a .vdb file, or a folder of frames")
+    vdb.add_argument("--json", action="store_true", help="print JSON")
+
     command("tasks", _tasks, "list tasks, scenes and presets, and the packages they come from")
     command("doctor", _doctor, "show versions, devices and which renderer backends work here")
     return parser, dict(sub.choices)
@@ -178,6 +183,12 @@ def _render(args: argparse.Namespace) -> int:
     for path in paths:
         print(path)
     return 0
+
+
+def _vdb(args: argparse.Namespace) -> int:
+    from neuprim.vdb_info import vdb_info
+
+    return vdb_info(args.path, args.json)
 
 
 def _tasks(args: argparse.Namespace) -> int:

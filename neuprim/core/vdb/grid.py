@@ -1,0 +1,269 @@
+"""A sparse volume in memory: blocks of 8 x 8 x 8 voxels, larger constant tiles, and where they lie in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from neuprim.core.errors import DataError
+
+__all__ = ["DENSE_LIMIT", "TILE_SIZES", "Bounds", "Grid", "Tiles", "scale_transform"]
+
+TILE_SIZES = (8, 128, 4096)
+"""Edges of a constant tile in voxels: in a lower node, in an upper node, in the root."""
+
+DENSE_LIMIT = 2 * 2**30
+"""Most bytes that :meth:`Grid.to_dense` takes unless told otherwise: 2 GiB."""
+
+Bounds = tuple[tuple[int, int, int], tuple[int, int, int]]
+"""A box of voxels: lowest index, and the first index beyond the highest, per axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tiles:
+    """T cubes of one value each.
+
+    Attributes:
+        origins: (T, 3) int32, the lowest index of each.
+        sizes: (T,) int32, edges in voxels, each one of :data:`TILE_SIZES`.
+        values: (T,) or (T, 3) float32.
+        active: (T,) bool.
+    """
+
+    origins: np.ndarray
+    sizes: np.ndarray
+    values: np.ndarray
+    active: np.ndarray
+
+    @staticmethod
+    def none(channels: int = 1) -> Tiles:
+        """No tiles."""
+        shape = (0,) if channels == 1 else (0, channels)
+        return Tiles(np.zeros((0, 3), np.int32), np.zeros(0, np.int32), np.zeros(shape, np.float32), np.zeros(0, bool))
+
+    def __len__(self) -> int:
+        return len(self.sizes)
+
+
+def scale_transform(voxel_size: float | Sequence[float] = 1.0, translation: Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """(4, 4) index to world: voxels of an edge (one, or one per axis), the centre of voxel 0 at ``translation``; world units."""
+    matrix = np.eye(4)
+    matrix[range(3), range(3)] = voxel_size
+    matrix[:3, 3] = translation
+    return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A float or vec3s grid.
+
+    A voxel with index (i, j, k) has its *centre* at ``transform @ (i, j, k, 1)``. Voxels of no leaf and no tile have the
+    background value and are not active. NaN and infinite values are kept as they are stored and counted in :attr:`non_finite`.
+
+    Attributes:
+        name: as in the file.
+        transform: (4, 4) float64, index to world, acting on column vectors.
+        background: () or (3,) float32.
+        origins: (L, 3) int32, the lowest index of each leaf, multiples of 8, all different.
+        values: (L, 8, 8, 8) or (L, 8, 8, 8, 3) float32, indexed x, y, z.
+        masks: (L, 8, 8, 8) bool, which voxels are active.
+        tiles: constant regions; none of them overlaps a leaf.
+        kind: ``fog volume``, ``staggered``, ``unknown`` or, if asked for, ``level set``.
+        half: store as 16-bit floats when written.
+        metadata: the grid's own.
+    """
+
+    name: str
+    transform: np.ndarray
+    background: np.ndarray
+    origins: np.ndarray
+    values: np.ndarray
+    masks: np.ndarray
+    tiles: Tiles
+    kind: str = "fog volume"
+    half: bool = False
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    @staticmethod
+    def from_dense(
+        name: str,
+        array: np.ndarray,
+        *,
+        lower: Sequence[int] = (0, 0, 0),
+        transform: np.ndarray | None = None,
+        background: float = 0.0,
+        half: bool = False,
+        metadata: Mapping[str, Any] | None = None,
+    ) -> Grid:
+        """A fog volume of the voxels that differ from the background.
+
+        Args:
+            array: (X, Y, Z) or (X, Y, Z, 3), any real type; kept as float32.
+            lower: index of ``array[0, 0, 0]``.
+            transform: (4, 4) index to world; :func:`scale_transform` makes one. None: voxels of edge 1.
+
+        Raises:
+            DataError: another shape, or indices beyond the 32 bits of the format.
+        """
+        array = np.asarray(array, np.float32)
+        if array.ndim not in (3, 4) or array.shape[3:] not in ((), (3,)):
+            raise DataError(f"grid {name!r}: array of shape {array.shape}; expected (X, Y, Z) or (X, Y, Z, 3)")
+        channels = array.shape[3:]
+        low = np.array(lower, np.int64)
+        if (low < -(2**31) + 8).any() or (low + array.shape[:3] > 2**31 - 8).any():
+            raise DataError(f"grid {name!r}: indices from {low.tolist()} on; expected at most 31 bits and a sign")
+        base = low & ~7
+        counts = -(-(low + array.shape[:3] - base) // 8)
+        padded = np.full((*(counts * 8), *channels), background, np.float32)
+        inside = tuple(slice(a, a + n) for a, n in zip(low - base, array.shape[:3], strict=True))
+        padded[inside] = array
+        blocks = _blocks(padded)
+        active = blocks != np.float32(background)
+        active = active.any(-1) if channels else active
+        kept = np.argwhere(active.any((3, 4, 5)))
+        chosen = tuple(kept.T)
+        return Grid(
+            name,
+            np.eye(4) if transform is None else np.array(transform, np.float64),
+            np.full(channels, background, np.float32),
+            (kept * 8 + base).astype(np.int32),
+            blocks[chosen],
+            active[chosen],
+            Tiles.none(3 if channels else 1),
+            half=half,
+            metadata=dict(metadata or {}),
+        )
+
+    @property
+    def channels(self) -> int:
+        """1 or 3."""
+        return 3 if self.values.ndim == 5 else 1
+
+    @property
+    def voxel_size(self) -> tuple[float, float, float]:
+        """Edge lengths of a voxel in world units."""
+        x, y, z = np.linalg.norm(self.transform[:3, :3], axis=0).tolist()
+        return x, y, z
+
+    @cached_property
+    def active_voxels(self) -> int:
+        """How many voxels are active, those of active tiles included."""
+        inside = sum(size**3 * int(np.count_nonzero(self.tiles.sizes[self.tiles.active] == size)) for size in TILE_SIZES)
+        return int(np.count_nonzero(self.masks)) + inside
+
+    @cached_property
+    def bounds(self) -> Bounds | None:
+        """The box of all active voxels, in indices; None if there is none."""
+        lows, highs = [], []
+        used = np.asarray(self.masks.any((1, 2, 3)))
+        if used.any():
+            masks, origins = self.masks[used], self.origins[used].astype(np.int64)
+            axes = [np.asarray(masks.any(other)) for other in ((2, 3), (1, 3), (1, 2))]
+            lows.append((origins + np.stack([a.argmax(1) for a in axes], 1)).min(0))
+            highs.append((origins + 8 - np.stack([a[:, ::-1].argmax(1) for a in axes], 1)).max(0))
+        if self.tiles.active.any():
+            origins = self.tiles.origins[self.tiles.active].astype(np.int64)
+            lows.append(origins.min(0))
+            highs.append((origins + self.tiles.sizes[self.tiles.active, None]).max(0))
+        if not lows:
+            return None
+        low, high = np.min(lows, 0).tolist(), np.max(highs, 0).tolist()
+        return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+
+    def world_bounds(self) -> np.ndarray | None:
+        """(2, 3) float64: the box, in world units and axes, around all active voxels with their extent; None if there is none."""
+        if self.bounds is None:
+            return None
+        corners = np.stack(np.meshgrid(*np.array(self.bounds, float).T - 0.5, indexing="ij"), -1).reshape(-1, 3)
+        world = corners @ self.transform[:3, :3].T + self.transform[:3, 3]
+        return np.stack([world.min(0), world.max(0)])
+
+    def _active_values(self) -> np.ndarray:
+        return np.concatenate([self.values[self.masks], self.tiles.values[self.tiles.active]])
+
+    @cached_property
+    def range(self) -> tuple[float, float] | None:
+        """Least and greatest finite number among active values (of all channels); None if there is none."""
+        values = self._active_values()
+        values = values[np.isfinite(values)]
+        return (float(values.min()), float(values.max())) if values.size else None
+
+    @cached_property
+    def non_finite(self) -> int:
+        """How many active leaf voxels and active tiles hold a NaN or an infinite number."""
+        bad = ~np.isfinite(self._active_values())
+        return int(np.count_nonzero(bad.any(-1) if self.channels == 3 else bad))
+
+    @property
+    def sparse_bytes(self) -> int:
+        """Memory that the leaves take now."""
+        return self.values.nbytes + self.masks.nbytes + self.origins.nbytes
+
+    @property
+    def dense_bytes(self) -> int:
+        """Memory that the box of active voxels takes as one float32 array."""
+        return 0 if self.bounds is None else _volume(self.bounds) * 4 * self.channels
+
+    def to_dense(self, bounds: Bounds | None = None, max_bytes: int = DENSE_LIMIT, non_finite: float | None = None) -> np.ndarray:
+        """(X, Y, Z) or (X, Y, Z, 3) float32: every voxel of a box, active or not.
+
+        Args:
+            bounds: the box, in indices; None takes :attr:`bounds`, and (0, 0, 0) voxels for a grid without active ones.
+            max_bytes: most memory for the result, which is built on whole leaves (up to 7 voxels more on each side).
+            non_finite: what replaces NaN and infinite numbers; None keeps them.
+
+        Raises:
+            DataError: an inverted box, or one that takes more than ``max_bytes``.
+        """
+        box = self.bounds if bounds is None else bounds
+        channels = (3,) if self.channels == 3 else ()
+        if box is None:
+            return np.zeros((0, 0, 0, *channels), np.float32)
+        low, high = ([int(v) for v in corner] for corner in box)
+        if any(h < l for l, h in zip(low, high, strict=True)):
+            raise DataError(f"grid {self.name!r}: bounds from {low} to {high}; expected the lower corner first")
+        base, top = [v & ~7 for v in low], [-(-v // 8) * 8 for v in high]
+        shape = [t - b for t, b in zip(top, base, strict=True)]
+        size = shape[0] * shape[1] * shape[2] * 4 * self.channels
+        if size > max_bytes:
+            raise DataError(
+                f"grid {self.name!r}: {' x '.join(map(str, shape))} voxels take {size} bytes when dense; at most {max_bytes} are allowed"
+            )
+        padded = np.empty((*shape, *channels), np.float32)
+        padded[...] = self.background
+        first, last = np.array(base, np.int64), np.array(top, np.int64)
+        self._fill_tiles(padded, first, last)
+        inside = ((self.origins >= first) & (self.origins < last)).all(1)
+        _blocks(padded)[tuple(((self.origins[inside] - first) // 8).T)] = self.values[inside]
+        cut = tuple(slice(l - b, h - b) for l, h, b in zip(low, high, base, strict=True))
+        dense = np.ascontiguousarray(padded[cut])
+        if non_finite is not None:
+            dense[~np.isfinite(dense)] = non_finite
+        return dense
+
+    def _fill_tiles(self, padded: np.ndarray, first: np.ndarray, last: np.ndarray) -> None:
+        tiles = self.tiles
+        origins = tiles.origins.astype(np.int64)
+        meets = ((origins < last) & (origins + tiles.sizes[:, None] > first)).all(1)
+        small = meets & (tiles.sizes == 8)  # often many, and each of them one whole block
+        repeated = tiles.values[small].reshape(-1, 1, 1, 1, *tiles.values.shape[1:])
+        _blocks(padded)[tuple(((origins[small] - first) // 8).T)] = repeated
+        for i in np.flatnonzero(meets & ~small):
+            begin, stop = np.maximum(origins[i] - first, 0), np.minimum(origins[i] + tiles.sizes[i], last) - first
+            padded[begin[0] : stop[0], begin[1] : stop[1], begin[2] : stop[2]] = tiles.values[i]
+
+
+def _volume(bounds: Bounds) -> int:
+    (a, b, c), (d, e, f) = bounds
+    return (d - a) * (e - b) * (f - c)
+
+
+def _blocks(padded: np.ndarray) -> np.ndarray:
+    """(X/8, Y/8, Z/8, 8, 8, 8, …) view of an (X, Y, Z, …) array whose edges are multiples of 8."""
+    x, y, z = (n // 8 for n in padded.shape[:3])
+    split = padded.reshape(x, 8, y, 8, z, 8, *padded.shape[3:])
+    return split.transpose(0, 2, 4, 1, 3, 5, *range(6, split.ndim))

@@ -1,0 +1,50 @@
+"""Reading grids, one at a time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from neuprim.core.vdb.grid import Grid
+from neuprim.core.vdb.header import parse_header
+from neuprim.core.vdb.stream import Cursor, opened
+from neuprim.core.vdb.tree import TreeReader
+
+__all__ = ["LEAF_LIMIT", "read_grid"]
+
+LEAF_LIMIT = 4 * 2**30
+"""Most bytes of decoded leaves and tiles that :func:`read_grid` takes unless told otherwise: 4 GiB."""
+
+
+def read_grid(path: Path, name: str, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False) -> Grid:
+    """Reads one grid of a file; the others stay undecoded.
+
+    Args:
+        path: an OpenVDB file of version 222 to 224.
+        name: the grid, as :func:`~neuprim.core.vdb.header.read_header` lists it.
+        max_bytes: most memory for its leaves and tiles; more is refused before it is taken.
+        level_sets: read signed distances too, for inspection.
+
+    Raises:
+        DataError: no such file or grid; points, a level set or another type that is not read; truncated or damaged.
+        BackendUnavailable: the grid is Blosc-compressed, and the package ``blosc`` is missing.
+    """
+    with opened(Path(path)) as cursor:
+        file = parse_header(cursor)
+        header = file.grid(name)
+        what = f"grid {name!r}"
+        refusal = header.undecodable() if level_sets else header.refusal()
+        if refusal:
+            raise cursor.fail(f"{what} {refusal}")
+        source = header
+        if header.parent:  # an instance: own transform and metadata, another grid's tree
+            source = file.grid(header.parent)
+            if source.parent or source.type != header.type:
+                raise cursor.fail(f"{what} shares the tree of {header.parent!r}, which has none of its own or one of another type")
+        inner = Cursor(cursor.path, cursor.data, source.tree_at, source.end)
+        tree = TreeReader(inner, source.block, source.flags, source.half, source.channels, what, max_bytes)
+    metadata: dict[str, Any] = dict(header.metadata)
+    assert header.transform is not None  # undecodable() says so
+    return Grid(
+        name, header.transform, tree.background, tree.origins, tree.values, tree.masks, tree.tiles, header.kind, header.half, metadata
+    )

@@ -15,12 +15,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from neuprim.core.vdb import read_grid, read_header
+from neuprim.core.vdb import read_grids, read_header
 
 
 def leaves(path: Path, names: list[str]) -> int:
     """Decodes the named grids; bytes of float32 values."""
-    return sum(read_grid(path, name, level_sets=True).values.nbytes for name in names)
+    return sum(grid.values.nbytes for grid in read_grids(path, names, level_sets=True))
 
 
 def timed(work: Callable[[], int]) -> tuple[float, int]:

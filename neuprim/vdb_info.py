@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from neuprim.core.errors import DataError
-from neuprim.core.vdb import GridHeader, read_grid, read_header, sequence
+from neuprim.core.vdb import Grid, GridHeader, read_grids, read_header, sequence
 
 __all__ = ["describe_file", "vdb_info"]
 
@@ -58,16 +58,17 @@ def _files(path: Path) -> tuple[list[Path], list[str]]:
 def describe_file(path: Path) -> dict[str, Any]:
     """Everything the report shows, as JSON-ready values: lengths in world units, bounds in voxel indices (upper ones excluded)."""
     header = read_header(path)
+    grids = read_grids(path, level_sets=True)  # in the same order, one in memory at a time
     return {
         "path": str(path),
         "version": header.version,
         "library": list(header.library),
         "metadata": _plain(header.metadata),
-        "grids": [_describe(path, grid) for grid in header.grids],
+        "grids": [_describe(entry, None if entry.undecodable() else next(grids)) for entry in header.grids],
     }
 
 
-def _describe(path: Path, header: GridHeader) -> dict[str, Any]:
+def _describe(header: GridHeader, grid: Grid | None) -> dict[str, Any]:
     """One grid; grids that cannot be decoded have a ``reason`` and no numbers from voxels."""
     entry: dict[str, Any] = {
         "name": header.name,
@@ -81,9 +82,8 @@ def _describe(path: Path, header: GridHeader) -> dict[str, Any]:
         "metadata": _plain(header.metadata),
         "reason": header.refusal(),
     }
-    if header.undecodable():
+    if grid is None:
         return entry
-    grid = read_grid(path, header.name, level_sets=True)
     box = grid.world_bounds()
     return entry | {
         "background": [_number(v) for v in grid.background.ravel().tolist()],

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from neuprim.core.vdb import read_grid, read_header
+from neuprim.core.vdb import read_grid, read_grids, read_header
 from tests.core.vdb_bytes import LEAF_CORNER, bits, file_head, grid_bytes, one_grid, one_leaf, refused, text
 
 RNG = np.random.default_rng(11)
@@ -182,6 +182,10 @@ def test_foreign_grids_are_skipped_unread(tmp_path: Path) -> None:
     refused(lambda: read_grid(path, "pts"), "'pts'", "holds points")
     refused(lambda: read_grid(path, "sdf"), "'sdf'", "level set", "signed distances")
     assert read_grid(path, "sdf", level_sets=True).kind == "level set"
+    assert [g.name for g in read_grids(path)] == ["density"]
+    assert [g.name for g in read_grids(path, level_sets=True)] == ["sdf", "density"]
+    assert [g.name for g in read_grids(path, ["density", "sdf"], level_sets=True)] == ["density", "sdf"]
+    refused(lambda: list(read_grids(path, ["density", "pts"])), "'pts'", "holds points")
     refused(lambda: read_grid(path, "densty"), "a.vdb", "'densty'", "did you mean 'density'")
 
 

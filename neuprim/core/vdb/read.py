@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from neuprim.core.vdb.grid import Grid
-from neuprim.core.vdb.header import parse_header
+from neuprim.core.vdb.header import FileHeader, GridHeader, parse_header
 from neuprim.core.vdb.stream import Cursor, opened
 from neuprim.core.vdb.tree import TreeReader
 
-__all__ = ["LEAF_LIMIT", "read_grid"]
+__all__ = ["LEAF_LIMIT", "read_grid", "read_grids"]
 
 LEAF_LIMIT = 4 * 2**30
 """Most bytes of decoded leaves and tiles that :func:`read_grid` takes unless told otherwise: 4 GiB."""
@@ -31,20 +31,48 @@ def read_grid(path: Path, name: str, *, max_bytes: int = LEAF_LIMIT, level_sets:
     """
     with opened(Path(path)) as cursor:
         file = parse_header(cursor)
-        header = file.grid(name)
-        what = f"grid {name!r}"
-        refusal = header.undecodable() if level_sets else header.refusal()
-        if refusal:
-            raise cursor.fail(f"{what} {refusal}")
-        source = header
-        if header.parent:  # an instance: own transform and metadata, another grid's tree
-            source = file.grid(header.parent)
-            if source.parent or source.type != header.type:
-                raise cursor.fail(f"{what} shares the tree of {header.parent!r}, which has none of its own or one of another type")
-        inner = Cursor(cursor.path, cursor.data, source.tree_at, source.end)
-        tree = TreeReader(inner, source.block, source.flags, source.half, source.channels, what, max_bytes)
-    metadata: dict[str, Any] = dict(header.metadata)
-    assert header.transform is not None  # undecodable() says so
+        return _read(cursor, file, file.grid(name), max_bytes, level_sets)
+
+
+def read_grids(path: Path, names: Sequence[str] | None = None, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False) -> Iterator[Grid]:
+    """Several grids of a file, one at a time; the file's header is read once.
+
+    Args:
+        names: which, in this order; None for all that can be decoded (of level sets: if ``level_sets``), in file order.
+        path, max_bytes, level_sets: as in :func:`read_grid`; the limit is for each grid.
+
+    Raises:
+        DataError, BackendUnavailable: as :func:`read_grid`, when that grid's turn comes.
+    """
+    with opened(Path(path)) as cursor:
+        file = parse_header(cursor)
+        if names is None:
+            names = [g.name for g in file.grids if not (g.undecodable() if level_sets else g.refusal())]
+        for name in names:
+            yield _read(cursor, file, file.grid(name), max_bytes, level_sets)
+
+
+def _read(cursor: Cursor, file: FileHeader, header: GridHeader, max_bytes: int, level_sets: bool) -> Grid:
+    what = f"grid {header.name!r}"
+    refusal = header.undecodable() if level_sets else header.refusal()
+    if refusal or header.transform is None:
+        raise cursor.fail(f"{what} {refusal}")
+    source = header
+    if header.parent:  # an instance: own transform and metadata, another grid's tree
+        source = file.grid(header.parent)
+        if source.parent or source.type != header.type:
+            raise cursor.fail(f"{what} shares the tree of {header.parent!r}, which has none of its own or one of another type")
+    inner = Cursor(cursor.path, cursor.data, source.tree_at, source.end)
+    tree = TreeReader(inner, source.block, source.flags, source.half, source.channels, what, max_bytes)
     return Grid(
-        name, header.transform, tree.background, tree.origins, tree.values, tree.masks, tree.tiles, header.kind, header.half, metadata
+        header.name,
+        header.transform,
+        tree.background,
+        tree.origins,
+        tree.values,
+        tree.masks,
+        tree.tiles,
+        header.kind,
+        header.half,
+        dict(header.metadata),
     )

@@ -3,8 +3,7 @@
 With W1 and b1 divided by 2 pi beforehand, reducing a phase to |r| <= 1/2 turn is ``r = u - rint(u)``, which is exact.
 float32 Horner errors: cos 4.3e-7, sinc 2.6e-7, dsinc/dz 9.3e-7; up to 1.5 turns sinc 4.4e-7, dsinc/dv 1.9e-6.
 
-In a trained model most neurons turn between half a turn and 1.5 turns over a half chord. A longer polynomial is cheaper there
-than the reduction, whose division costs as much as everything else.
+Between half a turn and 1.5 turns a longer polynomial takes the place of the range reduction and its division.
 """
 
 from __future__ import annotations

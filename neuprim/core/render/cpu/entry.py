@@ -66,6 +66,17 @@ def _lanes_of(S, state, offset, bounds, rows_live, span, box, p, tx, ty):  # typ
 
 
 @inline
+def _load_tile(state, rows_live, norms, tx, ty):  # type: ignore[no-untyped-def]
+    """Ray norms of a tile's pixels, and which of its rows lie in the image."""
+    height, width = norms.shape
+    for y in range(TILE):
+        rows_live[y] = f(1) if ty + y < height else f(0)
+        for x in range(TILE):
+            inside = tx + x < width and ty + y < height
+            state[NORM + y * TILE + x] = norms[ty + y, tx + x] if inside else f(0)
+
+
+@inline
 def _room(first, end, ids, boxes, tx, ty):  # type: ignore[no-untyped-def]
     """An upper bound of the hits of one tile: the boxes' pixels."""
     room = 1
@@ -165,11 +176,7 @@ def composite_tiles_by_entry(  # type: ignore[no-untyped-def]
     for t in range(start, stop):
         tx, ty = (t % across) * TILE, (t // across) * TILE
         first, end = starts[t], starts[t + 1]
-        for y in range(TILE):
-            rows_live[y] = f(1) if ty + y < height else f(0)
-            for x in range(TILE):
-                inside = tx + x < width and ty + y < height
-                state[NORM + y * TILE + x] = norms[ty + y, tx + x] if inside else f(0)
+        _load_tile(state, rows_live, norms, tx, ty)
         room = _room(first, end, ids, boxes, tx, ty)
         if room > listing.shape[0]:
             hits, marks, listing = np.empty((room, H_FLOATS), np.float32), np.empty((room, H_INTS), np.int32), np.empty(room, np.int32)
@@ -228,11 +235,7 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
     for t in range(start, stop):
         tx, ty = (t % across) * TILE, (t // across) * TILE
         first, end = starts[t], starts[t + 1]
-        for y in range(TILE):
-            rows_live[y] = f(1) if ty + y < height else f(0)
-            for x in range(TILE):
-                inside = tx + x < width and ty + y < height
-                state[NORM + y * TILE + x] = norms[ty + y, tx + x] if inside else f(0)
+        _load_tile(state, rows_live, norms, tx, ty)
         room = _room(first, end, ids, boxes, tx, ty)
         if room > listing.shape[0]:
             hits, marks, listing = np.empty((room, H_FLOATS), np.float32), np.empty((room, H_INTS), np.int32), np.empty(room, np.int32)

@@ -33,7 +33,8 @@ from tables import between_markers
 from neuprim.config import compose
 from neuprim.core.checkpoint import save_model
 from neuprim.core.train.trainer import Trainer, initial_model
-from neuprim.evaluate import load_dataset, measure, summary
+from neuprim.evaluate import load_dataset
+from neuprim.measure import measure, summary
 from neuprim.plugins.registry import load_task
 
 HERE = Path(__file__).parent
@@ -58,7 +59,7 @@ class Form:
 # 0.1 25.18, 0.2 25.37; constant, 0.01 22.73, 0.03 22.93, 0.1 22.32, 0.3 20.39.
 FORMS = {
     "neural": Form("neural, K = 8", ("model.neurons=8", "train.rates.b2=0.03", "train.rates.w2=0.03"), 51),
-    "gaussian": Form("Gaussian", ("model.density=gaussian", "train.rates.log_amplitude=0.2"), 11),
+    "gaussian": Form("Gaussian", ("model.density.form=gaussian", "train.rates.log_amplitude=0.2"), 11),
     "constant": Form("constant density, K = 0", ("model.neurons=0", "train.rates.b2=0.03"), 11),
 }
 COLOUR = 48
@@ -117,7 +118,7 @@ def train(job: Job, words: list[str], iterations: int, backend: str, target: Pat
         pass
     for field in (model.density, model.colour):
         field.set_progress(1.0)
-    views = measure(model, dataset.test, config.renderer, dataset.background)
+    views = measure(model, dataset, config.renderer)
     target.mkdir(parents=True, exist_ok=True)
     (target / "config.yaml").write_text(config.to_yaml())
     save_model(target / "model.safetensors", model, config.task, {"color_space": dataset.color_space})

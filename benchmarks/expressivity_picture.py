@@ -25,7 +25,8 @@ from neuprim.core.geometry import Geometry
 from neuprim.core.primitives import Lowered, Primitives
 from neuprim.core.render import render_lowered
 from neuprim.core.render.reference import pixel_directions
-from neuprim.evaluate import display, draw, load_dataset, load_run
+from neuprim.evaluate import load_dataset, load_run
+from neuprim.measure import display, draw
 from neuprim.report.pictures import ERROR_SCALE
 
 SIZE = 200

@@ -39,6 +39,8 @@ twice, for the shell and for the grammar: "scene.path='a=b, c'"."""
 
 EXAMPLES = """\
 examples:
+  neuprim run task=dynamic scene=smoke_fire
+  neuprim run task=dynamic scene=vdb scene.vdb=DIR scene.frames=0:100:2
   neuprim run task=static scene=solids
   neuprim run task=static scene=blender scene.path=DIR preset=paper
   neuprim run -m model.primitives=200,1000 train.max_seconds=60"""
@@ -117,7 +119,8 @@ def _parsers(with_tasks: bool) -> tuple[Parser, dict[str, argparse.ArgumentParse
     render.add_argument("run_dir", type=Path, metavar="RUN_DIR")
     render.add_argument("--camera", required=True, metavar="orbit|test|FILE.json", help="which cameras")
     render.add_argument("--size", type=_size, metavar="WxH", help="pixels (default: the data set's)")
-    render.add_argument("--format", choices=("png", "exr", "webp"), default="png", help="image format (default: png)")
+    render.add_argument("--format", choices=("png", "exr", "webp", "gif", "mp4"), help="default: png, or webp for an animation")
+    render.add_argument("--fps", type=_rate, metavar="F", help="frames per second of an animation (default: about four seconds in all)")
     render.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
     render.add_argument("--frames", type=_count, default=60, metavar="N", help="frames of an orbit (default: 60)")
 
@@ -179,7 +182,7 @@ def _render(args: argparse.Namespace) -> int:
             raise ConfigError(f"--camera {args.camera}: no such file")
     from neuprim.evaluate import render_run
 
-    paths = render_run(run_dir, args.camera, args.size, args.format, args.out, args.frames, args.conditions)
+    paths = render_run(run_dir, args.camera, args.size, args.format, args.out, args.frames, args.conditions, args.fps)
     for path in paths:
         print(path)
     return 0
@@ -242,7 +245,7 @@ def _conditions(run_dir: Path, words: list[str]) -> tuple[dict[str, str], list[s
         parser.add_argument("--" + condition.name.replace("_", "-"), dest=condition.name)
     args, rest = parser.parse_known_args(words)
     if rest:
-        flags = ["--camera", "--size", "--format", "--out", "--frames", *parser._option_string_actions]
+        flags = ["--camera", "--size", "--format", "--fps", "--out", "--frames", *parser._option_string_actions]
         raise ConfigError(f"{rest[0]}: no such argument of `neuprim render` for task {spec.name!r}{nearest(rest[0], flags)}")
     return {name: text for name, text in vars(args).items() if text is not None}, []
 
@@ -264,6 +267,16 @@ def _count(text: str) -> int:
     if not re.fullmatch(r"[1-9]\d{0,6}", text):
         raise argparse.ArgumentTypeError(f"{text!r}: expected a positive count")
     return int(text)
+
+
+def _rate(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.1 <= value <= 240.0:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected 0.1 to 240 frames per second")
+    return value
 
 
 def _task_names() -> str:

@@ -1,129 +1,40 @@
-"""Measure and draw fitted models: on held-out views, from a run directory, along an orbit or given cameras."""
+"""Measure and draw the model of a run directory: on its held-out views, along an orbit or given cameras."""
 
 from __future__ import annotations
 
 import json
 import math
-import platform
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 
-import neuprim
 from neuprim.config import RunConfig
 from neuprim.core import images
 from neuprim.core.camera_file import read_cameras
 from neuprim.core.checkpoint import load_model
-from neuprim.core.data import Dataset, View, ViewSet
+from neuprim.core.data import Dataset, View
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.files import cache_directory
-from neuprim.core.metrics import psnr, ssim, to_json
+from neuprim.core.film import write_film
 from neuprim.core.primitives import Primitives
-from neuprim.core.render import RenderSettings, choose_backend, render
 from neuprim.core.task import SceneContext, TaskSpec
+from neuprim.measure import display, draw, measure, summary
 from neuprim.plugins.registry import load_task
 
-__all__ = ["ViewMetrics", "display", "draw", "evaluate_run", "load_dataset", "load_run", "measure", "render_run", "summary"]
+__all__ = ["FORMATS", "evaluate_run", "load_dataset", "load_run", "read_metrics", "render_run"]
 
-
-@dataclass(frozen=True)
-class ViewMetrics:
-    """One view's numbers; ``seconds`` is the forward pass alone."""
-
-    name: str
-    psnr: float
-    ssim: float
-    seconds: float
-
-
-def draw(model: Primitives, view: View, settings: RenderSettings, background: Tensor) -> Tensor:
-    """(H, W, C) image of one view, without gradients."""
-    with torch.no_grad():
-        return render(model, view.camera, view.conditions, settings, background).rgb
-
-
-def measure(
-    model: Primitives,
-    views: ViewSet,
-    settings: RenderSettings,
-    background: Tensor,
-    seen: Callable[[int, View, Tensor, Tensor], None] | None = None,
-) -> list[ViewMetrics]:
-    """PSNR and SSIM of every view of a split, float images against ``pixels.over(background)``, unclamped and unquantised.
-
-    ``seen(index, view, rendered, truth)`` is called for each, e.g. to keep pictures.
-    """
-    result = []
-    for i in range(len(views)):
-        view, pixels = views.view(i), views.pixels(i)
-        truth = pixels.over(background)
-        start = time.perf_counter()
-        rendered = draw(model, view, settings, background)
-        seconds = time.perf_counter() - start
-        if pixels.mask is not None:
-            rendered = torch.where(pixels.mask[..., None], rendered, truth)
-        result.append(ViewMetrics(view.name, psnr(rendered, truth, pixels.mask), ssim(rendered, truth), seconds))
-        if seen is not None:
-            seen(i, view, rendered, truth)
-    return result
+ANIMATIONS = ("webp", "gif", "mp4")
+FORMATS = ("png", "exr", *ANIMATIONS)
+"""What ``neuprim render`` writes."""
 
 
 def load_dataset(config: RunConfig, task: TaskSpec, progress: Callable[[str, float], None] = lambda text, fraction: None) -> Dataset:
     """The data set of a run's configuration."""
     context = SceneContext(config.seed, cache_directory() / "scenes", progress)
     return task.scene(config.scene_name).load(config.scene, context)
-
-
-def summary(
-    config: RunConfig, model: Primitives, dataset: Dataset, views: Sequence[ViewMetrics], model_bytes: int, training: Mapping[str, Any]
-) -> dict[str, Any]:
-    """The content of ``metrics.json``. ``training`` holds iterations and train_seconds as the run recorded them."""
-    worst = min(views, key=lambda v: v.psnr)
-    lowered = model.lower(dataset.test.view(0).camera, dataset.test.view(0).conditions)
-    seconds = sorted(v.seconds for v in views)
-    return {
-        "task": config.task,
-        "scene": config.scene_name,
-        "dataset": dataset.name,
-        "preset": config.preset,
-        "split": "test",
-        **to_json("psnr", float(np.mean([v.psnr for v in views]))),
-        "ssim": float(np.mean([v.ssim for v in views])),
-        **to_json("psnr_worst", worst.psnr),
-        "view_worst": worst.name,
-        "per_view": [{"name": v.name, **to_json("psnr", v.psnr), "ssim": v.ssim, "seconds": v.seconds} for v in views],
-        "primitives": model.count,
-        "parameters": model.count * model.parameters_per_primitive,
-        "parameters_per_primitive": model.parameters_per_primitive,
-        "model_bytes": model_bytes,
-        **training,
-        "render_fps": 1.0 / max(seconds[len(seconds) // 2], 1e-9),
-        "backend": choose_backend(lowered, config.renderer),
-        "device": f"cpu ({platform.processor() or platform.machine()})",
-        "checkpoint": "last",
-        "downsampling": dataset.downsampling,
-        "background": [round(float(x), 6) for x in dataset.background],
-        "color_space": dataset.color_space,
-        "data_source": dataset.data_source,
-        "train_views": len(dataset.train),
-        "seed": config.seed,
-        "non_default": {key: list(pair) for key, pair in config.non_default.items()},
-        "versions": {
-            "neuprim": neuprim.__version__,
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-            "numpy": np.__version__,
-        },
-    }
-
-
-# ---------------------------------------------------------------- a run directory
 
 
 def load_run(run_dir: Path) -> tuple[RunConfig, TaskSpec, Primitives, dict[str, Any]]:
@@ -144,28 +55,32 @@ def evaluate_run(run_dir: Path) -> dict[str, Any]:
     dataset = load_dataset(config, task)
     path = run_dir / "model.safetensors"
     training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
-    views = measure(model, dataset.test, config.renderer, dataset.background)
+    views = measure(model, dataset, config.renderer)
     return summary(config, model, dataset, views, path.stat().st_size, training)
 
 
-def display(image: Tensor, color_space: str) -> Tensor:
-    """(H, W, 3) display-referred copy of a rendered image: linear values get the sRGB curve, one channel becomes grey."""
-    if image.shape[-1] == 1:
-        image = image.expand(-1, -1, 3)
-    elif image.shape[-1] != 3:
-        image = torch.nn.functional.pad(image[..., :3], (0, 3 - min(image.shape[-1], 3)))
-    return images.linear_to_srgb(image.clamp_min(0.0)) if color_space == "linear" else image
-
-
 def render_run(
-    run_dir: Path, camera: str, size: tuple[int, int] | None, format: str, out: Path | None, frames: int, conditions: Mapping[str, str]
+    run_dir: Path,
+    camera: str,
+    size: tuple[int, int] | None,
+    format: str | None,
+    out: Path | None,
+    frames: int,
+    conditions: Mapping[str, str],
+    fps: float | None = None,
 ) -> list[Path]:
     """Draw a run's model: ``camera`` is "orbit", "test" or a JSON file of cameras (see :mod:`neuprim.core.camera_file`).
 
-    Writes one file per frame, or one animation for ``webp`` with more than one frame; returns the files.
+    Writes one file per view, or one animation for the formats of :data:`ANIMATIONS` with more than one view; returns the files.
+    Without a format, the suffix of ``out`` decides, else views that differ in a condition become a WebP animation and others PNGs.
+
+    Args:
+        conditions: name -> text, e.g. ``{"time": "0:1"}``.
+        fps: of an animation; None lets it last four seconds, at 5 to 30 frames per second.
 
     Raises:
         DataError, ConfigError, CheckpointError: bad cameras, conditions, or run directory.
+        BackendUnavailable: a format whose package is missing.
     """
     config, task, model, header = load_run(run_dir)
     background = torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)])
@@ -177,20 +92,21 @@ def render_run(
         views = dataset.orbit(frames) if camera == "orbit" else [dataset.test.view(i) for i in range(len(dataset.test))]
     if size is not None:
         views = [replace(v, camera=v.camera.resized(*size)) for v in views]
-    views = _with_conditions(views, task, conditions)
+    views, animated = with_conditions(views, task, conditions)
+    format = format or _format_of(out, animated)
 
     single = out is not None and out.suffix.lower() == f".{format}"
     folder = out if out is not None and not single else run_dir / "renders" / camera.removesuffix(".json").split("/")[-1]
-    animate = format == "webp" and len(views) > 1
+    animate = format in ANIMATIONS and len(views) > 1
     if single and len(views) > 1 and not animate:
         raise ConfigError(
             f"--out {out}: {len(views)} views do not fit one .{format} file; give a folder, or --format webp for an animation"
         )
     if animate:
-        target = out if single and out is not None else folder.with_suffix(".webp")
+        target = out if single and out is not None else folder.with_suffix(f".{format}")
         target.parent.mkdir(parents=True, exist_ok=True)
         stack = [display(draw(model, v, config.renderer, background), color_space) for v in views]
-        images.write_animation(target, stack, fps=min(30.0, max(len(views) / 4.0, 5.0)))
+        write_film(target, stack, fps or min(30.0, max(len(views) / 4.0, 5.0)))
         return [target]
     paths = []
     for v in views:
@@ -199,27 +115,43 @@ def render_run(
         image = draw(model, v, config.renderer, background)
         if format == "exr":
             images.write_exr(path, image if color_space == "linear" else images.srgb_to_linear(image.clamp_min(0.0)), half=False)
+        elif format == "png":
+            images.write_png(path, display(image, color_space))
         elif format == "webp":
             images.write_webp(path, display(image, color_space))
         else:
-            images.write_png(path, display(image, color_space))
+            write_film(path, [display(image, color_space)], fps or 12.0)
         paths.append(path)
     return paths
 
 
-def _with_conditions(views: list[View], task: TaskSpec, texts: Mapping[str, str]) -> list[View]:
-    """Views with the conditions the user gave; an animated condition repeats or stretches the cameras to its length."""
+def _format_of(out: Path | None, animated: bool) -> str:
+    suffix = "" if out is None else out.suffix.lower().removeprefix(".")
+    return suffix if suffix in FORMATS else "webp" if animated else "png"
+
+
+def with_conditions(views: list[View], task: TaskSpec, texts: Mapping[str, str]) -> tuple[list[View], bool]:
+    """Views with the conditions the user gave, and whether one of these is animated; an animated condition repeats or stretches the
+    cameras to its length.
+
+    Raises:
+        ConfigError: a view lacks a condition that the task needs.
+    """
+    animated = False
     for spec in task.conditions:
-        if spec.name not in texts:
-            continue
-        values = spec.parse(texts[spec.name])
-        if len(values) == 1:
-            views = [replace(v, conditions={**v.conditions, spec.name: values[0]}) for v in views]
-        else:
-            count = max(len(values), len(views))
-            pick = [(views[i * len(views) // count], values[i * len(values) // count]) for i in range(count)]
-            views = [replace(v, name=f"{v.name}_{i:03d}", conditions={**v.conditions, spec.name: x}) for i, (v, x) in enumerate(pick)]
-    return views
+        if spec.name in texts:
+            values = spec.parse(texts[spec.name])
+            if len(values) == 1:
+                views = [replace(v, conditions={**v.conditions, spec.name: values[0]}) for v in views]
+            else:
+                animated = True
+                count = max(len(values), len(views))
+                pick = [(views[i * len(views) // count], values[i * len(values) // count]) for i in range(count)]
+                views = [replace(v, name=f"{v.name}_{i:03d}", conditions={**v.conditions, spec.name: x}) for i, (v, x) in enumerate(pick)]
+        for v in views:
+            if spec.name not in v.conditions:
+                raise ConfigError(f"view {v.name} has no {spec.name}, which task {task.name!r} needs; give --{spec.name}")
+    return views, animated
 
 
 def _file_name(name: str) -> str:

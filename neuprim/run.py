@@ -23,7 +23,8 @@ from neuprim.core.errors import CheckpointError, DataError
 from neuprim.core.files import write_json, write_text
 from neuprim.core.primitives import Primitives
 from neuprim.core.train.trainer import Trainer, initial_model
-from neuprim.evaluate import display, draw, load_dataset, measure, summary
+from neuprim.evaluate import load_dataset
+from neuprim.measure import display, draw, measure, summary
 from neuprim.plugins.registry import load_task
 from neuprim.progress import RunProgress
 from neuprim.report import error_map, write_report
@@ -129,14 +130,23 @@ def _finish(trainer: Trainer, config: RunConfig, dataset: Dataset, directory: Pa
     folder = directory / "renders"
     folder.mkdir(exist_ok=True)
 
+    reels = {i: clip for clip in dataset.clips() for i in clip.views}
+    pictures: list[torch.Tensor] = []
+
     def keep(index: int, view: View, rendered: torch.Tensor, truth: torch.Tensor) -> None:
+        clip = reels.get(index)
+        if clip is not None:
+            pictures.append(images.to_uint8(torch.cat([display(x, dataset.color_space) for x in (truth, rendered)], dim=1)))
+            if index == clip.views[-1]:
+                images.write_animation(folder / f"clip_{clip.name}.webp", pictures, clip.fps)
+                pictures.clear()
         if index in shown:
             stem = f"test_{index:03d}_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in view.name)
             images.write_png(folder / f"{stem}.png", display(rendered, dataset.color_space))
             images.write_png(folder / f"{stem}_truth.png", display(truth, dataset.color_space))
             images.write_png(folder / f"{stem}_error.png", torch.from_numpy(error_map(rendered, truth)))
 
-    views = measure(model, dataset.test, config.renderer, dataset.background, keep)
+    views = measure(model, dataset, config.renderer, keep)
     size = (directory / "model.safetensors").stat().st_size
     training = {"iterations": trainer.step, "train_seconds": trainer.elapsed}
     write_json(directory / "metrics.json", summary(config, model, dataset, views, size, training))

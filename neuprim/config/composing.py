@@ -65,6 +65,7 @@ def _compose(overrides: Sequence[str], check_output: bool, files: Files) -> RunC
         _check_key(assignment, base, scene_name)
     plain, full = _merge(base, values)
     settings = _settings(full)
+    spec.check(vars(settings.model))
     scene = _scene(full["scene"], base["scene"], declared_paths)
     directory = output_directory(settings.output_dir, f"{spec.name}-{scene_name}", settings.resume, check_output)
     full["scene"] = scene

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, orbit
+from neuprim.core.errors import ConfigError
 from neuprim.core.fields import Conditions
 
-__all__ = ["DataSource", "Dataset", "Pixels", "PointCloud", "View", "ViewSet", "camera_extent"]
+if TYPE_CHECKING:
+    from neuprim.core.primitives import Primitives
+
+__all__ = ["Clip", "DataSource", "Dataset", "Pixels", "PointCloud", "View", "ViewSet", "camera_extent"]
 
 DataSource = Literal["real", "generated", "simulated"]
 """Photographs or captures ("real"), our own ray-cast scenes ("generated"), stand-ins for data not given ("simulated")."""
@@ -70,10 +74,26 @@ class ViewSet(ABC):
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points where matter probably is: means (N, 3) scene units, colors (N, C) in the data set's colour space."""
+    """Points where matter probably is.
+
+    Attributes:
+        means: (N, 3) scene units.
+        colors: (N, C) in the data set's colour space.
+        conditions: name -> (N,) condition at which a point was found ("time"), for data sets that have any.
+    """
 
     means: Tensor
     colors: Tensor
+    conditions: Mapping[str, Tensor] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Test views that make a film in their order (one camera over time, a light going round)."""
+
+    name: str
+    views: Sequence[int]
+    fps: float = 12.0
 
 
 class Dataset(ABC):
@@ -91,6 +111,7 @@ class Dataset(ABC):
         downsampling: text for reports, e.g. "none", "images_4" or "200x200 from 800x800 by area".
         up: (3,) the scene's upward direction, for orbits.
         center: (3,) what the cameras look at, for orbits.
+        bounds: (2, 3) lower and upper corner of a box around everything, scene units; None if the data do not say.
     """
 
     name: str
@@ -105,10 +126,35 @@ class Dataset(ABC):
     downsampling: str
     up: Tensor
     center: Tensor
+    bounds: Tensor | None = None
 
     @abstractmethod
     def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
         """At most ``count`` distinct starting points; the only randomness is ``generator``'s."""
+
+    def uniform_points(self, count: int, generator: torch.Generator) -> PointCloud:
+        """``count`` mid-grey points, uniform in the box of the data set.
+
+        Raises:
+            ConfigError: the data set has none.
+        """
+        if self.bounds is None:
+            raise ConfigError(f"model.init.points=box: {self.name} does not say which box its matter fills; expected matter")
+        low, high = self.bounds.float()
+        means = low + torch.rand((count, 3), generator=generator) * (high - low)
+        return PointCloud(means, torch.full((count, self.channels), 0.5))
+
+    def clips(self) -> list[Clip]:
+        """Films to make of the test views; none by default."""
+        return []
+
+    def mask(self, index: int) -> Tensor | None:
+        """(H, W) bool, the part of a test view whose error is worth reporting on its own; None: no such part."""
+        return None
+
+    def diagnose(self, model: Primitives) -> dict[str, Any]:
+        """Further JSON-able numbers for ``metrics.json`` that only this kind of data can tell."""
+        return {}
 
     def orbit(self, frames: int) -> list[View]:
         """Views circling the scene at the training cameras' mean distance and elevation."""

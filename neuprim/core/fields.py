@@ -158,6 +158,30 @@ class DensityField(Field):
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         """Rows whose density is ``factor`` (rows,) times as large everywhere (a clone in place halves both copies)."""
 
+    def alive(self, params: Params, conditions: Conditions) -> Tensor | None:
+        """(M,) int64 ascending rows that can absorb anything under these conditions; None for all of them.
+
+        The others are left out before anything else is computed, so they cost nothing in such a frame.
+        """
+        return None
+
+    def move(self, params: Params, geometry: Geometry, conditions: Conditions) -> Geometry:
+        """Where the ellipsoids are under these conditions; differentiable."""
+        return geometry
+
+    def divide(self, params: Params, geometry: Geometry) -> tuple[Tensor, dict[str, Tensor], Geometry] | None:
+        """A split along a condition instead of in space, for densities that live for a part of its range.
+
+        Args:
+            params: this field's tensors, one row per parent (P rows).
+            geometry: the parents'.
+
+        Returns:
+            (P,) bool of the parents that are better divided this way; this field's tensors and the geometry of 2 P rows, all
+            first halves then all second halves (rows of other parents are ignored). None: never.
+        """
+        return None
+
 
 class ColourField(Field):
     """What colour a primitive sends towards the camera."""

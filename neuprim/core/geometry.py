@@ -65,7 +65,7 @@ class Geometry:
         """(N, 3, 3), columns are the ellipsoid's axes in scene coordinates."""
         return quaternion_to_matrix(self.quats)
 
-    def __getitem__(self, rows: Tensor) -> Geometry:
+    def __getitem__(self, rows: Tensor | slice) -> Geometry:
         return Geometry(self.means[rows], self.log_scales[rows], self.quats[rows])
 
 

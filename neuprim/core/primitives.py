@@ -19,11 +19,15 @@ __all__ = ["Lowered", "Primitives"]
 
 @dataclass(frozen=True)
 class Lowered:
-    """What one frame hands to the renderer, whatever the task."""
+    """What one frame hands to the renderer, whatever the task.
+
+    ``rows`` (M,) int64 says which primitives these are where a field left some out; None for all.
+    """
 
     geometry: Geometry
     density: LoweredDensity
     colour: LoweredColour
+    rows: Tensor | None = None
 
 
 class Primitives:
@@ -75,13 +79,13 @@ class Primitives:
         return {s.name: self.params[s.name] for s in field.parameters()}
 
     def lower(self, camera: AnyCamera, conditions: Conditions) -> Lowered:
-        """Fold a frame's conditions into closed forms; differentiable."""
-        geometry = self.geometry
-        return Lowered(
-            geometry,
-            self.density.lower(self.of(self.density), geometry, conditions),
-            self.colour.lower(self.of(self.colour), geometry, camera, conditions),
-        )
+        """Fold a frame's conditions into closed forms; differentiable. Primitives that are not alive in it are left out."""
+        rows = self.density.alive(self.of(self.density), conditions)
+        params = self.params if rows is None else {name: value.index_select(0, rows) for name, value in self.params.items()}
+        own, tint = ({s.name: params[s.name] for s in field.parameters()} for field in (self.density, self.colour))
+        geometry = Geometry(params["means"], params["log_scales"], params["quats"])
+        geometry = self.density.move(own, geometry, conditions)
+        return Lowered(geometry, self.density.lower(own, geometry, conditions), self.colour.lower(tint, geometry, camera, conditions), rows)
 
     def rows(self, index: Tensor) -> dict[str, Tensor]:
         """Detached copies of some rows of every parameter."""

@@ -31,6 +31,7 @@ class InitContext:
         colors: (N, C) initial colours in the data set's own colour space.
         generator: the only source of randomness initialisers may use.
         settings: free settings of the preset (``model.init``), e.g. ``{"alpha": 0.8}``.
+        conditions: name -> (N,) condition at which each starting point was found ("time"), where the data set says so.
     """
 
     means: Tensor
@@ -38,6 +39,7 @@ class InitContext:
     colors: Tensor
     generator: torch.Generator
     settings: Mapping[str, object] = field(default_factory=dict)
+    conditions: Mapping[str, Tensor] = field(default_factory=dict)
 
     @property
     def count(self) -> int:

@@ -62,6 +62,8 @@ class TaskSpec:
             ``preset/NAME/*.yaml``.
         build: (model settings, dataset) -> the density and colour fields.
         loss: loss settings -> the training loss.
+        check: (model settings) raises :class:`~neuprim.core.errors.ConfigError` for choices the task does not have, before
+            any data is loaded.
     """
 
     api: int
@@ -72,6 +74,7 @@ class TaskSpec:
     build: Callable[[Mapping[str, Any], Dataset], tuple[DensityField, ColourField]]
     loss: Callable[[Mapping[str, Any]], Loss]
     conditions: tuple[ConditionSpec, ...] = ()
+    check: Callable[[Mapping[str, Any]], None] = lambda model: None
     fields: Mapping[str, type] | None = None
     """Class name -> field class, so that a saved model can be rebuilt from its header."""
 

@@ -32,6 +32,8 @@ WIDTH, HEIGHT = 360, 210
 BUCKETS = 120
 """A series of more points than twice this is drawn as medians of so many groups, inside a band from the least to the greatest."""
 
+UNITS = {"step": "steps", "frame": "frame"}
+
 LOG_RATIO = 4.0
 """Positive values that span at least this factor get a logarithmic axis, where one is asked for."""
 
@@ -47,7 +49,7 @@ def series(run: RunRecord, x: str, y: str) -> Series:
 
 
 def curve(training: Series, held_out: Series | None, x: str, label: str, log: bool = False) -> str | None:
-    """One chart over ``x`` ("seconds" or "step") as an ``<svg>`` element; None where there is nothing to draw.
+    """One chart over ``x`` ("seconds", "step" or "frame") as an ``<svg>`` element; None where there is nothing to draw.
 
     Args:
         training: drawn as a line, or as median and range where it has many points.
@@ -58,7 +60,7 @@ def curve(training: Series, held_out: Series | None, x: str, label: str, log: bo
     drawn = [s for s in (training, held_out) if s is not None and s[0].size]
     if not drawn:
         return None
-    unit, divisor = _time_unit(max(float(s[0].max()) for s in drawn)) if x == "seconds" else ("steps", 1.0)
+    unit, divisor = _time_unit(max(float(s[0].max()) for s in drawn)) if x == "seconds" else (UNITS[x], 1.0)
     with _look():
         figure, axes = _axes()
         if training[0].size:

@@ -39,6 +39,7 @@ def render_page(run: RunRecord) -> str:
         heading=sections.heading(run),
         banner=sections.banner(run),
         headline=sections.headline(run),
+        films=sections.films(run),
         held_out=sections.held_out(run),
         charts=sections.charts(run),
         view_table=sections.view_table(run),

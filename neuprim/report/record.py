@@ -2,7 +2,7 @@
 
 Expected files, each of which may be missing: ``config.yaml`` (resolved settings), ``metrics.json`` (final numbers), ``metrics.jsonl``
 (one JSON object per logged step) and ``renders/`` (held-out views as ``test_<index>_<name>.png`` with ``_truth`` and ``_error``
-beside them, and ``orbit.webp``).
+beside them, ``clip_<name>.webp`` with ground truth and render side by side, and ``orbit.webp``).
 """
 
 from __future__ import annotations
@@ -53,6 +53,7 @@ class RunRecord:
     unreadable_lines: int
     views: list[ViewFiles]
     orbit: Path | None
+    clips: list[Path]
 
     @property
     def finished(self) -> bool:
@@ -123,7 +124,8 @@ def read_run(run_dir: Path) -> RunRecord:
     config = {} if config_text is None else _parsed_config(config_file, config_text)
     log, unreadable = _log(_text(log_file) or "")
     views, orbit = _pictures(run_dir / "renders")
-    return RunRecord(run_dir, config_text, config, _metrics(metrics_file), log, unreadable, views, orbit)
+    clips = sorted((run_dir / "renders").glob("clip_*.webp"))
+    return RunRecord(run_dir, config_text, config, _metrics(metrics_file), log, unreadable, views, orbit, clips)
 
 
 def _text(path: Path) -> str | None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Iterable, Mapping
+
+import numpy as np
 
 from neuprim.core.metrics import from_json
 from neuprim.report.curves import curve, dots, series
@@ -11,7 +14,7 @@ from neuprim.report.pictures import ERROR_SCALE, Inlined, color_bar, inline
 from neuprim.report.record import RunRecord, ViewFiles, number, per_view
 from neuprim.report.text import MISSING, byte_size, count, decimal, duration, escape, setting
 
-__all__ = ["banner", "charts", "commands", "config", "facts", "headline", "heading", "held_out", "settings", "view_table"]
+__all__ = ["banner", "charts", "commands", "config", "facts", "films", "headline", "heading", "held_out", "settings", "view_table"]
 
 MAX_VIEWS = 24
 """Held-out views shown as pictures; of more, evenly spaced ones."""
@@ -92,12 +95,21 @@ def _final_tiles(run: RunRecord) -> list[Tile]:
         ("PSNR, mean", decimal(mean, 2), _unit("dB", mean), f"{count(views)} {split} view{'s' if views != 1 else ''}" if views else ""),
         ("PSNR, worst view", decimal(worst, 2), _unit("dB", worst), escape(name) if name else ""),
         ("SSIM", decimal(similarity, 4), "", "" if similarity is None else "mean over views"),
+        *_masked_tile(metrics),
         ("Primitives", count(metrics.get("primitives")), "", ""),
         ("Parameters", count(metrics.get("parameters")), "", "" if each is None else f"{count(each)} per primitive"),
         ("Model size", size, size_unit, ""),
         ("Training", duration(metrics.get("train_seconds")), "", "" if iterations is None else f"{count(iterations)} iterations"),
         ("Rendering", decimal(fps, 1 if fps is None or fps < 100 else 0), _unit("fps", fps), escape(backend) if backend else ""),
     ]
+
+
+def _masked_tile(metrics: Mapping[str, object]) -> list[Tile]:
+    inside, black = from_json(metrics, "psnr_mask"), from_json(metrics, "psnr_black_image_mask")
+    if inside is None:
+        return []
+    note = "where anything ever is" if black is None else f"where anything ever is; a black image: {decimal(black, 1)} dB"
+    return [("PSNR inside the mask", decimal(inside, 2), _unit("dB", inside), note)]
 
 
 def _unit(unit: str, value: float | None) -> str:
@@ -132,6 +144,15 @@ def _worst_name(run: RunRecord) -> str | None:
     known = [(value, entry.get("name")) for entry in per_view(run) if (value := from_json(entry, "psnr")) is not None]
     name = min(known, key=lambda pair: pair[0])[1] if known else None
     return None if name is None else str(name)
+
+
+def films(run: RunRecord) -> str:
+    """Held-out cameras over time, ground truth on the left and render on the right."""
+    figures = []
+    for path in run.clips:
+        name = escape(path.stem.removeprefix("clip_"))
+        figures.append(_figure(inline(path), f"{name}: ground truth, render", f"film of {name}, ground truth beside render", exists=True))
+    return _section("Held-out films", f'<div class="films">{"".join(figures)}</div>') if figures else ""
 
 
 def held_out(run: RunRecord) -> str:
@@ -200,6 +221,7 @@ def charts(run: RunRecord) -> str:
         ("PSNR over steps, dB", curve(series(run, steps, "psnr"), series(run, steps, "eval_psnr"), steps, "PSNR over steps")),
         ("Loss over steps", curve(series(run, steps, "loss"), None, steps, "Loss over steps", log=True)),
         ("PSNR per view, dB <small>dashed: mean</small>", _view_dots(run)),
+        ("PSNR over the frames of a film, dB", _frames(run)),
     )
     panels = "".join(f'<figure class="panel"><figcaption>{title}</figcaption>{svg}</figure>' for title, svg in table if svg)
     if not panels:
@@ -211,6 +233,17 @@ def charts(run: RunRecord) -> str:
 def _view_dots(run: RunRecord) -> str | None:
     values = [from_json(entry, "psnr") for entry in per_view(run)]
     return dots(values, from_json(run.metrics or {}, "psnr"), _worst_name(run), "PSNR per view")
+
+
+def _frames(run: RunRecord) -> str | None:
+    entries = run.field("per_frame")
+    if not isinstance(entries, list):
+        return None
+    values = [from_json(e, "psnr") if isinstance(e, Mapping) else None for e in entries]
+    pairs = [(float(i), v) for i, v in enumerate(values) if v is not None and math.isfinite(v)]
+    table = np.array(pairs, dtype=np.float64).reshape(-1, 2)
+    empty = np.zeros(0)
+    return curve((empty, empty), (table[:, 0], table[:, 1]), "frame", "PSNR over frames")
 
 
 def view_table(run: RunRecord) -> str:
@@ -262,7 +295,9 @@ def facts(run: RunRecord) -> str:
 def commands(run: RunRecord) -> str:
     """The commands that go on from here."""
     folder = shlex.quote(str(run.run_dir))
-    lines = ((f"neuprim eval {folder}", "measure again"), (f"neuprim render {folder} --camera orbit", "fly around the scene"))
+    lines = [(f"neuprim eval {folder}", "measure again"), (f"neuprim render {folder} --camera orbit", "fly around the scene")]
+    if run.clips:
+        lines.append((f"neuprim render {folder} --camera orbit --time 0:1", "fly around it while time goes by"))
     items = "".join(f"<li><code>{escape(line)}</code><span>{what}</span></li>" for line, what in lines)
     return _section("Go on", f'<ul class="commands">{items}</ul>')
 

@@ -250,7 +250,7 @@ def test_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: st
     monkeypatch.setattr(running, "_ORBIT_FRAMES", 2)
     scene, out = tiny.write_blender(tmp_path / "two"), tmp_path / "run"
     words = [
-        "task=static", "scene=blender", f"scene.path={scene}", f"preset={preset}", "model.density=gaussian", "model.primitives=30",
+        "task=static", "scene=blender", f"scene.path={scene}", f"preset={preset}", "model.density.form=gaussian", "model.primitives=30",
         "model.sh_degree=1", "train.iterations=120", "train.max_seconds=null", "train.log_every=5", "train.population.every=20",
         f"train.population.strategy={strategy}", "train.population.start=0", f"output_dir={out}",
     ]  # fmt: skip
@@ -270,11 +270,11 @@ def test_rates_are_still_checked(tmp_path: Path) -> None:
     words = [
         "scene=blender",
         f"scene.path={scene}",
-        "model.density=gaussian",
+        "model.density.form=gaussian",
         f"output_dir={tmp_path / 'run'}",
         "train.rates.log_amplitud=1",
     ]
     with pytest.raises(ConfigError, match=r"train\.rates\.log_amplitud: no such parameter; did you mean 'log_amplitude'"):
         running.run(compose(words), Console(quiet=True))
-    with pytest.raises(ConfigError, match=r"model\.density=gausian: expected cosine or gaussian"):
-        compose(["model.density=gausian"])
+    with pytest.raises(ConfigError, match=r"model\.density\.form='gausian': expected cosine or gaussian"):
+        compose(["model.density.form=gausian"])

@@ -77,8 +77,11 @@ def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings
     if settings.samples > 1:
         if isinstance(camera, RayCamera):
             raise ConfigError(f"renderer.samples={settings.samples}: only pinhole cameras are sampled; give a RayCamera more directions")
-        return render_samples(draw, lowered, camera, background, settings)
-    return draw(lowered, camera, background, settings)  # type: ignore[arg-type]
+        output = render_samples(draw, lowered, camera, background, settings)
+    else:
+        output = draw(lowered, camera, background, settings)  # type: ignore[arg-type]
+    output.stats.rows = lowered.rows
+    return output
 
 
 def probe(name: str) -> str | None:

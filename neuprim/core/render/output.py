@@ -21,6 +21,7 @@ class RenderStats:
         pixel_error: set this (H, W) map after the forward pass, and the backward pass fills the two sums below.
         weight: (N,) sum over pixels of alpha_i T_i; positive exactly for primitives the view saw.
         error_weight: (N,) sum over pixels of alpha_i T_i x pixel_error.
+        rows: which primitives the sums belong to where some were left out of the frame; None for all.
     """
 
     backend: str
@@ -28,7 +29,12 @@ class RenderStats:
     pixel_error: Tensor | None = None
     weight: Tensor | None = None
     error_weight: Tensor | None = None
+    rows: Tensor | None = None
     extra: dict[str, Any] = field(default_factory=dict)
+
+    def of_all(self, sums: Tensor, count: int) -> Tensor:
+        """(count,) sums of all primitives of the model, zero for those that were left out of the frame."""
+        return sums if self.rows is None else sums.new_zeros(count).index_copy_(0, self.rows, sums)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ class SampledStats(RenderStats):
 
     def __init__(self, fine: RenderStats, samples: int) -> None:
         self._fine, self._samples = fine, samples
-        super().__init__(fine.backend, fine.pairs, None, self._mean(fine.weight), self._mean(fine.error_weight), fine.extra)
+        super().__init__(fine.backend, fine.pairs, None, self._mean(fine.weight), self._mean(fine.error_weight), fine.rows, fine.extra)
 
     @property
     def pixel_error(self) -> Tensor | None:  # type: ignore[override]

@@ -66,7 +66,7 @@ def split(model: Primitives, parents: Tensor, shift: float, long_factor: float, 
     """Two children per parent, all first ones then all second ones, each carrying its parent's fields unchanged.
 
     Children sit at +-shift x the longest semi-axis, inside the parent's support; that axis shrinks by ``long_factor``,
-    the others by ``other_factor``.
+    the others by ``other_factor``. Parents that the density divides along a condition (time) stay where they are.
     """
     rows = torch.cat([parents, parents])
     old = {n: v.detach()[rows].clone() for n, v in model.params.items()}
@@ -80,7 +80,15 @@ def split(model: Primitives, parents: Tensor, shift: float, long_factor: float, 
     after = Geometry(before.means + sign * shift * reach * direction, before.log_scales + shrink.log(), before.quats)
     density = model.density.on_split({k: old[k] for k in model.of(model.density)}, before, after)
     colour = model.colour.on_split({k: old[k] for k in model.of(model.colour)}, before, after)
-    return {**old, "means": after.means, "log_scales": after.log_scales, **density, **colour}
+    children = {**old, "means": after.means, "log_scales": after.log_scales, **density, **colour}
+    first = slice(len(parents))
+    divided = model.density.divide({k: old[k][first] for k in model.of(model.density)}, before[first])
+    if divided is not None:
+        chosen, halves, place = divided
+        chosen = torch.cat([chosen, chosen])
+        for name, value in {**old, "means": place.means, "log_scales": place.log_scales, "quats": place.quats, **halves}.items():
+            children[name][chosen] = value[chosen]
+    return children
 
 
 class Relocate(Population):
@@ -99,8 +107,8 @@ class Relocate(Population):
             return
         if self.weight is None or self.error is None:
             self.weight, self.error = torch.zeros(model.count), torch.zeros(model.count)
-        self.weight += stats.weight
-        self.error += stats.error_weight
+        self.weight += stats.of_all(stats.weight, model.count)
+        self.error += stats.of_all(stats.error_weight, model.count)
 
     def intervene(self, model: Primitives, extent: float) -> Change | None:
         if self.weight is None or self.error is None:
@@ -155,7 +163,7 @@ class Gradient(Population):
             return
         if self.total is None or self.seen is None:
             self.total, self.seen = torch.zeros(model.count), torch.zeros(model.count)
-        saw = stats.weight > 0
+        saw = stats.of_all(stats.weight, model.count) > 0
         norm = torch.zeros(model.count)
         for name in model.of(model.density):
             grad = model.params[name].grad

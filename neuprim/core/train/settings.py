@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 from neuprim.core.errors import ConfigError
 
@@ -16,7 +16,8 @@ class ModelSettings:
 
     Attributes:
         primitives: primitives at the start (and throughout, unless population control grows them).
-        density: "cosine", the neural density, or "gaussian", the classical baseline, which runs on the reference backend alone.
+        density: which density the task builds; the task says what there is to choose, see its presets.
+        colour: the same for the colour.
         neurons: hidden width K of the cosine density, 0..16; 0 is a constant density. A Gaussian has none.
         sh_degree: spherical-harmonics degree of the colour, 0..3.
         sh_every: fraction of the budget after which one more SH band is unlocked; 0 unlocks all at once.
@@ -24,7 +25,8 @@ class ModelSettings:
     """
 
     primitives: int = 2000
-    density: Literal["cosine", "gaussian"] = "cosine"
+    density: dict[str, Any] = field(default_factory=dict)
+    colour: dict[str, Any] = field(default_factory=dict)
     neurons: int = 8
     sh_degree: int = 3
     sh_every: float = 0.1

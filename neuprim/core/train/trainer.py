@@ -52,11 +52,14 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
         DataError: the data set offers no starting point.
     """
     for key in settings.init:
-        known = ("scale", *density.init_settings, *colour.init_settings)
+        known = ("scale", "points", *density.init_settings, *colour.init_settings)
         if key not in known:
             raise ConfigError(f"model.init.{key}: no such setting{nearest(key, known)}")
     generator = torch.Generator().manual_seed(seed)
-    cloud = dataset.initial_points(settings.primitives, generator)
+    where = settings.init.get("points", "matter")
+    if where not in ("matter", "box"):
+        raise ConfigError(f"model.init.points={where!r}: expected matter or box")
+    cloud = (dataset.uniform_points if where == "box" else dataset.initial_points)(settings.primitives, generator)
     if len(cloud.means) == 0:
         raise DataError(f"{dataset.name}: no starting points found; expected points or images with visible content")
     if len(cloud.means) == 1:
@@ -66,7 +69,8 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
         distance = torch.from_numpy(cKDTree(cloud.means.numpy()).query(cloud.means.numpy(), k=neighbours + 1)[0][:, 1:])
         scales = distance.square().mean(dim=1).sqrt().clamp_min(1e-6 * dataset.extent).float()
     scales = scales * float(settings.init.get("scale", 1.0))
-    return Primitives.initialise(density, colour, InitContext(cloud.means.float(), scales, cloud.colors.float(), generator, settings.init))
+    context = InitContext(cloud.means.float(), scales, cloud.colors.float(), generator, settings.init, cloud.conditions)
+    return Primitives.initialise(density, colour, context)
 
 
 class Trainer:

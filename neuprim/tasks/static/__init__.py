@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from neuprim.core.choices import choose
 from neuprim.core.cosine import CosineDensity
 from neuprim.core.data import Dataset
 from neuprim.core.fields import ColourField, DensityField
@@ -17,8 +18,13 @@ __all__ = ["TASK"]
 
 
 def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
-    density = GaussianDensity() if model["density"] == "gaussian" else CosineDensity(model["neurons"])
+    density = GaussianDensity() if model["density"].get("form") == "gaussian" else CosineDensity(model["neurons"])
     return density, SphericalHarmonics(model["sh_degree"], dataset.channels, model["sh_every"])
+
+
+def _check(model: Mapping[str, Any]) -> None:
+    choose(model["density"], "model.density", {"form": ("cosine", "gaussian")})
+    choose(model["colour"], "model.colour", {})
 
 
 # Loaders are imported when used: each pulls in a library of its own.
@@ -61,5 +67,6 @@ TASK = TaskSpec(
     ),
     build=_build,
     loss=photometric,
+    check=_check,
     fields={"CosineDensity": CosineDensity, "GaussianDensity": GaussianDensity, "SphericalHarmonics": SphericalHarmonics},
 )

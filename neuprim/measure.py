@@ -1,0 +1,183 @@
+"""The numbers of a fitted model: every held-out view, their means, and what the data set adds.
+
+PSNR and SSIM compare float images in the data set's own colour space, unclamped and unquantised. A linear data set also gets
+both after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``). Where it marks a part of its views (the union of all that a
+camera ever sees of a volume), the error there counts on its own: a black background flatters.
+"""
+
+from __future__ import annotations
+
+import math
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import neuprim
+from neuprim.config import RunConfig
+from neuprim.core import images
+from neuprim.core.data import Dataset, View
+from neuprim.core.metrics import psnr, ssim, to_json
+from neuprim.core.primitives import Primitives
+from neuprim.core.render import RenderSettings, choose_backend, render
+
+__all__ = ["ViewMetrics", "display", "draw", "measure", "summary"]
+
+
+@dataclass(frozen=True)
+class ViewMetrics:
+    """One view's numbers.
+
+    Attributes:
+        psnr, ssim: in the data set's colour space.
+        seconds: of the forward pass alone.
+        more: further numbers by name: ``psnr_srgb``, ``ssim_srgb`` of linear images; ``psnr_mask`` and ``mse_mask`` inside the
+            data set's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without anything on it.
+    """
+
+    name: str
+    psnr: float
+    ssim: float
+    seconds: float
+    more: dict[str, float] = field(default_factory=dict)
+
+
+def draw(model: Primitives, view: View, settings: RenderSettings, background: Tensor) -> Tensor:
+    """(H, W, C) image of one view, without gradients."""
+    with torch.no_grad():
+        return render(model, view.camera, view.conditions, settings, background).rgb
+
+
+def display(image: Tensor, color_space: str) -> Tensor:
+    """(H, W, 3) display-referred copy of a rendered image: linear values get the sRGB curve, one channel becomes grey."""
+    if image.shape[-1] == 1:
+        image = image.expand(-1, -1, 3)
+    elif image.shape[-1] != 3:
+        image = torch.nn.functional.pad(image[..., :3], (0, 3 - min(image.shape[-1], 3)))
+    return images.linear_to_srgb(image.clamp_min(0.0)) if color_space == "linear" else image
+
+
+def measure(
+    model: Primitives,
+    dataset: Dataset,
+    settings: RenderSettings,
+    seen: Callable[[int, View, Tensor, Tensor], None] | None = None,
+) -> list[ViewMetrics]:
+    """Every view of the test split, composited over the data set's background.
+
+    ``seen(index, view, rendered, truth)`` is called for each, e.g. to keep pictures.
+    """
+    views, background = dataset.test, dataset.background
+    result = []
+    for i in range(len(views)):
+        view, pixels = views.view(i), views.pixels(i)
+        truth = pixels.over(background)
+        start = time.perf_counter()
+        rendered = draw(model, view, settings, background)
+        seconds = time.perf_counter() - start
+        if pixels.mask is not None:
+            rendered = torch.where(pixels.mask[..., None], rendered, truth)
+        more = _more(rendered, truth, dataset, dataset.mask(i), pixels.mask)
+        result.append(ViewMetrics(view.name, psnr(rendered, truth, pixels.mask), ssim(rendered, truth), seconds, more))
+        if seen is not None:
+            seen(i, view, rendered, truth)
+    return result
+
+
+def _more(rendered: Tensor, truth: Tensor, dataset: Dataset, part: Tensor | None, valid: Tensor | None) -> dict[str, float]:
+    more: dict[str, float] = {}
+    if dataset.color_space == "linear":
+        shown, wanted = (images.linear_to_srgb(x.clamp_min(0.0)) for x in (rendered, truth))
+        more |= {"psnr_srgb": psnr(shown, wanted, valid), "ssim_srgb": ssim(shown, wanted)}
+    if part is not None and bool(part.any()):
+        black = dataset.background.to(truth).expand_as(truth)
+        more["psnr_mask"] = psnr(rendered, truth, part)
+        more["mse_mask"] = float((rendered - truth)[part].double().square().mean())
+        more["psnr_black_image"], more["psnr_black_image_mask"] = psnr(black, truth), psnr(black, truth, part)
+    return more
+
+
+def summary(
+    config: RunConfig, model: Primitives, dataset: Dataset, views: Sequence[ViewMetrics], model_bytes: int, training: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The content of ``metrics.json``. ``training`` holds iterations and train_seconds as the run recorded them."""
+    worst = min(views, key=lambda v: v.psnr)
+    lowered = model.lower(dataset.test.view(0).camera, dataset.test.view(0).conditions)
+    seconds = sorted(v.seconds for v in views)
+    return {
+        "task": config.task,
+        "scene": config.scene_name,
+        "dataset": dataset.name,
+        "preset": config.preset,
+        "split": "test",
+        **to_json("psnr", float(np.mean([v.psnr for v in views]))),
+        "ssim": float(np.mean([v.ssim for v in views])),
+        **_means(views),
+        **to_json("psnr_worst", worst.psnr),
+        "view_worst": worst.name,
+        "per_view": [_entry(v) for v in views],
+        **_per_frame(dataset, views),
+        "primitives": model.count,
+        "parameters": model.count * model.parameters_per_primitive,
+        "parameters_per_primitive": model.parameters_per_primitive,
+        "model_bytes": model_bytes,
+        **training,
+        "render_fps": 1.0 / max(seconds[len(seconds) // 2], 1e-9),
+        "backend": choose_backend(lowered, config.renderer),
+        "device": f"cpu ({platform.processor() or platform.machine()})",
+        "checkpoint": "last",
+        "downsampling": dataset.downsampling,
+        "background": [round(float(x), 6) for x in dataset.background],
+        "color_space": dataset.color_space,
+        "data_source": dataset.data_source,
+        "train_views": len(dataset.train),
+        "seed": config.seed,
+        **dataset.diagnose(model),
+        "non_default": {key: list(pair) for key, pair in config.non_default.items()},
+        "versions": {
+            "neuprim": neuprim.__version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+        },
+    }
+
+
+def _entry(view: ViewMetrics) -> dict[str, Any]:
+    entry = {"name": view.name, **to_json("psnr", view.psnr), "ssim": view.ssim, "seconds": view.seconds}
+    for name, value in view.more.items():
+        entry |= to_json(name, value)
+    return entry
+
+
+def _means(views: Sequence[ViewMetrics]) -> dict[str, Any]:
+    """Means over views of the further numbers, and the PSNR of the mean squared error inside the mask ("pooled")."""
+    result: dict[str, Any] = {}
+    for name in sorted({key for v in views for key in v.more}):
+        values = [v.more[name] for v in views if name in v.more]
+        if name == "mse_mask":
+            error = float(np.mean(values))
+            result |= to_json("psnr_pooled_mask", -10.0 * math.log10(error) if error > 0 else math.inf)
+        else:
+            result |= to_json(name, float(np.mean(values)))
+    return result
+
+
+def _per_frame(dataset: Dataset, views: Sequence[ViewMetrics]) -> dict[str, Any]:
+    """Means over the clips of each of their frames, for data sets that have clips of one length."""
+    clips = [[views[i] for i in clip.views] for clip in dataset.clips()]
+    if not clips or len({len(c) for c in clips}) != 1:
+        return {}
+    frames = []
+    for same in zip(*clips, strict=True):
+        entry = to_json("psnr", float(np.mean([v.psnr for v in same]))) | {"ssim": float(np.mean([v.ssim for v in same]))}
+        for name in ("psnr_mask", "psnr_black_image"):
+            values = [v.more[name] for v in same if name in v.more]
+            entry |= to_json(name, float(np.mean(values))) if values else {}
+        frames.append(entry)
+    return {"per_frame": frames}

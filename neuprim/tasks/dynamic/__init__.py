@@ -1,0 +1,75 @@
+"""The dynamic task: smoke and fire, from OpenVDB sequences or from images with a time each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from neuprim.core.choices import choose
+from neuprim.core.data import Dataset
+from neuprim.core.errors import ConfigError
+from neuprim.core.fields import ColourField, ConditionSpec, DensityField
+from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
+from neuprim.core.train.losses import photometric
+from neuprim.tasks.dynamic.colour import FREQUENCIES, TimeHarmonics
+from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.dynamic.time import parse_times
+
+__all__ = ["TASK"]
+
+
+def _check(model: Mapping[str, Any]) -> None:
+    choose(model["density"], "model.density", {"time": str, "divide_above": float})
+    choose(model["colour"], "model.colour", {"frequencies": tuple(FREQUENCIES), "powers": int, "waves": int})
+    try:
+        _density(model)
+    except ValueError as error:
+        raise ConfigError(f"model.density.time: {error}") from error
+    try:
+        TimeHarmonics(model["sh_degree"], **model["colour"])
+    except ValueError as error:
+        raise ConfigError(f"model.colour: {error}") from error
+
+
+def _density(model: Mapping[str, Any]) -> TimeDensity:
+    return TimeDensity(model["neurons"], model["density"].get("time", "phase"), model["density"].get("divide_above", 0.0))
+
+
+def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
+    return _density(model), TimeHarmonics(model["sh_degree"], dataset.channels, model["sh_every"], **model["colour"])
+
+
+# Loaders are imported when used: each pulls in modules of its own.
+
+
+def _volume(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    from neuprim.tasks.dynamic.volume.scene import load
+
+    return load(settings, context)
+
+
+def _multiview(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    from neuprim.tasks.dynamic.multiview import load
+
+    return load(settings, context)
+
+
+TASK = TaskSpec(
+    api=API_VERSION,
+    name="dynamic",
+    summary="Smoke and fire over time, from OpenVDB sequences or images with a time each (time inside the density)",
+    config_package="neuprim.tasks.dynamic.conf",
+    scenes=(
+        SceneSpec("smoke_fire", "fire under dark smoke, 100 timesteps; simulated, or scene.vdb=DIR", _volume),
+        SceneSpec("colorful_smoke", "coloured smoke, 128 timesteps; simulated, or scene.vdb=DIR", _volume),
+        SceneSpec("ground_explosion", "a blast and its cloud, 130 timesteps; simulated, or scene.vdb=DIR", _volume),
+        SceneSpec("dust_tornado", "a column of dust, 100 timesteps; simulated, or scene.vdb=DIR", _volume),
+        SceneSpec("vdb", "any sequence of .vdb files: scene.vdb=DIR", _volume),
+        SceneSpec("multiview", "images with a time per frame (D-NeRF layout): scene.path=DIR", _multiview),
+    ),
+    build=_build,
+    loss=photometric,
+    check=_check,
+    conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_times),),
+    fields={"TimeDensity": TimeDensity, "TimeHarmonics": TimeHarmonics},
+)

@@ -1,0 +1,96 @@
+"""Colour that changes in time: the zero-order spherical-harmonics coefficient is a function of it (equations 10 to 12)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.core import sh
+from neuprim.core.fields import ColourField, Conditions, Constant
+from neuprim.core.geometry import Geometry
+from neuprim.core.ray_cameras import AnyCamera
+from neuprim.core.schema import InitContext, ParameterSpec, Params
+from neuprim.tasks.dynamic.density import time_of
+
+__all__ = ["TimeHarmonics"]
+
+FREQUENCIES = {"turns": 2 * math.pi, "printed": 1.0}
+"""Angle of the first Fourier term at xi = 1. The paper prints i xi, whose basis is nearly rank-deficient on [0, 1] (condition
+5e13); whole turns are well conditioned (2e5)."""
+
+
+class TimeHarmonics(ColourField):
+    """c = max(0, C0 S(xi) + sum of higher bands + 1/2), S(xi) = S0 + sum_i a_i xi^i + sum_i b_i cos(w i xi) + c_i sin(w i xi).
+
+    Per channel 1 + n + 2 l parameters in the zero-order coefficient, i = 1..n and 1..l; the higher bands do not change. With
+    n = l = 4, three channels and degree 3: 84 parameters, 39 at degree 0. ``frequencies`` chooses w, see :data:`FREQUENCIES`.
+    """
+
+    def __init__(
+        self,
+        degree: int = 3,
+        channels: int = 3,
+        sh_every: float = 0.0,
+        powers: int = 4,
+        waves: int = 4,
+        frequencies: str = "turns",
+    ) -> None:
+        if not isinstance(degree, int) or not 0 <= degree <= 3:
+            raise ValueError(f"spherical-harmonics degree {degree!r}; expected 0..3")
+        if not isinstance(channels, int) or channels < 1:
+            raise ValueError(f"{channels!r} colour channels; expected at least 1")
+        if not all(isinstance(n, int) and 0 <= n <= 16 for n in (powers, waves)):
+            raise ValueError(f"{powers!r} powers and {waves!r} waves; expected 0..16")
+        if frequencies not in FREQUENCIES:
+            raise ValueError(f"frequencies {frequencies!r}; expected {' or '.join(FREQUENCIES)}")
+        self.degree, self.channels, self.sh_every = degree, channels, sh_every
+        self.powers, self.waves, self.frequencies = powers, waves, frequencies
+        self.active = degree
+
+    def settings(self) -> dict[str, Any]:
+        names = ("degree", "channels", "powers", "waves", "frequencies")
+        return {name: getattr(self, name) for name in names}
+
+    def set_progress(self, progress: float) -> None:
+        self.active = min(self.degree, int(progress / self.sh_every + 1e-9)) if self.sh_every > 0 else self.degree
+
+    def parameters(self) -> list[ParameterSpec]:
+        C, rest = self.channels, sh.coefficient_count(self.degree) - 1
+        specs = [ParameterSpec("sh_dc", (C,), 1e-2, _initial_dc, group="colour")]
+        for name, terms in (("time_poly", self.powers), ("time_cos", self.waves), ("time_sin", self.waves)):
+            if terms:
+                specs.append(ParameterSpec(name, (terms, C), 5e-3, _zeros(terms, C), group="colour"))
+        if rest:
+            specs.append(ParameterSpec("sh_rest", (rest, C), 2e-3, _zeros(rest, C), group="colour"))
+        return specs
+
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
+        dc = params["sh_dc"]
+        xi = time_of(conditions)
+        waves = FREQUENCIES[self.frequencies] * xi * torch.arange(1, self.waves + 1, dtype=torch.float64, device=xi.device)
+        powers = xi ** torch.arange(1, self.powers + 1, dtype=torch.float64, device=xi.device)
+        for name, basis in (("time_poly", powers), ("time_cos", waves.cos()), ("time_sin", waves.sin())):
+            if name in params:
+                dc = dc + (params[name] * basis.to(dc)[:, None]).sum(1)
+        color = dc * sh.C0 + 0.5
+        if self.active:
+            offset = geometry.means - camera.position.to(geometry.means)
+            direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-30)
+            bands = sh.basis(direction, self.active)[:, 1:]
+            color = color + (bands[:, :, None] * params["sh_rest"][:, : bands.shape[1]]).sum(1)
+        return Constant(color.clamp_min(0.0))
+
+
+_DARKEST = 1e-3
+"""Initial colours start at least this far above zero: at zero and below, max(0, .) passes no gradient and black stays black."""
+
+
+def _initial_dc(ctx: InitContext) -> Tensor:
+    return ((ctx.colors.clamp_min(_DARKEST) - 0.5) / sh.C0).float()
+
+
+def _zeros(terms: int, channels: int) -> Any:
+    return lambda ctx: torch.zeros(ctx.count, terms, channels)

@@ -1,0 +1,169 @@
+"""A cosine density that changes in time: one frame's is a static one, so time costs nothing per pixel (method: "Density").
+
+What varies is chosen by name, several joined by "+":
+
+    phase    b1 + xi W_t                                        equation 13 of the paper; K parameters
+    offset   b2 + sum_j p_j cos(pi j xi) + q_j sin(pi j xi)     j = 1..4; 8 parameters
+    window   (w2, b2) (1 - u^2)^2, u = (xi - c)/tau, |u| < 1    the primitive lives from c - tau to c + tau; 2 parameters
+    motion   mu + v (xi - c) + a (xi - c)^2                     c of the window, else 1/2; 6 parameters
+
+xi is time over the sequence, 0..1. Primitives outside their window are left out of a frame before anything is computed.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cosine import OMEGA0, CosineDensity, cosine_density, split_cosine
+from neuprim.core.fields import Conditions, Cosine, DensityField
+from neuprim.core.geometry import Geometry
+from neuprim.core.schema import InitContext, ParameterSpec, Params
+
+__all__ = ["PARTS", "TimeDensity", "time_of"]
+
+PARTS = ("phase", "offset", "window", "motion")
+"""What may vary in time."""
+
+OFFSET_TERMS = 4
+_TURN = 2 * math.pi / OMEGA0  # of a phase that omega0 multiplies
+
+
+def time_of(conditions: Conditions) -> Tensor:
+    """The frame's time xi, a 0-dim float64 tensor.
+
+    Raises:
+        KeyError: the frame has no condition "time".
+    """
+    if "time" not in conditions:
+        raise KeyError("a dynamic model needs the condition 'time'")
+    return conditions["time"].detach().double().reshape(())
+
+
+class TimeDensity(DensityField):
+    """f(x~, xi) of K cosine neurons whose ``time`` parts vary, see the module; 5K + 1 parameters and those of the parts.
+
+    ``init`` of the model settings: as :class:`~neuprim.core.cosine.CosineDensity`, and ``window``, the half width tau of a fresh
+    window in units of the sequence, and ``rate``, the bound of U(-rate, rate) that W_t starts from.
+    """
+
+    init_settings = (*CosineDensity.init_settings, "window", "rate")
+
+    def __init__(self, neurons: int = 8, time: str = "phase", divide_above: float = 0.0) -> None:
+        parts = time.split("+") if isinstance(time, str) and time != "none" else []
+        if not isinstance(time, str) or any(p not in PARTS for p in parts) or len(set(parts)) != len(parts):
+            raise ValueError(f"{time!r}: expected none or some of {', '.join(PARTS)} joined by +")
+        self.static, self.divide_above = CosineDensity(neurons), divide_above
+        self.time, self.parts = "+".join(p for p in PARTS if p in parts) or "none", frozenset(parts)
+
+    def settings(self) -> dict[str, Any]:
+        return {"neurons": self.static.neurons, "time": self.time}
+
+    def parameters(self) -> list[ParameterSpec]:
+        K = self.static.neurons
+        specs = self.static.parameters()
+        if "phase" in self.parts:
+            specs.append(ParameterSpec("W_t", (K,), 3e-3, lambda c: c.uniform(K, bound=_number(c, "rate", 0.1))))
+        if "offset" in self.parts:
+            specs += [ParameterSpec(name, (OFFSET_TERMS,), 3e-3, _zeros(OFFSET_TERMS)) for name in ("offset_cos", "offset_sin")]
+        if "window" in self.parts:
+            specs.append(ParameterSpec("window_center", (1,), 3e-3, _initial_center))
+            specs.append(ParameterSpec("log_window", (1,), 1e-2, lambda c: torch.full((c.count, 1), math.log(_number(c, "window", 0.2)))))
+        if "motion" in self.parts:
+            specs += [ParameterSpec(name, (3,), 1e-2, _zeros(3), lr_unit="extent") for name in ("velocity", "acceleration")]
+        return specs
+
+    # ------------------------------------------------------------ one frame
+
+    def alive(self, params: Params, conditions: Conditions) -> Tensor | None:
+        if "window" not in self.parts:
+            return None
+        center, tau = params["window_center"].detach()[:, 0].double(), params["log_window"].detach()[:, 0].double().exp()
+        return ((time_of(conditions) - center).abs() < tau).nonzero()[:, 0]
+
+    def move(self, params: Params, geometry: Geometry, conditions: Conditions) -> Geometry:
+        if "motion" not in self.parts:
+            return geometry
+        since = self._since(params, conditions)
+        shift = (params["velocity"] + params["acceleration"] * since) * since
+        return Geometry(geometry.means + shift, geometry.log_scales, geometry.quats)
+
+    def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Cosine:
+        xi = time_of(conditions)
+        b1, w2, b2 = params["b1"], params["w2"], params["b2"]
+        if "phase" in self.parts:
+            b1 = _advance(b1, params["W_t"], xi)
+        if "offset" in self.parts:
+            angle = math.pi * xi * torch.arange(1, OFFSET_TERMS + 1, dtype=torch.float64, device=xi.device)
+            b2 = b2 + (params["offset_cos"] @ angle.cos().to(b2) + params["offset_sin"] @ angle.sin().to(b2))[:, None]
+        if "window" in self.parts:
+            u = (xi.to(b2) - params["window_center"]) / params["log_window"].exp()
+            weight = (1 - u.square()).clamp_min(0).square()
+            w2, b2 = w2 * weight, b2 * weight
+        return Cosine(params["W1"], b1, w2, b2, OMEGA0)
+
+    def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
+        return cosine_density(self.lower(params, geometry, conditions), self.move(params, geometry, conditions), prim, x)
+
+    def _since(self, params: Params, conditions: Conditions) -> Tensor:
+        """(N, 1) time since the middle of each primitive's life."""
+        xi = time_of(conditions).to(params["velocity"])
+        return xi - params["window_center"] if "window" in self.parts else (xi - 0.5).reshape(1, 1)
+
+    # ------------------------------------------------------------ population
+
+    def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
+        children = split_cosine(params, old, new)
+        if "offset" in self.parts:
+            r = (new.log_length_scale.double() - old.log_length_scale.double()).exp().to(params["b2"])[:, None]
+            for name in ("offset_cos", "offset_sin"):
+                children[name] = params[name] * r
+        return children
+
+    def divide(self, params: Params, geometry: Geometry) -> tuple[Tensor, dict[str, Tensor], Geometry] | None:
+        """Windows longer than ``divide_above`` are halved; the halves overlap, as windows fade at their ends."""
+        if "window" not in self.parts or self.divide_above <= 0:
+            return None
+        tau = params["log_window"].double().exp()
+        later = torch.cat([-0.5 * tau, 0.5 * tau]).float()
+        halves = {name: torch.cat([value, value]) for name, value in params.items()}
+        halves["window_center"] = halves["window_center"] + later
+        halves["log_window"] = halves["log_window"] + math.log(0.6)
+        means = torch.cat([geometry.means, geometry.means])
+        if "motion" in self.parts:
+            velocity, acceleration = halves["velocity"], halves["acceleration"]
+            means = means + (velocity + acceleration * later) * later
+            halves["velocity"] = velocity + 2 * acceleration * later
+        rows = Geometry(means, *(torch.cat([x, x]) for x in (geometry.log_scales, geometry.quats)))
+        return tau[:, 0] > self.divide_above, halves, rows
+
+    def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
+        scaled = self.static.scale_density(params, factor)
+        for name in ("offset_cos", "offset_sin"):
+            if name in params:
+                scaled[name] = params[name] * factor[:, None]
+        return scaled
+
+
+def _advance(b1: Tensor, W_t: Tensor, xi: Tensor) -> Tensor:
+    """b1 + xi W_t less whole turns: exact to float32 however far outside 0..1 the time lies, as only the remainder matters."""
+    phase = b1.double() + xi * W_t.double()
+    return (phase - _TURN * torch.round(phase.detach() / _TURN)).to(b1)
+
+
+def _zeros(width: int) -> Any:
+    return lambda ctx: torch.zeros(ctx.count, width)
+
+
+def _number(ctx: InitContext, name: str, default: float) -> float:
+    return float(ctx.settings.get(name, default))  # type: ignore[arg-type]
+
+
+def _initial_center(ctx: InitContext) -> Tensor:
+    """When the starting point was seen, else spread evenly at random over the sequence."""
+    if "time" in ctx.conditions:
+        return ctx.conditions["time"].float().reshape(-1, 1)
+    return (ctx.uniform(1) + 1) / 2

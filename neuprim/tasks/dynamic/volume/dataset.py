@@ -1,0 +1,143 @@
+"""Rendered volume sequences as a data set: 38 cameras to learn from, two held out, every frame a time."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuprim.core import images
+from neuprim.core.data import Clip, Dataset, DataSource, Pixels, PointCloud, View, ViewSet, camera_extent
+from neuprim.core.errors import DataError
+from neuprim.core.primitives import Primitives
+from neuprim.tasks.dynamic.volume.compare import compare_with_truth
+from neuprim.tasks.dynamic.volume.shoot import Shoot
+
+__all__ = ["MEMORY", "FrameViews", "VolumeDataset"]
+
+MEMORY = 2**30
+"""Bytes of decoded images that a split keeps; beyond them the oldest are read again when needed."""
+
+_MATTER = 1.0 / 255.0  # alpha from which a pixel belongs to the union mask
+
+
+class FrameViews(ViewSet):
+    """All frames of some cameras, camera by camera; half floats, decoded when first used."""
+
+    def __init__(self, shoot: Shoot, folder: Path, cameras: Sequence[int], exposure: float, memory: int = MEMORY) -> None:
+        self.shoot, self.folder, self.cameras, self.exposure, self.memory = shoot, folder, list(cameras), exposure, memory
+        self._kept: OrderedDict[int, Tensor] = OrderedDict()
+        count = len(shoot.frames)
+        self.times = [torch.tensor(t / max(count - 1, 1)) for t in range(count)]
+
+    def __len__(self) -> int:
+        return len(self.cameras) * len(self.times)
+
+    def view(self, index: int) -> View:
+        c, t = divmod(index, len(self.times))
+        frame = self.shoot.frames[t]
+        return View(f"cam_{self.cameras[c]:02d}_frame_{frame.number:04d}", self.shoot.cameras[self.cameras[c]], {"time": self.times[t]})
+
+    def pixels(self, index: int) -> Pixels:
+        rgba = self._decoded(index).float()
+        return Pixels(rgba[..., :3] / self.exposure, rgba[..., 3])
+
+    def _decoded(self, index: int) -> Tensor:
+        if index in self._kept:
+            self._kept.move_to_end(index)
+            return self._kept[index]
+        c, t = divmod(index, len(self.times))
+        camera = self.shoot.cameras[self.cameras[c]]
+        rgba = images.read_image(self.shoot.image(self.folder, self.shoot.frames[t], self.cameras[c]), (camera.width, camera.height))
+        self._kept[index] = rgba = rgba.half()
+        while len(self._kept) > 1 and len(self._kept) * rgba.numel() * 2 > self.memory:
+            self._kept.popitem(last=False)
+        return rgba
+
+
+class VolumeDataset(Dataset):
+    """A volume sequence seen by cameras; colours are linear radiance over ``exposure``, the brightest value any camera sees."""
+
+    train: FrameViews
+    test: FrameViews
+    channels = 3
+    color_space = "linear"
+    random_background = True
+
+    def __init__(self, name: str, source: DataSource, shoot: Shoot, folder: Path, held_out: Sequence[int], up: Tensor) -> None:
+        self.name, self.data_source = name, source
+        self.shoot, self.folder = shoot, folder
+        stored = [_stored(shoot.points(folder, frame)) for frame in shoot.frames]
+        self.exposure = max(float(s["brightest"]) for s in stored)
+        if not self.exposure > 0:
+            raise DataError(f"{name}: every frame is black from every camera; expected light (check scene.look and scene.grids)")
+        self.weights = [float(s["weight"]) for s in stored]
+        learned = [c for c in range(len(shoot.cameras)) if c not in held_out]
+        self.train = FrameViews(shoot, folder, learned, self.exposure)
+        self.test = FrameViews(shoot, folder, held_out, self.exposure)
+        self.extent = camera_extent(shoot.cameras)
+        self.background = torch.zeros(3)
+        camera = shoot.cameras[0]
+        self.downsampling = f"rendered at {camera.width}x{camera.height}, {shoot.samples}x{shoot.samples} rays per pixel"
+        self.up, self.center = up, torch.zeros(3, dtype=torch.float64)
+        self.bounds = torch.from_numpy(shoot.bounds)
+        self._masks: dict[int, Tensor] = {}
+
+    def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
+        """Points where some frame absorbs, as many of a frame as it has of the sequence's extinction, with the frame's time."""
+        total = np.array(self.weights)
+        if not total.sum() > 0:
+            raise DataError(f"{self.name}: no frame absorbs light; expected extinction somewhere")
+        share = torch.multinomial(torch.from_numpy(total), count, replacement=True, generator=generator)
+        per_frame = torch.bincount(share, minlength=len(total)).tolist()
+        means, colors, times = [], [], []
+        for t, wanted in enumerate(per_frame):
+            if not wanted:
+                continue
+            stored = _stored(self.shoot.points(self.folder, self.shoot.frames[t]))
+            points = torch.from_numpy(stored["means"])
+            rows = torch.randint(len(points), (wanted,), generator=generator) if wanted > len(points) else None
+            rows = torch.randperm(len(points), generator=generator)[:wanted] if rows is None else rows
+            means.append(points[rows])
+            colors.append(torch.from_numpy(stored["colors"])[rows] / self.exposure)
+            times.append(torch.full((wanted,), float(self.train.times[t])))
+        return PointCloud(torch.cat(means), torch.cat(colors), {"time": torch.cat(times)})
+
+    def clips(self) -> list[Clip]:
+        frames = len(self.shoot.frames)
+        return [Clip(f"cam_{c:02d}", range(i * frames, (i + 1) * frames), 24.0) for i, c in enumerate(self.test.cameras)]
+
+    def mask(self, index: int) -> Tensor:
+        """Pixels that show matter in some frame of the view's camera."""
+        frames = len(self.shoot.frames)
+        camera = index // frames
+        if camera not in self._masks:
+            alphas = (self.test.pixels(i).alpha for i in range(camera * frames, (camera + 1) * frames))
+            union = torch.zeros(self.test.view(index).camera.height, self.test.view(index).camera.width, dtype=torch.bool)
+            for alpha in alphas:
+                assert alpha is not None
+                union |= alpha > _MATTER
+            self._masks[camera] = union
+        return self._masks[camera]
+
+    def diagnose(self, model: Primitives) -> dict[str, Any]:
+        """The model's extinction against the files', and its size against theirs."""
+        return {
+            "exposure": self.exposure,
+            "vdb_bytes": sum(frame.path.stat().st_size for frame in self.shoot.frames),
+            "normalisation": self.shoot.normalisation.to_json(),
+            **compare_with_truth(model, self.shoot, [float(t) for t in self.train.times]),
+        }
+
+
+def _stored(path: Path) -> dict[str, Any]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in ("means", "colors", "weight", "brightest")}
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise DataError(f"{path}: damaged ({error}); delete its folder to render the frame again") from error

@@ -1,0 +1,115 @@
+"""``scene=smoke_fire`` and its like: OpenVDB files, given or simulated, as a data set."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neuprim.core.data import Dataset, DataSource
+from neuprim.core.errors import ConfigError, DataError, nearest
+from neuprim.core.task import SceneContext
+from neuprim.core.vdb import Frame, sequence
+from neuprim.tasks.dynamic.simulation import simulate
+from neuprim.tasks.dynamic.volume.dataset import VolumeDataset
+from neuprim.tasks.dynamic.volume.grids import GridReader, find_grids
+from neuprim.tasks.dynamic.volume.looks import named_look
+from neuprim.tasks.dynamic.volume.normalise import Normalisation
+from neuprim.tasks.dynamic.volume.optics import Light, Look
+from neuprim.tasks.dynamic.volume.rig import AXES, rig
+from neuprim.tasks.dynamic.volume.settings import VolumeSettings, choose_frames
+from neuprim.tasks.dynamic.volume.shoot import Shoot
+
+__all__ = ["load"]
+
+Progress = Callable[[str, float], None]
+
+
+def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """The data set of a volume scene: files found or simulated, surveyed, rendered from all cameras, kept in the cache.
+
+    Raises:
+        ConfigError: unknown setting or impossible value.
+        DataError: files that are missing, damaged, or without a usable grid; a cache that cannot be written.
+    """
+    asked = VolumeSettings.parse(settings)
+    look = _look(asked)  # a typing error shows before anything is simulated
+    folder, name, source = _files(asked, context)
+    frames = _frames(folder, asked)
+    reader = find_grids(frames, asked.grids)
+    box, hottest = _survey(frames, reader, context.progress)
+    if "flame_range" not in asked.optics and source == "real":
+        look = dataclasses.replace(look, flame_range=(0.0, hottest)) if hottest > 0 else look
+    normalisation = Normalisation.from_bounds(box)
+    train, test = rig(asked.size, asked.cameras, up=asked.up)
+    shoot = Shoot(frames, reader, look, [*train, *test], asked.samples, normalisation, normalisation.to_scene(box))
+    rendered = shoot.take(context.cache_dir, context.progress)
+    held_out = range(len(train), len(train) + len(test))
+    return VolumeDataset(name, source, shoot, rendered, held_out, torch.tensor(AXES[asked.up], dtype=torch.float64))
+
+
+def _files(asked: VolumeSettings, context: SceneContext) -> tuple[Path, str, DataSource]:
+    if asked.vdb is not None:
+        return asked.vdb, asked.vdb.name, "real"
+    assert asked.simulation is not None, "settings were checked"
+    folder = simulate(asked.simulation, asked.timesteps, asked.resolution, context.seed, context.cache_dir, context.progress)
+    return folder, f"{asked.simulation} (simulated)", "simulated"
+
+
+def _frames(folder: Path, asked: VolumeSettings) -> list[Frame]:
+    found = sequence(folder).frames
+    chosen = choose_frames(asked.frames, [f.number for f in found], str(folder))
+    return [f for f in found if f.number in set(chosen)]
+
+
+def _look(asked: VolumeSettings) -> Look:
+    """The look by name with the user's changes.
+
+    Raises:
+        ConfigError: no such look or setting, or an impossible value.
+    """
+    look = named_look(asked.look, asked.up)
+    known = {f.name: f for f in dataclasses.fields(Look)}
+    changes: dict[str, Any] = {}
+    for key, value in asked.optics.items():
+        if key not in known:
+            raise ConfigError(f"scene.optics.{key}: no such setting{nearest(key, known)}")
+        try:
+            if key == "light" and value is not None:
+                changes[key] = Light(tuple(value["direction"]), tuple(value["irradiance"]))
+            else:
+                changes[key] = tuple(tuple(v) if isinstance(v, list) else v for v in value) if isinstance(value, list) else value
+            look = dataclasses.replace(look, **changes)
+        except (TypeError, KeyError, ValueError) as error:
+            raise ConfigError(f"scene.optics.{key}={value!r}: {error}") from error
+    return look
+
+
+def _survey(frames: list[Frame], reader: GridReader, progress: Progress) -> tuple[np.ndarray, float]:
+    """(2, 3) box around all matter of all frames, world units, and the largest flame.
+
+    Raises:
+        DataError: no frame has any active voxel.
+    """
+    lows, highs, hottest = [], [], 0.0
+    extinction = "density" if "density" in reader.names else "temperature"
+    for i, frame in enumerate(frames):
+        progress(f"looking through frame {i + 1} of {len(frames)}", i / len(frames))
+        for meaning, grid in reader.read(frame.path).items():
+            bounds = grid.world_bounds()
+            if bounds is None:
+                continue
+            if meaning == extinction:
+                lows.append(bounds[0])
+                highs.append(bounds[1])
+            elif meaning == "flames" and grid.range is not None:
+                hottest = max(hottest, grid.range[1])
+    if not lows:
+        where = os.path.commonpath([f.path for f in frames])
+        raise DataError(f"{where}: no frame has an active voxel of {reader.names[extinction]!r}; expected matter in at least one")
+    return np.stack([np.min(lows, 0), np.max(highs, 0)]), hottest

@@ -1,0 +1,154 @@
+"""Images of every frame from every camera, rendered once and kept on disk.
+
+    volumes/KEY/scene.json                 what was rendered, and how scene units map to the files' world
+    volumes/KEY/frame_00012/cam_07.exr     linear RGB radiance and alpha, premultiplied, half floats
+    volumes/KEY/frame_00012/points.npz     where the frame's matter is, for starting points
+
+A frame's folder appears under its name only when complete, so an interrupted run goes on with the frames that are missing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuprim.core import images
+from neuprim.core.cameras import Camera
+from neuprim.core.errors import DataError
+from neuprim.core.files import write_json
+from neuprim.core.vdb import Frame
+from neuprim.tasks.dynamic.volume.grids import GridReader
+from neuprim.tasks.dynamic.volume.march import integrate
+from neuprim.tasks.dynamic.volume.medium import Medium
+from neuprim.tasks.dynamic.volume.normalise import Normalisation
+from neuprim.tasks.dynamic.volume.optics import Look, medium_of
+
+__all__ = ["RENDERER_VERSION", "Shoot"]
+
+RENDERER_VERSION = 1
+"""Part of the cache's key: to be raised with every change to the march, the optics, the rig or the files' layout."""
+
+POINTS = 8192
+"""Starting points kept per frame."""
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Shoot:
+    """Everything the images depend on.
+
+    Attributes:
+        frames: the files, in order.
+        reader: which grids mean what.
+        cameras: all of them, those held out included.
+        bounds: (2, 3) box around all matter, scene units.
+    """
+
+    frames: Sequence[Frame]
+    reader: GridReader
+    look: Look
+    cameras: Sequence[Camera]
+    samples: int
+    normalisation: Normalisation
+    bounds: np.ndarray
+
+    def key(self) -> str:
+        """A short hash of all of it; files count by name, size and time of change."""
+        stats = [(f.number, str(f.path), f.path.stat().st_size, f.path.stat().st_mtime_ns) for f in self.frames]
+        cameras = [(c.viewmat.tolist(), c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in self.cameras]
+        parts = [RENDERER_VERSION, stats, asdict(self.look), dict(self.reader.names), cameras, self.samples, self.normalisation.to_json()]
+        return hashlib.sha256(json.dumps(parts, default=_plain).encode()).hexdigest()[:16]
+
+    def medium(self, frame: Frame) -> Medium:
+        """What a frame's file holds, as extinction and radiance."""
+        return medium_of(self.reader.read(frame.path), self.look, self.normalisation)
+
+    def image(self, folder: Path, frame: Frame, camera: int) -> Path:
+        """File of one image."""
+        return folder / f"frame_{frame.number:05d}" / f"cam_{camera:02d}.exr"
+
+    def points(self, folder: Path, frame: Frame) -> Path:
+        """File of a frame's points: means (M, 3) scene units, colors (M, 3) linear radiance, weight (), the frame's total extinction."""
+        return folder / f"frame_{frame.number:05d}" / "points.npz"
+
+    def take(self, cache_dir: Path, progress: Progress) -> Path:
+        """Render what is missing; returns the folder.
+
+        Raises:
+            DataError: a file cannot be read, or the cache cannot be written.
+        """
+        folder = cache_dir / "volumes" / self.key()
+        try:
+            for i, frame in enumerate(self.frames):
+                if not self.points(folder, frame).is_file():
+                    progress(f"rendering the ground truth, frame {i + 1} of {len(self.frames)}", i / len(self.frames))
+                    self._take_frame(folder, frame)
+            if not (folder / "scene.json").is_file():
+                write_json(folder / "scene.json", self.describe())
+        except OSError as error:
+            raise DataError(f"cannot write the rendered images to {folder}: {error}") from error
+        return folder
+
+    def describe(self) -> dict[str, Any]:
+        """What ``scene.json`` holds."""
+        return {
+            "renderer_version": RENDERER_VERSION,
+            "frames": [{"number": f.number, "file": str(f.path)} for f in self.frames],
+            "grids": dict(self.reader.names),
+            "look": json.loads(json.dumps(asdict(self.look), default=_plain)),
+            "cameras": len(self.cameras),
+            "size": [self.cameras[0].width, self.cameras[0].height],
+            "samples": self.samples,
+            "normalisation": self.normalisation.to_json(),
+        }
+
+    def _take_frame(self, folder: Path, frame: Frame) -> None:
+        medium = self.medium(frame)
+        final = folder / f"frame_{frame.number:05d}"
+        folder.mkdir(parents=True, exist_ok=True)
+        draft = Path(tempfile.mkdtemp(prefix=f".{final.name}-", dir=folder))
+        try:
+            draft.chmod(0o755)
+            brightest = 0.0
+            for c, camera in enumerate(self.cameras):
+                rgba = integrate(medium, camera, samples=self.samples)
+                brightest = max(brightest, float(rgba[..., :3].max()))
+                images.write_exr(draft / f"cam_{c:02d}.exr", rgba, half=True)
+            np.savez(draft / "points.npz", brightest=np.float32(brightest), **_points(medium, frame.number))
+            if final.exists():  # of a run that was cut short while publishing
+                shutil.rmtree(final)
+            os.replace(draft, final)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+
+
+def _points(medium: Medium, seed: int) -> dict[str, Any]:
+    """Points drawn where the extinction is, in proportion to it, with jitter inside their voxels."""
+    generator = np.random.default_rng(seed)
+    sigma = medium.values[..., 0]
+    total = float(sigma.sum(dtype=np.float64))
+    if total <= 0:
+        return {"means": np.zeros((0, 3), np.float32), "colors": np.zeros((0, 3), np.float32), "weight": np.float64(0)}
+    cumulative = np.cumsum(sigma.ravel(), dtype=np.float64)
+    flat = np.searchsorted(cumulative, generator.random(POINTS) * cumulative[-1], side="right").clip(max=sigma.size - 1)
+    index = np.stack(np.unravel_index(flat, sigma.shape), -1)
+    values = medium.values.reshape(-1, 4)[flat]
+    jittered = index + generator.random((POINTS, 3)) - 0.5
+    means = jittered @ medium.scene_from_index[:3, :3].T + medium.scene_from_index[:3, 3]
+    colors = values[:, 1:] / np.maximum(values[:, :1], 1e-12)
+    cell = abs(float(np.linalg.det(medium.scene_from_index[:3, :3])))
+    return {"means": means.astype(np.float32), "colors": colors.astype(np.float32), "weight": np.float64(total * cell)}
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else str(value)

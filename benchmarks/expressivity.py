@@ -20,7 +20,7 @@ import json
 import multiprocessing
 import sys
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +32,10 @@ from tables import between_markers
 
 from neuprim.config import compose
 from neuprim.core.checkpoint import save_model
-from neuprim.core.train.trainer import Trainer, initial_model
 from neuprim.evaluate import load_dataset
 from neuprim.measure import measure, summary
 from neuprim.plugins.registry import load_task
+from neuprim.run import make_trainer
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "expressivity.json"
@@ -110,10 +110,8 @@ def train(job: Job, words: list[str], iterations: int, backend: str, target: Pat
     ], check_output=False)  # fmt: skip
     task = load_task(config.task)
     dataset = load_dataset(config, task)
-    model = initial_model(*task.build({**vars(config.model), "options": config.options}, dataset), dataset, config.model, config.seed)
-    others = task.parameter_names() - model.params.keys()  # the preset has rates for all densities
-    settings = replace(config.train, rates={k: v for k, v in config.train.rates.items() if k not in others})
-    trainer = Trainer(model, dataset, task.loss(vars(config.train)), settings, config.renderer, config.seed)
+    trainer = make_trainer(config, task, dataset)
+    model = trainer.model
     for _ in trainer.run():
         pass
     for field in (model.density, model.colour):

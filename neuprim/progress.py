@@ -49,15 +49,16 @@ class RunProgress:
     def preparing(self, text: str, fraction: float) -> None:
         """Work before the training loop."""
         self.bar.update(self.task, description=self.title, completed=fraction, info=text)
-        if not self.live and text != self._stage:
-            self.note(text)
+        if not self.live and (text != self._stage or fraction >= self._printed + 0.25):
+            self._printed = fraction
+            self.note(f"{text}, {fraction:.0%}" if fraction > 0 else text)
         self._stage = text
 
     def step(self, report: StepReport, progress: float) -> None:
         """One training step."""
         self._smooth = report.psnr if self._smooth is None else 0.98 * self._smooth + 0.02 * report.psnr
         if self._stage != "training":
-            self._stage = "training"
+            self._stage, self._printed = "training", -1.0
             self.bar.reset(self.task)
         info = f"step {report.step}  train {self._smooth:.2f} dB{self._held_out}  {report.primitives} primitives"
         self.bar.update(self.task, completed=progress, info=info)

@@ -22,6 +22,7 @@ from neuprim.core.data import Dataset, View
 from neuprim.core.errors import CheckpointError, DataError
 from neuprim.core.files import write_json, write_text
 from neuprim.core.primitives import Primitives
+from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer, initial_model
 from neuprim.evaluate import load_dataset
 from neuprim.measure import display, draw, measure, summary
@@ -29,7 +30,7 @@ from neuprim.plugins.registry import load_task
 from neuprim.progress import RunProgress
 from neuprim.report import error_map, write_report
 
-__all__ = ["run"]
+__all__ = ["make_trainer", "run"]
 
 _CURVE_VIEWS = 5  # held-out views behind the curve's eval_psnr
 _SHOWN_VIEWS = 8  # held-out views in renders/ and the report
@@ -51,14 +52,8 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
         dataset = load_dataset(config, task, progress.preparing)
         if len(dataset.test) == 0:
             raise DataError(f"{dataset.name}: the test split is empty")
-        density, colour = task.build({**vars(config.model), "options": config.options}, dataset)
         progress.preparing("starting points", 0.0)
-        model = initial_model(density, colour, dataset, config.model, config.seed)
-        # A preset has rates for every density and colour of its task; the trainer refuses names that the model does not have.
-        others = task.parameter_names() - model.params.keys()
-        settings = replace(config.train, rates={k: v for k, v in config.train.rates.items() if k not in others})
-        loss = task.loss({**vars(config.train), "options": config.options})
-        trainer = Trainer(model, dataset, loss, settings, config.renderer, config.seed)
+        trainer = make_trainer(config, task, dataset)
         saved = directory / "checkpoint.safetensors"
         if config.resume and saved.exists():
             header, tensors = checkpoint.read(saved, "checkpoint")
@@ -74,6 +69,22 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
     if interrupted:
         raise KeyboardInterrupt
     return directory
+
+
+def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset) -> Trainer:
+    """A fresh model of a run's configuration and what fits it.
+
+    Raises:
+        ConfigError: a rate or starting value for something the model does not have.
+        DataError: the data set offers no starting point.
+    """
+    density, colour = task.build({**vars(config.model), "options": config.options}, dataset)
+    model = initial_model(density, colour, dataset, config.model, config.seed)
+    # A preset has rates for every density and colour of its task; the trainer refuses names that the model does not have.
+    others = task.parameter_names() - model.params.keys()
+    settings = replace(config.train, rates={k: v for k, v in config.train.rates.items() if k not in others})
+    loss = task.loss({**vars(config.train), "options": config.options})
+    return Trainer(model, dataset, loss, settings, config.renderer, config.seed)
 
 
 def _train(trainer: Trainer, config: RunConfig, dataset: Dataset, progress: RunProgress) -> bool:

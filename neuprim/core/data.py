@@ -164,7 +164,11 @@ class Dataset(ABC):
         up = self.up.double() / self.up.double().norm()
         sine = ((offsets @ up) / offsets.norm(dim=-1).clamp_min(1e-12)).mean().clamp(-0.9, 0.9)
         views = orbit(cameras[0], self.center, self.up, radius, torch.asin(sine).item(), frames)
-        return [View(f"orbit_{i:03d}", c) for i, c in enumerate(views)]
+        return [View(f"orbit_{i:03d}", c, self.orbit_conditions(i / max(frames - 1, 1))) for i, c in enumerate(views)]
+
+    def orbit_conditions(self, fraction: float) -> Conditions:
+        """What an orbit's frame depends on besides its camera, ``fraction`` 0..1 of the way round."""
+        return {}
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:

@@ -126,6 +126,11 @@ class Field(ABC):
     def settings(self) -> dict[str, Any]:
         """JSON-able constructor arguments; ``type(self)(**settings)`` rebuilds the field from a checkpoint header."""
 
+    @classmethod
+    def every_parameter(cls) -> list[ParameterSpec]:
+        """The parameters that it has at any settings; a preset may give rates for all of them."""
+        return cls().parameters()
+
     def set_progress(self, progress: float) -> None:  # noqa: B027 - a hook most fields do not need
         """Called before every training step with the used fraction of the budget, 0..1; e.g. to unlock SH bands."""
 

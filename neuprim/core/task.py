@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from neuprim.core.data import Dataset
-from neuprim.core.fields import ColourField, ConditionSpec, DensityField
+from neuprim.core.fields import ColourField, ConditionSpec, DensityField, Field
 
 __all__ = ["API_VERSION", "Loss", "SceneContext", "SceneSpec", "TaskSpec"]
 
@@ -75,11 +75,11 @@ class TaskSpec:
     loss: Callable[[Mapping[str, Any]], Loss]
     conditions: tuple[ConditionSpec, ...] = ()
     check: Callable[[Mapping[str, Any]], None] = lambda model: None
-    fields: Mapping[str, type] | None = None
+    fields: Mapping[str, type[Field]] | None = None
     """Class name -> field class, so that a saved model can be rebuilt from its header."""
 
     def parameter_names(self) -> set[str]:
-        """Names of the parameters that the task's fields have at their default settings.
+        """Names of the parameters that the task's fields have at any settings.
 
         A preset may give rates for all of them, although a model has only one of the densities and one of the colours.
         Fields that cannot be made without settings are left out.
@@ -87,7 +87,7 @@ class TaskSpec:
         names = set()
         for field in (self.fields or {}).values():
             try:
-                names |= {spec.name for spec in field().parameters()}
+                names |= {spec.name for spec in field.every_parameter()}
             except TypeError:  # a required setting
                 continue
         return names

@@ -62,6 +62,10 @@ class TimeDensity(DensityField):
     def settings(self) -> dict[str, Any]:
         return {"neurons": self.static.neurons, "time": self.time}
 
+    @classmethod
+    def every_parameter(cls) -> list[ParameterSpec]:
+        return cls(time="+".join(PARTS)).parameters()
+
     def parameters(self) -> list[ParameterSpec]:
         K = self.static.neurons
         specs = self.static.parameters()

@@ -14,7 +14,9 @@ from torch import Tensor
 from neuprim.core import images
 from neuprim.core.data import Clip, Dataset, DataSource, Pixels, PointCloud, View, ViewSet, camera_extent
 from neuprim.core.errors import DataError
+from neuprim.core.fields import Conditions
 from neuprim.core.primitives import Primitives
+from neuprim.tasks.dynamic.dead import dead_fraction
 from neuprim.tasks.dynamic.volume.compare import compare_with_truth
 from neuprim.tasks.dynamic.volume.shoot import Shoot
 
@@ -27,20 +29,26 @@ _MATTER = 1.0 / 255.0  # alpha from which a pixel belongs to the union mask
 
 
 class FrameViews(ViewSet):
-    """All frames of some cameras, camera by camera; half floats, decoded when first used."""
+    """Frames of some cameras, camera by camera; half floats, decoded when first used.
 
-    def __init__(self, shoot: Shoot, folder: Path, cameras: Sequence[int], exposure: float, memory: int = MEMORY) -> None:
+    ``every`` = n leaves out all but every n-th frame; times stay those of the whole sequence.
+    """
+
+    def __init__(
+        self, shoot: Shoot, folder: Path, cameras: Sequence[int], exposure: float, every: int = 1, memory: int = MEMORY
+    ) -> None:
         self.shoot, self.folder, self.cameras, self.exposure, self.memory = shoot, folder, list(cameras), exposure, memory
         self._kept: OrderedDict[int, Tensor] = OrderedDict()
         count = len(shoot.frames)
-        self.times = [torch.tensor(t / max(count - 1, 1)) for t in range(count)]
+        self.frames = shoot.frames[::every]
+        self.times = [torch.tensor(t / max(count - 1, 1)) for t in range(0, count, every)]
 
     def __len__(self) -> int:
         return len(self.cameras) * len(self.times)
 
     def view(self, index: int) -> View:
         c, t = divmod(index, len(self.times))
-        frame = self.shoot.frames[t]
+        frame = self.frames[t]
         return View(f"cam_{self.cameras[c]:02d}_frame_{frame.number:04d}", self.shoot.cameras[self.cameras[c]], {"time": self.times[t]})
 
     def pixels(self, index: int) -> Pixels:
@@ -53,7 +61,7 @@ class FrameViews(ViewSet):
             return self._kept[index]
         c, t = divmod(index, len(self.times))
         camera = self.shoot.cameras[self.cameras[c]]
-        rgba = images.read_image(self.shoot.image(self.folder, self.shoot.frames[t], self.cameras[c]), (camera.width, camera.height))
+        rgba = images.read_image(self.shoot.image(self.folder, self.frames[t], self.cameras[c]), (camera.width, camera.height))
         self._kept[index] = rgba = rgba.half()
         while len(self._kept) > 1 and len(self._kept) * rgba.numel() * 2 > self.memory:
             self._kept.popitem(last=False)
@@ -69,16 +77,16 @@ class VolumeDataset(Dataset):
     color_space = "linear"
     random_background = True
 
-    def __init__(self, name: str, source: DataSource, shoot: Shoot, folder: Path, held_out: Sequence[int], up: Tensor) -> None:
+    def __init__(self, name: str, source: DataSource, shoot: Shoot, folder: Path, held_out: Sequence[int], up: Tensor, every: int = 1) -> None:
         self.name, self.data_source = name, source
-        self.shoot, self.folder = shoot, folder
+        self.shoot, self.folder, self.every = shoot, folder, every
         stored = [_stored(shoot.points(folder, frame)) for frame in shoot.frames]
         self.exposure = max(float(s["brightest"]) for s in stored)
         if not self.exposure > 0:
             raise DataError(f"{name}: every frame is black from every camera; expected light (check scene.look and scene.grids)")
         self.weights = [float(s["weight"]) for s in stored]
         learned = [c for c in range(len(shoot.cameras)) if c not in held_out]
-        self.train = FrameViews(shoot, folder, learned, self.exposure)
+        self.train = FrameViews(shoot, folder, learned, self.exposure, every)
         self.test = FrameViews(shoot, folder, held_out, self.exposure)
         self.extent = camera_extent(shoot.cameras)
         self.background = torch.zeros(3)
@@ -91,6 +99,7 @@ class VolumeDataset(Dataset):
     def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
         """Points where some frame absorbs, as many of a frame as it has of the sequence's extinction, with the frame's time."""
         total = np.array(self.weights)
+        total[[t for t in range(len(total)) if t % self.every]] = 0.0  # nothing is known of frames that are not learned from
         if not total.sum() > 0:
             raise DataError(f"{self.name}: no frame absorbs light; expected extinction somewhere")
         share = torch.multinomial(torch.from_numpy(total), count, replacement=True, generator=generator)
@@ -105,8 +114,11 @@ class VolumeDataset(Dataset):
             rows = torch.randperm(len(points), generator=generator)[:wanted] if rows is None else rows
             means.append(points[rows])
             colors.append(torch.from_numpy(stored["colors"])[rows] / self.exposure)
-            times.append(torch.full((wanted,), float(self.train.times[t])))
+            times.append(torch.full((wanted,), float(self.test.times[t])))
         return PointCloud(torch.cat(means), torch.cat(colors), {"time": torch.cat(times)})
+
+    def orbit_conditions(self, fraction: float) -> Conditions:
+        return {"time": torch.tensor(fraction)}
 
     def clips(self) -> list[Clip]:
         frames = len(self.shoot.frames)
@@ -131,7 +143,8 @@ class VolumeDataset(Dataset):
             "exposure": self.exposure,
             "vdb_bytes": sum(frame.path.stat().st_size for frame in self.shoot.frames),
             "normalisation": self.shoot.normalisation.to_json(),
-            **compare_with_truth(model, self.shoot, [float(t) for t in self.train.times]),
+            "dead_fraction": dead_fraction(model, self.test.times),
+            **compare_with_truth(model, self.shoot, [float(t) for t in self.test.times]),
         }
 
 

@@ -50,7 +50,8 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     shoot = Shoot(frames, reader, look, [*train, *test], asked.samples, normalisation, normalisation.to_scene(box))
     rendered = shoot.take(context.cache_dir, context.progress)
     held_out = range(len(train), len(train) + len(test))
-    return VolumeDataset(name, source, shoot, rendered, held_out, torch.tensor(AXES[asked.up], dtype=torch.float64))
+    up = torch.tensor(AXES[asked.up], dtype=torch.float64)
+    return VolumeDataset(name, source, shoot, rendered, held_out, up, asked.train_every)
 
 
 def _files(asked: VolumeSettings, context: SceneContext) -> tuple[Path, str, DataSource]:
@@ -99,7 +100,7 @@ def _survey(frames: list[Frame], reader: GridReader, progress: Progress) -> tupl
     lows, highs, hottest = [], [], 0.0
     extinction = "density" if "density" in reader.names else "temperature"
     for i, frame in enumerate(frames):
-        progress(f"looking through frame {i + 1} of {len(frames)}", i / len(frames))
+        progress("looking through the frames", i / len(frames))
         for meaning, grid in reader.read(frame.path).items():
             bounds = grid.world_bounds()
             if bounds is None:

@@ -31,6 +31,7 @@ class VolumeSettings:
         size: width and height of the images in pixels.
         cameras: on the upper hemisphere; two are held out.
         samples: rays per pixel side.
+        train_every: learn from every n-th frame only; the test views keep all.
         up: "y" or "z", the upward axis of the files.
     """
 
@@ -45,6 +46,7 @@ class VolumeSettings:
     size: int = 64
     cameras: int = 40
     samples: int = 2
+    train_every: int = 1
     up: str = "z"
 
     @staticmethod
@@ -55,7 +57,8 @@ class VolumeSettings:
             if name not in known:
                 raise ConfigError(f"scene.{name} is not a setting of this scene{nearest(str(name), known)}")
         made = VolumeSettings(**{**settings, "vdb": Path(settings["vdb"]) if settings.get("vdb") else None})
-        for name, lowest, highest in (("resolution", 8, 512), ("size", 8, 4096), ("cameras", 3, 1000), ("samples", 1, 16)):
+        limits = (("resolution", 8, 512), ("size", 8, 4096), ("cameras", 4, 1000), ("samples", 1, 16), ("train_every", 1, 1000))
+        for name, lowest, highest in limits:
             value = getattr(made, name)
             if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
                 raise ConfigError(f"scene.{name}={value!r}: expected a whole number from {lowest} to {highest}")

@@ -91,7 +91,7 @@ class Shoot:
         try:
             for i, frame in enumerate(self.frames):
                 if not self.points(folder, frame).is_file():
-                    progress(f"rendering the ground truth, frame {i + 1} of {len(self.frames)}", i / len(self.frames))
+                    progress(f"rendering the ground truth: {len(self.frames)} frames, {len(self.cameras)} cameras", i / len(self.frames))
                     self._take_frame(folder, frame)
             if not (folder / "scene.json").is_file():
                 write_json(folder / "scene.json", self.describe())

@@ -22,6 +22,7 @@ from neuprim.core.data import Dataset, View
 from neuprim.core.errors import CheckpointError, DataError
 from neuprim.core.files import write_json, write_text
 from neuprim.core.primitives import Primitives
+from neuprim.core.render.cpu.compile import cache_directory
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer, initial_model
 from neuprim.evaluate import load_dataset
@@ -30,7 +31,7 @@ from neuprim.plugins.registry import load_task
 from neuprim.progress import RunProgress
 from neuprim.report import error_map, write_report
 
-__all__ = ["make_trainer", "run"]
+__all__ = ["make_trainer", "run", "warm_up"]
 
 _CURVE_VIEWS = 5  # held-out views behind the curve's eval_psnr
 _SHOWN_VIEWS = 8  # held-out views in renders/ and the report
@@ -90,7 +91,9 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset) -> Trainer
 def _train(trainer: Trainer, config: RunConfig, dataset: Dataset, progress: RunProgress) -> bool:
     """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
     directory = config.output_dir
-    _warm_up(trainer, progress)
+    if not any(cache_directory().rglob("*backward_tiles*.nbc")):
+        progress.preparing("compiling kernels, once per installation (about a minute)", 0.0)
+    warm_up(trainer)
     curve = _open_curve(directory / "metrics.jsonl", trainer.step)
     last_saved, next_eval = time.monotonic(), _next_evaluation(trainer)
     interrupted = False
@@ -203,14 +206,10 @@ def _curve_psnr(trainer: Trainer) -> float:
 # ---------------------------------------------------------------- before and around the loop
 
 
-def _warm_up(trainer: Trainer, progress: RunProgress) -> None:
+def warm_up(trainer: Trainer) -> None:
     """Compile the kernels outside the training clock: one throw-away step on a copy of a few primitives."""
-    from neuprim.core.render.cpu.compile import cache_directory as kernels
-
-    if not any(kernels().rglob("*backward_tiles*.nbc")):
-        progress.preparing("compiling kernels, once per installation (about a minute)", 0.0)
     model = trainer.model
-    rows = torch.arange(min(4, model.count))
+    rows = torch.arange(0, model.count, max(model.count // 64, 1))  # some of them live in the view
     few = Primitives(model.density, model.colour, model.rows(rows))
     warm = Trainer(few, trainer.dataset, trainer.loss, trainer.settings, trainer.renderer, 0)
     warm.step = max(warm.settings.iterations, 1)  # at the end of the budget every band of colour is in use

@@ -1,0 +1,235 @@
+"""Quality of the dynamic task on a real sequence, and which way of varying in time is worth its parameters.
+
+    python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--parts main variants control between] [--seeds 3] [--readme] [--docs]
+
+DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free fire animation, frames 1 to 40). Parts:
+
+    main       preset quick, 5,000 primitives, 300 s
+    variants   every model.density.time, 2,000 primitives, the same seconds; a table of parameters and quality
+    control    times shuffled among the training images: a model of time must lose by it
+    between    every second frame is learned; the others are compared with the real ones, and steps between frames are measured
+
+Images are 96 x 96, 40 cameras (two held out), linear RGB over the exposure's peak, black background; means over seeds +- half the
+spread, of the last checkpoint. Results go to benchmarks/results/dynamic_quality.json, part by part; --readme and --docs put the
+recorded tables between the markers of README.md and docs/dynamic.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import math
+import statistics
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from static_quality import cpu_name, spread
+from tables import ROOT, between_markers
+
+from neuprim.config import compose
+from neuprim.core.render.cpu.threads import core_count
+from neuprim.core.train.trainer import Trainer
+from neuprim.evaluate import load_dataset
+from neuprim.measure import draw, measure, summary
+from neuprim.plugins.registry import load_task
+from neuprim.run import make_trainer, warm_up
+
+RESULTS = Path(__file__).parent / "results" / "dynamic_quality.json"
+VARIANTS = ("phase", "offset", "phase+offset", "window", "phase+motion", "window+motion")
+KEYS = (
+    "psnr", "psnr_mask", "psnr_pooled_mask", "psnr_black_image", "psnr_black_image_mask", "psnr_srgb", "ssim", "ssim_srgb",
+    "sigma_correlation_early", "sigma_correlation_middle", "sigma_correlation_late",
+    "sigma_relative_l2_early", "sigma_relative_l2_middle", "sigma_relative_l2_late",
+    "dead_fraction", "primitives", "parameters_per_primitive", "model_bytes", "vdb_bytes", "iterations", "train_seconds", "seed",
+)  # fmt: skip
+
+
+def fit(words: list[str], change: Callable[[Trainer], None] = lambda trainer: None) -> tuple[Trainer, dict[str, Any]]:
+    """What `neuprim run` does, less its files: the trainer after its budget, and the metrics."""
+    torch.set_num_threads(1)
+    config = compose(["task=dynamic", *words], check_output=False)
+    task = load_task(config.task)
+    trainer = make_trainer(config, task, load_dataset(config, task))
+    change(trainer)
+    warm_up(trainer)
+    for _ in trainer.run():
+        pass
+    for field in (trainer.model.density, trainer.model.colour):
+        field.set_progress(1.0)
+    size = 4 * sum(v.numel() for v in trainer.model.params.values())
+    training = {"iterations": trainer.step, "train_seconds": trainer.elapsed}
+    views = measure(trainer.model, trainer.dataset, config.renderer)
+    return trainer, summary(config, trainer.model, trainer.dataset, views, size, training)
+
+
+def shuffled_times(trainer: Trainer) -> None:
+    """Every training camera keeps its images, under the times of other frames."""
+    views: Any = trainer.dataset.train
+    order = torch.randperm(len(views.times), generator=torch.Generator().manual_seed(5)).tolist()
+    views.times = [views.times[i] for i in order]
+
+
+def between_frames(trainer: Trainer) -> dict[str, float]:
+    """PSNR inside the mask of test frames that were learned from and of those between them, and the largest step between frames.
+
+    The steps: the image at every quarter of a frame's interval. ``largest_step`` is the largest mean absolute difference of two such
+    neighbours over that of the two whole frames around them; smooth motion gives about 1/4, a jump 1 or more.
+    """
+    data: Any = trainer.dataset
+    frames, every = len(data.test.times), data.every
+    errors: dict[bool, list[float]] = {True: [], False: []}
+    worst = 0.0
+    for index in range(len(data.test)):
+        view, t = data.test.view(index), index % frames
+        rendered, truth = draw(trainer.model, view, trainer.renderer, data.background), data.test.pixels(index).over(data.background)
+        error = (rendered - truth)[data.mask(index)].double().square().mean().item()
+        errors[t % every == 0].append(-10 * math.log10(error))
+        if t + 1 < frames and index < frames:
+            after = data.test.view(index + 1)
+            steps = [view.conditions["time"] + q / 4 * (after.conditions["time"] - view.conditions["time"]) for q in range(5)]
+            images = [draw(trainer.model, type(view)("", view.camera, {"time": s}), trainer.renderer, data.background) for s in steps]
+            whole = (images[4] - images[0]).abs().mean().item()
+            worst = max(worst, *((b - a).abs().mean().item() / max(whole, 1e-9) for a, b in itertools.pairwise(images)))
+    return {"learned": statistics.mean(errors[True]), "between": statistics.mean(errors[False]) if errors[False] else math.nan, "largest_step": worst}  # fmt: skip
+
+
+def repeat_neighbour(trainer: Trainer) -> float:
+    """PSNR inside the mask of showing, for each frame that was not learned, the real frame before it: what interpolation must beat."""
+    data: Any = trainer.dataset
+    frames, values = len(data.test.times), []
+    for index in range(len(data.test)):
+        if (index % frames) % data.every:
+            pair = [data.test.pixels(i).over(data.background) for i in (index - (index % frames) % data.every, index)]
+            error = (pair[0] - pair[1])[data.mask(index)].double().square().mean().item()
+            values.append(-10 * math.log10(error))
+    return statistics.mean(values)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("--frames", default="1:40")
+    parser.add_argument("--parts", nargs="*", default=["main", "variants", "control", "between"])
+    parser.add_argument("--variants", nargs="*", default=list(VARIANTS))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=60.0, help="of every run but those of main")
+    parser.add_argument("--readme", action="store_true")
+    parser.add_argument("--docs", action="store_true")
+    args = parser.parse_args()
+    recorded: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    if args.folder:
+        recorded |= {"cpu": cpu_name(), "cores": core_count()}
+        data = [
+            "scene=vdb", f"scene.vdb='{args.folder.resolve()}'", f"scene.frames='{args.frames}'", "scene.look=embergen_fire", "scene.size=96",
+            "train.iterations=1000000", "train.eval_every=0",
+        ]  # fmt: skip
+        short = ["model.primitives=2000", f"train.max_seconds={args.seconds}"]
+
+        def keep(part: str, entry: dict[str, Any]) -> None:
+            recorded.setdefault(part, []).append(entry)
+            RESULTS.write_text(json.dumps(recorded, indent=1) + "\n")  # after every run: a long benchmark may be cut short
+            print(part, json.dumps({k: round(v, 4) if isinstance(v, float) else v for k, v in entry.items()}), flush=True)
+
+        for part in args.parts:
+            if part != "variants":
+                recorded[part] = []
+        if "variants" in args.parts:
+            recorded["variants"] = [e for e in recorded.get("variants", []) if e["time"] not in args.variants]
+        for seed in range(args.seeds):
+            own = [*data, f"seed={seed}"]
+            if "main" in args.parts:
+                _, m = fit([*own, "model.primitives=5000", "train.max_seconds=300"])
+                keep("main", {k: m[k] for k in KEYS} | {"per_frame": [round(f["psnr_mask"], 3) for f in m["per_frame"]]})
+            if "variants" in args.parts:
+                for time in args.variants:
+                    _, m = fit([*own, *short, f"model.density.time={time}"])
+                    keep("variants", {"time": time, **{k: m[k] for k in KEYS}})
+            if "control" in args.parts:
+                for name, change in (("true times", lambda trainer: None), ("shuffled times", shuffled_times)):
+                    _, m = fit([*own, *short], change)
+                    keep("control", {"name": name, **{k: m[k] for k in KEYS}})
+            if "between" in args.parts:
+                for every in (1, 2):
+                    trainer, m = fit([*own, *short, f"scene.train_every={every}"])
+                    base = {"repeat": repeat_neighbour(trainer)} if every > 1 else {}
+                    keep("between", {"every": every, "seed": seed, **between_frames(trainer), **base})
+    note = f"\nMeans over seeds ± half the spread; {recorded['cores']} cores of {recorded['cpu']}."
+    tables = {"dynamic-quality": main_table, "dynamic-variants": variants_table, "dynamic-control": control_table}
+    for name, make in tables.items():
+        text = make(recorded) + "\n" + note
+        if args.docs:
+            between_markers(ROOT / "docs" / "dynamic.md", name, text)
+        if args.readme and name == "dynamic-quality":
+            between_markers(ROOT / "README.md", name, text)
+        print(f"\n{text}")
+
+
+def _spread(runs: list[dict[str, Any]], key: str, digits: int = 2) -> str:
+    return spread([r[key] for r in runs], digits) if runs else "–"
+
+
+def main_table(recorded: dict[str, Any]) -> str:
+    """The main run, one row per number."""
+    runs = recorded.get("main", [])
+    if not runs:
+        return "not measured"
+    black, inside = runs[0]["psnr_black_image"], runs[0]["psnr_black_image_mask"]
+    lines = [
+        f"| {runs[0]['primitives']:,} primitives, {runs[0]['train_seconds']:.0f} s of training, {len(runs)} seed(s) | model | black image |",
+        "| --- | --- | --- |",
+        f"| PSNR, whole image | {_spread(runs, 'psnr')} dB | {black:.1f} dB |",
+        f"| PSNR inside the union mask | {_spread(runs, 'psnr_mask')} dB | {inside:.1f} dB |",
+        f"| PSNR of the pooled error inside the mask | {_spread(runs, 'psnr_pooled_mask')} dB | |",
+        f"| PSNR after the sRGB curve | {_spread(runs, 'psnr_srgb')} dB | |",
+        f"| SSIM, linear / sRGB | {_spread(runs, 'ssim', 4)} / {_spread(runs, 'ssim_srgb', 4)} | |",
+    ]
+    for key, name in (("correlation", "correlation of σ with the files"), ("relative_l2", "relative L2 error of σ")):
+        thirds = " / ".join(_spread(runs, f"sigma_{key}_{third}", 3) for third in ("early", "middle", "late"))
+        lines.append(f"| {name}, early / middle / late frames | {thirds} | |")
+    size = f"{runs[0]['model_bytes'] / 1e6:.2f} MB ({runs[0]['vdb_bytes'] / runs[0]['model_bytes']:.1f} times less than the .vdb files)"
+    lines.append(f"| model | {size} | |")
+    lines.append(f"| primitives that never show | {100 * statistics.mean(r['dead_fraction'] for r in runs):.1f} % | |")
+    return "\n".join(lines)
+
+
+def variants_table(recorded: dict[str, Any]) -> str:
+    """One row per way of varying in time."""
+    runs = recorded.get("variants", [])
+    lines = [
+        "| model.density.time | numbers per primitive | PSNR | inside the mask | pooled, inside | σ correlation, late | dead | steps |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for time in dict.fromkeys(r["time"] for r in runs):
+        own = [r for r in runs if r["time"] == time]
+        lines.append(
+            f"| {time} | {own[0]['parameters_per_primitive']} | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB "
+            f"| {_spread(own, 'psnr_pooled_mask')} dB | {_spread(own, 'sigma_correlation_late', 3)} "
+            f"| {100 * statistics.mean(r['dead_fraction'] for r in own):.0f} % | {round(statistics.mean(r['iterations'] for r in own))} |"
+        )
+    if runs:
+        lines.append(f"\n{runs[0]['primitives']:,} primitives, {runs[0]['train_seconds']:.0f} s, {len({r['seed'] for r in runs})} seed(s).")
+    return "\n".join(lines)
+
+
+def control_table(recorded: dict[str, Any]) -> str:
+    """Shuffled times, and frames between those that were learned."""
+    lines = ["| control | PSNR | inside the mask |", "| --- | --- | --- |"]
+    runs = recorded.get("control", [])
+    for name in dict.fromkeys(r["name"] for r in runs):
+        own = [r for r in runs if r["name"] == name]
+        lines.append(f"| {name} | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB |")
+    lines += ["", "| learned from | learned frames, inside the mask | frames between | real frame before instead | largest step |"]
+    lines.append("| --- | --- | --- | --- | --- |")
+    for every in dict.fromkeys(r["every"] for r in recorded.get("between", [])):
+        own = [r for r in recorded["between"] if r["every"] == every]
+        what = "every frame" if every == 1 else f"every {every}nd frame"
+        between, repeat = (_spread(own, k) + " dB" if every > 1 else "–" for k in ("between", "repeat"))
+        lines.append(f"| {what} | {_spread(own, 'learned')} dB | {between} | {repeat} | {_spread(own, 'largest_step')} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

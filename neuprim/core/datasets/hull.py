@@ -16,9 +16,9 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.data import ViewSet
+from neuprim.core.datasets.focus import focus_point
 from neuprim.core.errors import DataError
 from neuprim.core.render.cpu.compile import exact_kernel
-from neuprim.tasks.static.focus import focus_point
 
 __all__ = ["hull_surface"]
 

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.data import Dataset, PointCloud, camera_extent
+from neuprim.core.datasets.focus import focus_point
+from neuprim.core.datasets.initial import initial_points
+from neuprim.core.datasets.views import Frame, ImageViews
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.task import SceneContext
-from neuprim.tasks.static.datasets.views import Frame, ImageViews
-from neuprim.tasks.static.focus import focus_point
-from neuprim.tasks.static.initial import initial_points
 
 __all__ = ["IMAGE_SUFFIXES", "PosedImages", "every_nth", "find_image", "missing_files", "posed_images", "unique_names"]
 
@@ -101,7 +101,7 @@ class PosedImages(Dataset):
         self._points = points
 
     def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
-        """See :func:`neuprim.tasks.static.initial.initial_points`."""
+        """See :func:`neuprim.core.datasets.initial.initial_points`."""
         return initial_points(self.train, self._points, count, generator)
 
 

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import PointCloud, ViewSet
+from neuprim.core.datasets.focus import focus_point
+from neuprim.core.datasets.hull import hull_surface
 from neuprim.core.errors import ConfigError
-from neuprim.tasks.static.focus import focus_point
-from neuprim.tasks.static.hull import hull_surface
 
 __all__ = ["box_points", "farthest_points", "hull_points", "initial_points", "subset"]
 

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.data import Pixels, View, ViewSet
+from neuprim.core.datasets.distortion import Distortion, resample, source_grid
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.images import ImageInfo, read_image, read_mask
 from neuprim.core.render.cpu.compile import exact_kernel
-from neuprim.tasks.static.datasets.distortion import Distortion, resample, source_grid
 
 __all__ = ["Frame", "ImageViews"]
 

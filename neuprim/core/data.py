@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -70,10 +70,22 @@ class ViewSet(ABC):
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points where matter probably is: means (N, 3) scene units, colors (N, C) in the data set's colour space."""
+    """Points where matter probably is.
+
+    Attributes:
+        means: (N, 3) scene units.
+        colors: (N, C) in the data set's colour space.
+        conditions: condition name -> (N,) the value under which matter was found at each point, e.g. "time" -> times 0..1;
+            empty for scenes without conditions.
+    """
 
     means: Tensor
     colors: Tensor
+    conditions: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def rows(self, index: Tensor) -> PointCloud:
+        """The points at ``index``, (M,) int64 or (N,) bool, with all that belongs to them."""
+        return PointCloud(self.means[index], self.colors[index], {name: value[index] for name, value in self.conditions.items()})
 
 
 class Dataset(ABC):

@@ -1,0 +1,1 @@
+"""Hydra groups of the dynamic task; a package, because Hydra looks for one."""

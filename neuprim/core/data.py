@@ -79,12 +79,17 @@ class PointCloud:
     Attributes:
         means: (N, 3) scene units.
         colors: (N, C) in the data set's colour space.
-        conditions: name -> (N,) condition at which a point was found ("time"), for data sets that have any.
+        conditions: condition name -> (N,) the value under which matter was found at each point, e.g. "time" -> times 0..1;
+            empty for scenes without conditions.
     """
 
     means: Tensor
     colors: Tensor
     conditions: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def rows(self, index: Tensor) -> PointCloud:
+        """The points at ``index``, (M,) int64 or (N,) bool, with all that belongs to them."""
+        return PointCloud(self.means[index], self.colors[index], {name: value[index] for name, value in self.conditions.items()})
 
 
 @dataclass(frozen=True)
@@ -164,11 +169,20 @@ class Dataset(ABC):
         up = self.up.double() / self.up.double().norm()
         sine = ((offsets @ up) / offsets.norm(dim=-1).clamp_min(1e-12)).mean().clamp(-0.9, 0.9)
         views = orbit(cameras[0], self.center, self.up, radius, torch.asin(sine).item(), frames)
-        return [View(f"orbit_{i:03d}", c, self.orbit_conditions(i / max(frames - 1, 1))) for i, c in enumerate(views)]
+        between = self._scalar_conditions()
+        return [
+            View(f"orbit_{i:03d}", c, {name: low + i / max(frames - 1, 1) * (high - low) for name, (low, high) in between.items()})
+            for i, c in enumerate(views)
+        ]
 
-    def orbit_conditions(self, fraction: float) -> Conditions:
-        """What an orbit's frame depends on besides its camera, ``fraction`` 0..1 of the way round."""
-        return {}
+    def _scalar_conditions(self) -> dict[str, tuple[Tensor, Tensor]]:
+        """Least and greatest value over the training views of every condition that is one number; an orbit goes from one to the other."""
+        found: dict[str, list[Tensor]] = {}
+        for i in range(len(self.train)):
+            for name, value in self.train.view(i).conditions.items():
+                if value.numel() == 1:
+                    found.setdefault(name, []).append(value)
+        return {name: (torch.stack(values).min(0).values, torch.stack(values).max(0).values) for name, values in found.items()}
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:

@@ -12,11 +12,11 @@ import pytest
 import torch
 from PIL import Image
 
+from neuprim.core.datasets.views import ImageViews
 from neuprim.core.errors import DataError
 from neuprim.core.images import write_exr
 from neuprim.core.task import SceneContext
 from neuprim.tasks.static.datasets.blender import load
-from neuprim.tasks.static.datasets.views import ImageViews
 
 W, H, ANGLE = 48, 36, 0.9
 
@@ -145,6 +145,20 @@ def test_chair(chair: Path, context: Any) -> None:
     assert data.center.norm() < 0.01 and data.extent == pytest.approx(5.25, abs=0.01)
     pixels = data.train.pixels(0)
     assert pixels.alpha is not None and 0.05 < pixels.alpha.mean() < 0.6 and bool((pixels.rgb <= pixels.alpha[..., None] + 0.01).all())
+
+
+def test_starting_points_of_the_chair(chair: Path, context: Any) -> None:
+    data = load({"path": chair}, context)
+    points = data.initial_points(2000, torch.Generator().manual_seed(0))
+    assert len(points.means) == 2000 and points.means.abs().max() < 1.15
+    inside = []
+    for i in range(len(data.test)):  # views that had no part in it
+        camera, alpha = data.test.view(i).camera, data.test.pixels(i).alpha
+        assert alpha is not None
+        p = points.means.double() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        u, v = camera.fx * p[:, 0] / p[:, 2] + camera.cx, camera.fy * p[:, 1] / p[:, 2] + camera.cy
+        inside.append((alpha[v.long(), u.long()] > 0.5).float().mean().item())
+    assert math.fsum(inside) / len(inside) > 0.93 and min(inside) > 0.8
 
 
 # ---------------------------------------------------------------- bad input

@@ -14,7 +14,6 @@ from torch import Tensor
 from neuprim.core import images
 from neuprim.core.data import Clip, Dataset, DataSource, Pixels, PointCloud, View, ViewSet, camera_extent
 from neuprim.core.errors import DataError
-from neuprim.core.fields import Conditions
 from neuprim.core.primitives import Primitives
 from neuprim.tasks.dynamic.dead import dead_fraction
 from neuprim.tasks.dynamic.volume.compare import compare_with_truth
@@ -116,9 +115,6 @@ class VolumeDataset(Dataset):
             colors.append(torch.from_numpy(stored["colors"])[rows] / self.exposure)
             times.append(torch.full((wanted,), float(self.test.times[t])))
         return PointCloud(torch.cat(means), torch.cat(colors), {"time": torch.cat(times)})
-
-    def orbit_conditions(self, fraction: float) -> Conditions:
-        return {"time": torch.tensor(fraction)}
 
     def clips(self) -> list[Clip]:
         frames = len(self.shoot.frames)

@@ -15,13 +15,13 @@ import torch
 
 from neuprim.core.cameras import Camera, opengl_to_viewmat
 from neuprim.core.data import Dataset
+from neuprim.core.datasets.common import every_nth, find_image, missing_files, posed_images, unique_names
+from neuprim.core.datasets.records import read_json
+from neuprim.core.datasets.settings import Setting, data_folder, read_settings, text
+from neuprim.core.datasets.views import Frame
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.images import image_info
 from neuprim.core.task import SceneContext
-from neuprim.tasks.static.datasets.common import every_nth, find_image, missing_files, posed_images, unique_names
-from neuprim.tasks.static.datasets.records import read_json
-from neuprim.tasks.static.datasets.settings import Setting, data_folder, read_settings, text
-from neuprim.tasks.static.datasets.views import Frame
 
 __all__ = ["load"]
 

@@ -116,7 +116,7 @@ def context(tmp_path: Path) -> SceneContext:
 @pytest.fixture
 def chair() -> Path:
     """The NeRF-synthetic chair at 200x200, where the developer has it."""
-    root = Path(os.environ.get("NEUPRIM_TEST_DATA") or Path(__file__).parents[4] / "shared" / "data")
+    root = Path(os.environ.get("NEUPRIM_TEST_DATA") or Path(__file__).parents[3] / "shared" / "data")
     path = root / "nerf_synthetic" / "chair_200"
     if not path.is_dir():
         pytest.skip(f"needs real data: no {path} (set NEUPRIM_TEST_DATA to a folder with nerf_synthetic/chair_200)")

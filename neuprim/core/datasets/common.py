@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +11,20 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.data import Dataset, PointCloud, camera_extent
+from neuprim.core.data import Dataset, PointCloud, ViewSet, camera_extent
+from neuprim.core.datasets.focus import focus_point
+from neuprim.core.datasets.initial import initial_points
+from neuprim.core.datasets.views import Frame, ImageViews
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.task import SceneContext
-from neuprim.tasks.static.datasets.views import Frame, ImageViews
-from neuprim.tasks.static.focus import focus_point
-from neuprim.tasks.static.initial import initial_points
 
-__all__ = ["IMAGE_SUFFIXES", "PosedImages", "every_nth", "find_image", "missing_files", "posed_images", "unique_names"]
+__all__ = ["IMAGE_SUFFIXES", "PosedImages", "StartingPoints", "every_nth", "find_image", "missing_files", "posed_images", "unique_names"]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG", ".EXR")
 _LISTED = 10
+
+StartingPoints = Callable[[ViewSet, int, torch.Generator], PointCloud]
+"""(training views, count, generator) -> at most ``count`` distinct starting points."""
 
 
 def find_image(folder: Path, text: str) -> Path | None:
@@ -68,10 +71,7 @@ def every_nth(frames: Sequence[Frame], n: int) -> tuple[list[Frame], list[Frame]
 
 
 class PosedImages(Dataset):
-    """Image files with poses, and SfM points if the format brings any.
-
-    :meth:`initial_points` uses those points, else the visual hull of the alpha masks, else a box in front of the cameras.
-    """
+    """Image files with poses, and a rule for starting points."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class PosedImages(Dataset):
         random_background: bool,
         downsampling: str,
         up: Tensor,
-        points: PointCloud | None,
+        start: StartingPoints,
     ) -> None:
         cameras = [train.view(i).camera for i in range(len(train))]
         self.name = name
@@ -98,11 +98,11 @@ class PosedImages(Dataset):
         self.downsampling = downsampling
         self.up = up
         self.center = focus_point(cameras).float()
-        self._points = points
+        self._start = start
 
     def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
-        """See :func:`neuprim.tasks.static.initial.initial_points`."""
-        return initial_points(self.train, self._points, count, generator)
+        """Those of the training views, by the rule that the loader chose."""
+        return self._start(self.train, count, generator)
 
 
 def posed_images(
@@ -115,6 +115,7 @@ def posed_images(
     up: Tensor | None = None,
     points: PointCloud | None = None,
     prefix: str = "",
+    start: StartingPoints | None = None,
 ) -> PosedImages:
     """The data set of two splits.
 
@@ -122,7 +123,10 @@ def posed_images(
         where: file or folder that errors name.
         settings: the common settings, already checked.
         up: (3,) upward direction; None takes the mean of the cameras' own.
+        points: starting points that the format brings, if any.
         prefix: reduction already in the files, e.g. "images_4".
+        start: another rule for starting points; None takes ``points``, else the visual hull of the alpha masks, else a box in
+            front of the cameras, which suits scenes at rest (:func:`neuprim.core.datasets.initial.initial_points`).
 
     Raises:
         DataError: an empty split, an image without alpha beside one with, sRGB beside linear files, or damaged images.
@@ -159,7 +163,7 @@ def posed_images(
         random_background=background == "random",
         downsampling=", then ".join(t for t in (prefix, _reduction(both, views[0].view(0).camera, factor)) if t) or "none",
         up=_mean_up([f.camera for f in train]) if up is None else up,
-        points=points,
+        start=start or (lambda views, count, generator: initial_points(views, points, count, generator)),
     )
 
 

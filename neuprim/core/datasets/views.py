@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +15,13 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.data import Pixels, View, ViewSet
+from neuprim.core.datasets.distortion import Distortion, resample, source_grid
 from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.fields import Conditions
 from neuprim.core.images import ImageInfo, read_image, read_mask
 from neuprim.core.render.cpu.compile import exact_kernel
-from neuprim.tasks.static.datasets.distortion import Distortion, resample, source_grid
 
-__all__ = ["Frame", "ImageViews"]
+__all__ = ["Frame", "ImageViews", "SomeViews"]
 
 _CACHE_BYTES = 2 * 2**30
 _GRIDS = 4
@@ -36,6 +37,7 @@ class Frame:
         info: the file's header.
         mask: image whose zero pixels do not count, or None.
         distortion: the lens that took the file, or None for a pinhole.
+        conditions: what the frame depends on besides its camera (time, light, ...); empty for static scenes.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Frame:
     info: ImageInfo
     mask: Path | None = None
     distortion: Distortion | None = None
+    conditions: Conditions = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -100,7 +103,7 @@ class ImageViews(ViewSet):
         return len(self._frames)
 
     def view(self, index: int) -> View:
-        return View(self._frames[index].name, self._cameras[index])
+        return View(self._frames[index].name, self._cameras[index], self._frames[index].conditions)
 
     def pixels(self, index: int) -> Pixels:
         """Pixels of view ``index``.
@@ -186,6 +189,27 @@ class ImageViews(ViewSet):
                     self._grids.pop(next(iter(self._grids)))
                 self._grids[key] = source_grid(camera, distortion)
             return self._grids[key]
+
+
+class SomeViews(ViewSet):
+    """Some views of another set, which keeps their pixels; e.g. those of one moment.
+
+    Args:
+        views: the whole set.
+        indices: of the chosen views, in the order they get here.
+    """
+
+    def __init__(self, views: ViewSet, indices: Sequence[int]) -> None:
+        self._views, self._indices = views, list(indices)
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def view(self, index: int) -> View:
+        return self._views.view(self._indices[index])
+
+    def pixels(self, index: int) -> Pixels:
+        return self._views.pixels(self._indices[index])
 
 
 def _reduced(frame: Frame, factor: int) -> Camera:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,11 +12,10 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data import Pixels, PointCloud, View, ViewSet
+from neuprim.core.datasets.focus import focus_point
+from neuprim.core.datasets.hull import hull_surface
+from neuprim.core.datasets.initial import _thinned, box_points, farthest_points, hull_points, initial_points
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.tasks.static.datasets.blender import load
-from neuprim.tasks.static.focus import focus_point
-from neuprim.tasks.static.hull import hull_surface
-from neuprim.tasks.static.initial import _thinned, box_points, farthest_points, hull_points, initial_points
 
 CENTER = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
 
@@ -215,17 +211,3 @@ def test_focus_point() -> None:
     point = focus_point(row)
     assert point[:2].abs().max() < 1e-6 and 0.5 < point[2] < 3.0
     assert torch.isfinite(focus_point(row[:1])).all()
-
-
-def test_chair(chair: Path, context: Any) -> None:
-    data = load({"path": chair}, context)
-    points = data.initial_points(2000, rng())
-    assert len(points.means) == 2000 and points.means.abs().max() < 1.15
-    inside = []
-    for i in range(len(data.test)):  # views that had no part in it
-        camera, alpha = data.test.view(i).camera, data.test.pixels(i).alpha
-        assert alpha is not None
-        p = points.means.double() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        u, v = camera.fx * p[:, 0] / p[:, 2] + camera.cx, camera.fy * p[:, 1] / p[:, 2] + camera.cy
-        inside.append((alpha[v.long(), u.long()] > 0.5).float().mean().item())
-    assert math.fsum(inside) / len(inside) > 0.93 and min(inside) > 0.8

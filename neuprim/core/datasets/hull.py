@@ -16,17 +16,19 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.data import ViewSet
+from neuprim.core.datasets.focus import focus_point
 from neuprim.core.errors import DataError
 from neuprim.core.render.cpu.compile import exact_kernel
-from neuprim.tasks.static.focus import focus_point
 
-__all__ = ["hull_surface"]
+__all__ = ["EmptyHull", "hull_surface"]
 
 _VIEWS = 100
 _MASK_SIDE = 400
 _COARSE = 64
-_WRONG_VIEWS = 0.02
-_SEEN_VIEWS = 0.5
+
+
+class EmptyHull(DataError):
+    """No voxel is left, so masks and cameras disagree, or nothing is opaque."""
 
 
 @dataclass(frozen=True)
@@ -49,27 +51,37 @@ class _Grid:
         return self.corner + (cells.double() + 0.5) * self.voxel
 
 
-def hull_surface(views: ViewSet, resolution: int) -> tuple[Tensor, float]:
+def hull_surface(
+    views: ViewSet, resolution: int, seen_views: float = 0.5, wrong_views: float = 0.02, matter: float = 0.5
+) -> tuple[Tensor, float]:
     """Centres (M, 3) float32 of the hull's surface voxels, and the voxel side, scene units.
 
-    A voxel stays if at least half of the views look at it and all but 2 % of those show matter (alpha > 0.5) there.
+    A voxel stays if enough views look at it and all but a few of the views show matter there.
+
+    Args:
+        resolution: voxels along the hull's longest side.
+        seen_views: which part of the views must look at a voxel, the more the fewer there are.
+        wrong_views: which part of the views may show no matter there.
+        matter: the alpha above which a pixel shows matter.
 
     Raises:
-        DataError: no voxel is left, so masks and cameras disagree.
+        EmptyHull: no voxel is left.
     """
-    silhouettes = _silhouettes(views)
+    silhouettes = _silhouettes(views, matter)
     cameras = [s.camera for s in silhouettes]
     center = focus_point(cameras)
     half = torch.stack([c.position.double() for c in cameras]).sub(center).norm(dim=-1).median().item() or 1.0
     everything = torch.ones((_COARSE,) * 3, dtype=torch.bool)
-    grid = _carved(_Grid(center - half, 2.0 * half / _COARSE, everything), silhouettes, 0.87)
-    grid = _carved(_refined(grid, _COARSE), silhouettes, 0.87)
-    grid = _carved(_refined(grid, resolution), silhouettes, 0.25)  # wider and the hull swells, narrower and it tears
+    grid = _carved(_Grid(center - half, 2.0 * half / _COARSE, everything), silhouettes, 0.87, seen_views, wrong_views)
+    grid = _carved(_refined(grid, _COARSE), silhouettes, 0.87, seen_views, wrong_views)
+    grid = _carved(
+        _refined(grid, resolution), silhouettes, 0.25, seen_views, wrong_views
+    )  # wider and the hull swells, narrower and it tears
     core = -F.max_pool3d(-F.pad(grid.full[None].float(), (1,) * 6), 3, stride=1)[0] > 0.5
     return grid.centers((grid.full & ~core).nonzero()).float(), grid.voxel
 
 
-def _silhouettes(views: ViewSet) -> list[_Silhouette]:
+def _silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
     """Masks of evenly chosen views, in an order in which neighbours in the list look from different sides."""
     chosen = sorted({round(i * (len(views) - 1) / max(1, min(len(views), _VIEWS) - 1)) for i in range(min(len(views), _VIEWS))})
     chosen.sort(key=lambda i: i * 0.6180339887 % 1.0)
@@ -78,7 +90,7 @@ def _silhouettes(views: ViewSet) -> list[_Silhouette]:
         camera, pixels = views.view(index).camera, views.pixels(index)
         if pixels.alpha is None:
             continue
-        matter = pixels.alpha > 0.5
+        matter = pixels.alpha > threshold
         if pixels.mask is not None:
             matter |= ~pixels.mask  # pixels that do not count rule nothing out
         n = -(-max(camera.width, camera.height) // _MASK_SIDE)
@@ -103,7 +115,7 @@ def _refined(grid: _Grid, resolution: int) -> _Grid:
     return _Grid(grid.corner + low.double() * grid.voxel, voxel, full)
 
 
-def _carved(grid: _Grid, silhouettes: list[_Silhouette], reach: float) -> _Grid:
+def _carved(grid: _Grid, silhouettes: list[_Silhouette], reach: float, seen_views: float, wrong_views: float) -> _Grid:
     """The grid without the voxels that the masks rule out; ``reach`` is half the side of the tested box, in voxels."""
     cells = grid.full.nonzero()
     poses = torch.stack([s.camera.viewmat[:3].double() for s in silhouettes]).numpy()
@@ -111,12 +123,12 @@ def _carved(grid: _Grid, silhouettes: list[_Silhouette], reach: float) -> _Grid:
     lenses = np.array([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras], dtype=np.float64)
     sizes = np.array([s.table.numel() for s in silhouettes], dtype=np.int64)
     tables = torch.cat([s.table.reshape(-1) for s in silhouettes]).numpy()
-    allowed, needed = int(_WRONG_VIEWS * len(silhouettes)), max(1.0, _SEEN_VIEWS * len(silhouettes))
+    allowed, needed = int(wrong_views * len(silhouettes)), max(1.0, seen_views * len(silhouettes))
     points = grid.centers(cells).numpy()
     keep = _test_points(points, poses, lenses, np.cumsum(sizes) - sizes, tables, reach * grid.voxel, allowed, needed)
     cells = cells[torch.from_numpy(keep)]
     if len(cells) == 0:
-        raise DataError(
+        raise EmptyHull(
             f"the visual hull of {len(silhouettes)} alpha masks is empty: no point in front of the cameras is opaque in all views; "
             "expected masks of one scene and poses that agree with them"
         )

@@ -7,11 +7,21 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import PointCloud, ViewSet
+from neuprim.core.datasets.focus import focus_point
+from neuprim.core.datasets.hull import hull_surface
 from neuprim.core.errors import ConfigError
-from neuprim.tasks.static.focus import focus_point
-from neuprim.tasks.static.hull import hull_surface
 
-__all__ = ["box_points", "farthest_points", "hull_points", "initial_points", "subset"]
+__all__ = [
+    "box_points",
+    "check_count",
+    "distinct",
+    "farthest_points",
+    "has_silhouettes",
+    "hull_points",
+    "initial_points",
+    "median_colors",
+    "subset",
+]
 
 _FPS_WORK = 5e8
 """Distances that exact farthest-point sampling may evaluate (about 1.5 s on one core); above, a grid thins the points."""
@@ -28,19 +38,27 @@ def initial_points(views: ViewSet, points: PointCloud | None, count: int, genera
         ConfigError: ``count`` is not positive.
         DataError: the alpha masks have no common volume, or an image is damaged.
     """
-    if count <= 0:
-        raise ConfigError(f"the number of initial points is {count}; expected at least 1")
+    check_count(count)
     if points is not None:
         return subset(points, count, generator)
-    if any(_informative(views, i) for i in range(min(len(views), 8))):
+    if has_silhouettes(views):
         return hull_points(views, count, generator)
     return box_points(views, count, generator)
 
 
-def _informative(views: ViewSet, index: int) -> bool:
-    """Whether a view has alpha that is not opaque everywhere."""
-    alpha = views.pixels(index).alpha
-    return alpha is not None and bool((alpha < 0.5).any())
+def check_count(count: int) -> None:
+    """Raises ConfigError unless ``count`` is positive."""
+    if count <= 0:
+        raise ConfigError(f"the number of initial points is {count}; expected at least 1")
+
+
+def has_silhouettes(views: ViewSet) -> bool:
+    """Whether one of the first views has alpha that is not opaque everywhere."""
+    for index in range(min(len(views), 8)):
+        alpha = views.pixels(index).alpha
+        if alpha is not None and bool((alpha < 0.5).any()):
+            return True
+    return False
 
 
 def subset(points: PointCloud, count: int, generator: torch.Generator) -> PointCloud:
@@ -49,7 +67,7 @@ def subset(points: PointCloud, count: int, generator: torch.Generator) -> PointC
     rows = torch.from_numpy(np.sort(first))
     if len(rows) > count:
         rows = rows[torch.randperm(len(rows), generator=generator)[:count]].sort().values
-    return PointCloud(points.means[rows], points.colors[rows])
+    return points.rows(rows)
 
 
 def hull_points(views: ViewSet, count: int, generator: torch.Generator, resolution: int = 128) -> PointCloud:
@@ -70,7 +88,7 @@ def hull_points(views: ViewSet, count: int, generator: torch.Generator, resoluti
         rows = torch.arange(count) % len(centers)
     jitter = torch.rand((len(rows), 3), generator=generator) - 0.5
     means = centers[rows] + jitter * voxel
-    return _distinct(PointCloud(means, _median_colors(views, means)))
+    return distinct(PointCloud(means, median_colors(views, means)))
 
 
 def box_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
@@ -84,16 +102,16 @@ def box_points(views: ViewSet, count: int, generator: torch.Generator) -> PointC
     if half <= 0:
         half = torch.tensor(1.0, dtype=torch.float64)
     means = (center + (2.0 * torch.rand((count, 3), generator=generator).double() - 1.0) * half).float()
-    return _distinct(PointCloud(means, _median_colors(views, means)))
+    return distinct(PointCloud(means, median_colors(views, means)))
 
 
-def _distinct(points: PointCloud) -> PointCloud:
+def distinct(points: PointCloud) -> PointCloud:
     """The points without repeated positions, which jitter makes rare but cannot exclude."""
     _, first = np.unique(points.means.numpy(), axis=0, return_index=True)
     if len(first) == len(points.means):
         return points
     rows = torch.from_numpy(np.sort(first))
-    return PointCloud(points.means[rows], points.colors[rows])
+    return points.rows(rows)
 
 
 # ---------------------------------------------------------------- spreading
@@ -143,21 +161,21 @@ def _thinned(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
 # ---------------------------------------------------------------- colour
 
 
-def _median_colors(views: ViewSet, means: Tensor) -> Tensor:
-    """(N, C) per-channel median of the pixels that the points project to, straight colour.
+def median_colors(views: ViewSet, means: Tensor, matter: float = 0.5) -> Tensor:
+    """(N, C) per-channel median of the pixels that the points (N, 3) project to, straight colour.
 
-    A view counts for a point that falls inside its image, on a pixel that counts and is not transparent. Points that no
-    view shows get the median of the others, or mid-grey.
+    A view counts for a point that falls inside its image, on a pixel that counts and whose alpha is above ``matter``. Points
+    that no view shows get the median of the others, or mid-grey.
     """
     indices = sorted({round(i) for i in np.linspace(0, len(views) - 1, min(len(views), _COLOR_VIEWS))})
-    samples = torch.stack([_sample(views, i, means) for i in indices])  # (V, N, C), NaN where a view does not count
+    samples = torch.stack([_sample(views, i, means, matter) for i in indices])  # (V, N, C), NaN where a view does not count
     colors = torch.cat([samples[:, i : i + _CHUNK].nanmedian(dim=0).values for i in range(0, len(means), _CHUNK)])
     hidden = colors.isnan().any(dim=-1)
     typical = colors.nanmedian(dim=0).values.nan_to_num(nan=0.5)
     return torch.where(hidden[:, None], typical, colors)
 
 
-def _sample(views: ViewSet, index: int, means: Tensor) -> Tensor:
+def _sample(views: ViewSet, index: int, means: Tensor, matter: float) -> Tensor:
     camera, pixels = views.view(index).camera, views.pixels(index)
     view = camera.viewmat.double()
     x, y, z = (means.double() @ view[:3, :3].T + view[:3, 3]).unbind(-1)
@@ -167,8 +185,8 @@ def _sample(views: ViewSet, index: int, means: Tensor) -> Tensor:
     color = pixels.rgb.reshape(-1, pixels.rgb.shape[-1])[flat].clone()
     if pixels.alpha is not None:
         alpha = pixels.alpha.reshape(-1)[flat]
-        inside &= alpha > 0.5
-        color /= alpha.clamp_min(0.5)[:, None]
+        inside &= alpha > matter
+        color /= alpha.clamp_min(matter)[:, None]
     if pixels.mask is not None:
         inside &= pixels.mask.reshape(-1)[flat]
     color[~inside] = float("nan")

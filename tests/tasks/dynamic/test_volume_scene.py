@@ -1,0 +1,234 @@
+"""From a folder of .vdb files to a data set: grids, frames, cache, times, masks, starting points."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.task import SceneContext
+from neuprim.core.vdb import Grid, scale_transform, write_vdb
+from neuprim.tasks.dynamic.volume import shoot as shooting
+from neuprim.tasks.dynamic.volume.compare import extinction_on, lattice
+from neuprim.tasks.dynamic.volume.dataset import FrameViews, VolumeDataset
+from neuprim.tasks.dynamic.volume.scene import load
+from neuprim.tasks.dynamic.volume.settings import choose_frames
+
+NUMBERS = (2, 9, 10, 11)
+VOXEL = 0.5
+
+
+def blob(center: float, names: tuple[str, ...] = ("density", "flames")) -> list[Grid]:
+    """A ball of radius 5 voxels at x = ``center``, denser in the middle."""
+    index = np.stack(np.meshgrid(*(np.arange(24, dtype=np.float32),) * 3, indexing="ij"), -1)
+    radius = np.linalg.norm(index - np.array([center, 12, 12], np.float32), axis=-1)
+    value = np.clip(1 - radius / 5, 0, None)
+    transform = scale_transform(VOXEL, (10.0, 0.0, -3.0))
+    return [Grid.from_dense(name, value * (0.2 if name == "flames" else 1.0), transform=transform) for name in names]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Frames 2 (empty), 9, 10 and 11 of a ball that moves along x."""
+    made = tmp_path / "files"
+    made.mkdir()
+    write_vdb(made / "ball_2.vdb", [Grid.from_dense("density", np.zeros((8, 8, 8), np.float32), transform=scale_transform(VOXEL))])
+    for step, number in enumerate(NUMBERS[1:]):
+        write_vdb(made / f"ball_{number}.vdb", blob(8.0 + 4 * step))
+    return made
+
+
+def dataset(folder: Path, tmp_path: Path, **changes: Any) -> VolumeDataset:
+    settings = {"vdb": str(folder), "size": 24, "cameras": 6, "samples": 1, "look": "smoke_fire", **changes}
+    found = load(settings, SceneContext(0, tmp_path / "cache"))
+    assert isinstance(found, VolumeDataset)
+    return found
+
+
+def test_frames_in_numerical_order_cameras_and_times(folder: Path, tmp_path: Path) -> None:
+    data = dataset(folder, tmp_path)
+    assert [f.number for f in data.shoot.frames] == list(NUMBERS)
+    assert len(data.train) == 4 * 4 and len(data.test) == 2 * 4
+    assert [round(float(data.test.view(i).conditions["time"]), 4) for i in range(4)] == [0, 0.3333, 0.6667, 1]
+    assert data.data_source == "real" and data.color_space == "linear"
+    assert data.clips()[1].views == range(4, 8)
+    trained, held_out = ({tuple(v.view(i).camera.position.tolist()) for i in range(len(v))} for v in (data.train, data.test))
+    assert len(trained) == 4 and len(held_out) == 2
+    assert not trained & held_out
+
+
+def test_images_are_radiance_over_the_exposures_peak_with_alpha(folder: Path, tmp_path: Path) -> None:
+    data = dataset(folder, tmp_path)
+    empty, full = data.test.pixels(0), data.test.pixels(2)
+    assert empty.alpha is not None and full.alpha is not None
+    assert not bool(empty.rgb.any()) and not bool(empty.alpha.any())
+    assert 0.3 < float(full.alpha.max()) <= 1
+    brightest = max(float(views.pixels(i).rgb.max()) for views in (data.train, data.test) for i in range(len(views)))
+    assert brightest == pytest.approx(1.0, abs=2e-3)
+    white = full.over(torch.ones(3))
+    assert torch.allclose(white[0, 0], torch.ones(3))
+
+
+def test_the_ball_moves_in_the_images_and_the_mask_is_its_track(folder: Path, tmp_path: Path) -> None:
+    data = dataset(folder, tmp_path)
+    mask = data.mask(0)
+    for i in range(1, 4):
+        alpha = data.test.pixels(i).alpha
+        assert alpha is not None and bool(((alpha > 1 / 255) <= mask).all())
+        assert int((alpha > 1 / 255).sum()) < int(mask.sum())
+    assert torch.equal(data.mask(3), mask)
+
+
+def test_starting_points_lie_where_and_when_there_is_matter(folder: Path, tmp_path: Path) -> None:
+    data = dataset(folder, tmp_path)
+    cloud = data.initial_points(500, torch.Generator().manual_seed(1))
+    again = data.initial_points(500, torch.Generator().manual_seed(1))
+    assert torch.equal(cloud.means, again.means) and torch.equal(cloud.conditions["time"], again.conditions["time"])
+    world = data.shoot.normalisation.to_world(cloud.means.numpy())
+    for time, center in ((1 / 3, 8.0), (2 / 3, 12.0), (1.0, 16.0)):
+        here = (cloud.conditions["time"] - time).abs() < 1e-6
+        assert 100 < int(here.sum()) < 250
+        middle = np.array([10.0 + VOXEL * center, VOXEL * 12, -3 + VOXEL * 12])
+        assert np.linalg.norm(world[here.numpy()] - middle, axis=1).max() < VOXEL * 6
+    assert bool(((cloud.means >= data.bounds[0] - 0.05) & (cloud.means <= data.bounds[1] + 0.05)).all())
+
+
+def test_a_second_call_renders_nothing_and_an_interrupted_one_goes_on(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = dataset(folder, tmp_path)
+    calls: list[int] = []
+    genuine = shooting.integrate
+    monkeypatch.setattr(shooting, "integrate", lambda *a, **k: calls.append(1) or genuine(*a, **k))
+    before = first.train.pixels(5).rgb
+    second = dataset(folder, tmp_path)
+    assert not calls and torch.equal(second.train.pixels(5).rgb, before)
+    shutil.rmtree(first.folder / "frame_00009")
+    third = dataset(folder, tmp_path)
+    assert len(calls) == 6 and torch.equal(third.train.pixels(5).rgb, before)
+
+
+def test_whatever_matters_is_part_of_the_key(folder: Path, tmp_path: Path) -> None:
+    names = {dataset(folder, tmp_path).folder}
+    for change in ({"size": 20}, {"samples": 2}, {"cameras": 5}, {"look": "dust_tornado"}, {"optics": {"extinction": 3.0}}, {"frames": "9:11"}):
+        names.add(dataset(folder, tmp_path, **change).folder)
+    write_vdb(folder / "ball_11.vdb", blob(17.0))
+    names.add(dataset(folder, tmp_path).folder)
+    assert len(names) == 8
+
+
+def test_what_was_rendered_is_written_down(folder: Path, tmp_path: Path) -> None:
+    data = dataset(folder, tmp_path)
+    record = json.loads((data.folder / "scene.json").read_text())
+    assert [f["number"] for f in record["frames"]] == list(NUMBERS) and record["cameras"] == 6
+    assert record["normalisation"] == data.shoot.normalisation.to_json()
+
+
+def test_every_nth_frame_may_be_left_out_of_training(folder: Path, tmp_path: Path) -> None:
+    data = dataset(folder, tmp_path, train_every=2)
+    assert len(data.train) == 4 * 2 and len(data.test) == 2 * 4
+    assert {round(float(data.train.view(i).conditions["time"]), 3) for i in range(8)} == {0.0, 0.667}
+    assert {round(t, 3) for t in data.initial_points(50, torch.Generator().manual_seed(0)).conditions["time"].tolist()} == {0.667}
+    whole = dataset(folder, tmp_path)
+    assert torch.equal(data.train.pixels(1).rgb, whole.train.pixels(2).rgb)
+
+
+def test_decoded_images_are_bounded(folder: Path, tmp_path: Path) -> None:
+    data = dataset(folder, tmp_path)
+    one = 24 * 24 * 4 * 2
+    few = FrameViews(data.shoot, data.folder, range(4), data.exposure, memory=3 * one)
+    images = [few.pixels(i).rgb for i in range(16)]
+    assert len(few._kept) == 3
+    assert all(torch.equal(few.pixels(i).rgb, images[i]) for i in range(16))
+
+
+def test_the_files_extinction_on_a_lattice(folder: Path, tmp_path: Path) -> None:
+    data = dataset(folder, tmp_path)
+    matrix, shape = lattice(data.shoot.bounds, 48)
+    medium = data.shoot.medium(data.shoot.frames[1])
+    found = extinction_on(medium, matrix, shape)
+    peak = np.array(np.unravel_index(found.argmax(), shape))
+    world = data.shoot.normalisation.to_world((matrix[:3, :3].numpy() @ peak + matrix[:3, 3].numpy())[None])[0]
+    assert np.linalg.norm(world - np.array([14.0, 6.0, 3.0])) < VOXEL
+    assert found.max() == pytest.approx(float(medium.values[..., 0].max()), rel=0.15)
+    assert not extinction_on(data.shoot.medium(data.shoot.frames[0]), matrix, shape).any()
+
+
+# ---------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"siz": 3}, r"scene\.siz is not a setting .*'size'"),
+        ({"size": 2}, r"scene\.size=2: expected a whole number from 8 to 4096"),
+        ({"up": "x"}, r"scene\.up='x': expected y or z"),
+        ({"frames": "9-11"}, r"scene\.frames=9-11: expected all, FIRST:LAST or FIRST:LAST:STEP"),
+        ({"frames": "11:9"}, r"scene\.frames=11:9: expected"),
+        ({"look": "smok_fire"}, r"smok_fire.*'smoke_fire'"),
+        ({"optics": {"extinktion": 1}}, r"scene\.optics\.extinktion: no such setting.*'extinction'"),
+        ({"optics": {"extinction": -1.0}}, r"look: .*negative"),
+        ({"optics": {"extinction": "much"}}, r"scene\.optics\.extinction='much'"),
+        ({"grids": {"smoke": "density"}}, r"scene\.grids\.smoke: no such meaning"),
+        ({"vdb": None}, r"scene\.vdb: required"),
+    ],
+)
+def test_wrong_settings(folder: Path, tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        dataset(folder, tmp_path, **changes)
+
+
+def test_frames_that_do_not_exist(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"scene\.frames=50:60: .* has frames 2 to 11, and none of these"):
+        dataset(folder, tmp_path, frames="50:60")
+    assert choose_frames("2:10:4", list(NUMBERS)) == [2, 10]
+
+
+def test_a_grid_by_another_name(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"scene\.grids\.density=densty: no frame has such a grid; did you mean 'density'"):
+        dataset(folder, tmp_path, grids={"density": "densty"})
+    other = tmp_path / "other"
+    other.mkdir()
+    for number in (1, 2):
+        write_vdb(other / f"x{number}.vdb", blob(10.0 + number, ("soup",)))
+    with pytest.raises(DataError, match=r"no grid of density or temperature; found: soup \(readable\)"):
+        dataset(other, tmp_path)
+    assert dataset(other, tmp_path, grids={"density": "soup"}).exposure > 0
+
+
+def test_level_sets_are_refused_by_name(tmp_path: Path) -> None:
+    other = tmp_path / "sets"
+    other.mkdir()
+    grid = blob(10.0, ("density",))[0]
+    write_vdb(other / "a1.vdb", [Grid(**{**vars(grid), "kind": "level set"})])
+    with pytest.raises(DataError, match="level set"):
+        dataset(other, tmp_path, grids={"density": "density"})
+
+
+def test_a_sequence_without_matter(tmp_path: Path) -> None:
+    other = tmp_path / "none"
+    other.mkdir()
+    write_vdb(other / "a1.vdb", [Grid.from_dense("density", np.zeros((8, 8, 8), np.float32))])
+    with pytest.raises(DataError, match="no frame has an active voxel of 'density'"):
+        dataset(other, tmp_path)
+
+
+def test_damaged_points_say_what_to_do(folder: Path, tmp_path: Path) -> None:
+    data = dataset(folder, tmp_path)
+    (data.folder / "frame_00010" / "points.npz").write_bytes(b"not a zip")
+    with pytest.raises(DataError, match="delete its folder to render the frame again"):
+        dataset(folder, tmp_path)
+
+
+def test_nan_and_infinite_voxels_count_as_nothing(folder: Path, tmp_path: Path) -> None:
+    grids = blob(12.0)
+    grids[0].values[0, 0, 0, 0], grids[0].values[1, 1, 1, 1] = np.nan, np.inf
+    write_vdb(folder / "ball_10.vdb", grids)
+    data = dataset(folder, tmp_path)
+    assert all(bool(torch.isfinite(data.train.pixels(i).rgb).all()) for i in range(len(data.train)))

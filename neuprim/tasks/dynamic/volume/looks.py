@@ -13,9 +13,13 @@ EMBERGEN_FIRE = Look(
     ambient=(0.05, 0.05, 0.05),
     flame_range=(0.0, 0.181396484375),  # the largest flame of the sequence
     kelvin=(1050.0, 2155.0),
-    emission=1.0,
+    emission=2.0,
 )
-"""EmberGen's free fire, which has no density: hot gas absorbs, flames glow, and 5 % grey shows the rest."""
+"""EmberGen's free fire, which has no density: hot gas absorbs, flames glow, and a grey of 0.05 shows the rest.
+
+The strength of the glow beside the grey decides how dark the images are beside their brightest pixel. At 2 a black image has a PSNR
+of 26.5 dB on the test cameras of the rig (frames 2, 4 … 40, exposure 1 / maximum of the training images); at 1 it has 22.9 dB.
+"""
 
 SMOKE_FIRE = Look(
     extinction=14.0,
@@ -40,11 +44,11 @@ COLORFUL_SMOKE = Look(
 
 GROUND_EXPLOSION = Look(
     extinction=60.0,
-    albedo=(0.62, 0.52, 0.44),
+    albedo=(0.46, 0.36, 0.29),
     ambient=(0.10, 0.11, 0.12),
     light=Light((-0.7, 0.4, 0.6), (9.0, 8.4, 7.6)),
     kelvin=(1000.0, 2900.0),
-    emission=4.0,
+    emission=6.0,
     flame_extinction=30.0,
 )
 """A hot core inside thick brown-grey smoke."""

@@ -85,8 +85,8 @@ class Look:
     up: str = "z"
 
     def __post_init__(self) -> None:
-        weights = (self.extinction, self.emission, self.flame_extinction, *self.albedo, *self.ambient)
-        weights += self.light.irradiance if self.light else ()
+        lit = self.light.irradiance if self.light else ()
+        weights = (self.extinction, self.emission, self.flame_extinction, *self.albedo, *self.ambient, *lit)
         if not all(0.0 <= w < math.inf for w in weights):
             raise ConfigError("look: an extinction, colour or strength is negative or infinite; expected numbers >= 0")
         if not self.flame_range[0] < self.flame_range[1] or not 0.0 < self.kelvin[0] <= self.kelvin[1] <= 1e5:
@@ -131,19 +131,17 @@ def medium_of(grids: Mapping[str, Grid], look: Look, normalisation: Normalisatio
         return Medium.nothing()
     density, bad = _scalars(base, base.transform, box)
     sigma_s = density * np.float32(look.extinction)
-    sigma, flame = sigma_s, None
-    if flames is not None:
-        flame, more = _scalars(flames, base.transform, box)
-        bad += more
-        sigma = sigma_s + flame * np.float32(look.flame_extinction)
+    flame, more = (None, 0) if flames is None else _scalars(flames, base.transform, box)
+    bad += more
+    sigma = sigma_s if flame is None else sigma_s + flame * np.float32(look.flame_extinction)
     values = np.zeros((*sigma.shape, 4), np.float32)
     values[..., 0] = sigma
     scene_from_index = normalisation.matrix() @ base.transform
     scene_from_index[:3, 3] += scene_from_index[:3, :3] @ np.array(box[0], np.float64)
-    arriving = np.broadcast_to(np.array(look.ambient, np.float32), (*sigma.shape, 3))
+    arriving: np.ndarray = np.array(look.ambient, np.float32)
     if look.light is not None:
         lit = transmittance(Medium.padded(values, scene_from_index), look.light.direction, threads)[1:-1, 1:-1, 1:-1]
-        arriving = arriving + lit[..., None] * (np.array(look.light.irradiance, np.float32) / np.float32(4.0 * math.pi))
+        arriving = arriving + lit[..., None] * (np.array(look.light.irradiance, np.float32) / np.float32(4.0 * math.pi)).astype(np.float32)
     albedo, more = _albedo(grids, look, base.transform, box, scene_from_index)
     values[..., 1:] = sigma_s[..., None] * (albedo * arriving)
     if flame is not None and look.emission > 0.0:

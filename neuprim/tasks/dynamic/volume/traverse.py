@@ -1,9 +1,9 @@
 """The two kernels that walk rays through the cells between voxel centres, and the steps they share.
 
 A cell is the cube between eight voxel centres. Along a straight line through it a trilinear field is a cubic polynomial, which
-two Gauss points integrate exactly: the optical depth of a ray has no discretisation error at all. For the radiance, each Gauss
-point stands for the half of the optical depth that it contributes, with its own source; this is exact for thin cells and for a
-constant source, and second order in the step otherwise.
+two Gauss points integrate exactly: the optical depth of a ray has no discretisation error at all. For the radiance, the points'
+sources are weighted by the transmittance up to each, and the weights scaled so that a constant source is integrated exactly: fourth
+order in the step. Steps of an optical depth above 0.5 are made shorter where the ray is, so thick smoke needs no setting.
 
 Both kernels are in one file because numba's cache does not notice edits of other files.
 """
@@ -11,8 +11,12 @@ Both kernels are in one file because numba's cache does not notice edits of othe
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 from neuprim.core.render.cpu.compile import inline, kernel
 
@@ -21,6 +25,9 @@ __all__ = ["depths", "radiances"]
 _GAUSS = 0.5 - math.sqrt(3.0) / 6.0
 _FAR = 1e30
 _OPAQUE = np.float32(1e-4)
+_SHORTEST = 1.0 / 64.0
+_LESS, _MORE = np.float32(math.sqrt(1.0 / 3.0) - 0.5), np.float32(math.sqrt(1.0 / 3.0) + 0.5)
+_TINY = np.float32(1e-30)
 _DARK = 16.0
 _HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 _C2, _C3, _C4, _C5, _C6, _C7 = (np.float32(1.0 / n) for n in range(2, 8))
@@ -38,16 +45,22 @@ def _slab(o, d, size, near, far):  # type: ignore[no-untyped-def]
 @inline
 def _first(o, d, t, cells):  # type: ignore[no-untyped-def]
     """The cell of a point, per axis."""
-    return min(max(int(math.floor(o + t * d)), 0), cells - 1)
+    return min(max(math.floor(o + t * d), 0), cells - 1)
 
 
 @inline
-def _leave(o, d, cell, reach):  # type: ignore[no-untyped-def]
+def _inverse(d):  # type: ignore[no-untyped-def]
+    """1 / d; 0 where the ray runs along the cells."""
+    return 1.0 / d if abs(d) > 1e-12 else 0.0
+
+
+@inline
+def _leave(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
     """Where the ray leaves the cells ``cell - reach … cell + reach`` of one axis."""
-    if d > 1e-12:
-        return (cell + reach + 1 - o) / d
-    if d < -1e-12:
-        return (cell - reach - o) / d
+    if inverse > 0.0:
+        return (cell + reach + 1 - o) * inverse
+    if inverse < 0.0:
+        return (cell - reach - o) * inverse
     return _FAR
 
 
@@ -58,7 +71,7 @@ def _next(o, d, cell, reach, t, crossed):  # type: ignore[no-untyped-def]
         return cell + reach + 1 if d > 0.0 else cell - reach - 1
     if reach == 0:
         return cell
-    return min(max(int(math.floor(o + t * d)), cell - reach), cell + reach)
+    return min(max(math.floor(o + t * d), cell - reach), cell + reach)
 
 
 @inline
@@ -77,17 +90,88 @@ def _fading(depth):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _blend(v, o, dy, dx, x, y, z):  # type: ignore[no-untyped-def]
-    """Trilinear value from the eight corners of a cell; ``o`` is the offset of its lowest one, ``dz`` is 4."""
-    four = np.uint64(4)
-    a = v[o] + z * (v[o + four] - v[o])
-    b = v[o + dy] + z * (v[o + dy + four] - v[o + dy])
-    o = o + dx
-    c = v[o] + z * (v[o + four] - v[o])
-    d = v[o + dy] + z * (v[o + dy + four] - v[o + dy])
-    a += y * (b - a)
-    c += y * (d - c)
-    return a + x * (c - a)
+def _transmittance(depth):  # type: ignore[no-untyped-def]
+    """exp(-depth) for depths of -0.05 to 0.55, to 3e-6; float32."""
+    rest = _ONE - depth * _C6
+    rest = _ONE - depth * _C5 * rest
+    rest = _ONE - depth * _C4 * rest
+    rest = _ONE - depth * _C3 * rest
+    rest = _ONE - depth * _C2 * rest
+    return _ONE - depth * rest
+
+
+@inline
+def _gains(a, b):  # type: ignore[no-untyped-def]
+    """How much of the sources of two Gauss points leaves a step, and its transmittance, float32.
+
+    Args:
+        a, b: optical depth that each point stands for.
+    """
+    depth = a + b
+    if depth > _HALF:  # the shortest steps of something all but solid: one point behind the other, never out of range
+        p, rest = _fading(a)
+        q, last = _fading(b)
+        return p, rest * q, rest * last
+    mean, rest = _fading(depth)
+    # depths up to the points if extinction is linear between and beyond them; the first may come out as a trifle below zero
+    p, q = _transmittance(_HALF * a - _LESS * b), _transmittance(_MORE * a + _HALF * b)
+    whole = a * p + b * q
+    scale = mean * depth / whole if whole > _TINY else _ONE
+    return p * scale, q * scale, rest
+
+
+_FREE = ("nsz", "contract", "reassoc")
+"""What LLVM may do with the arithmetic of ``_two_points``."""
+
+
+def _generator(context, flat, o, dy, dx, x1, y1, z1, x2, y2, z2):  # type: ignore[no-untyped-def]
+    """Trilinear values of the four channels at two points of one cell, eight numbers: one vector of four per corner.
+
+    Written in LLVM's vectors because its optimiser does not find them in scalar code; without them an image takes 1.4 times as long.
+
+    Args:
+        flat: float32 array of the interleaved voxels. o, dy, dx: uint64, offsets of the cell's lowest corner and between neighbours
+            in y and x; those in z are 4 apart. x1 … z2: float32 fractions within the cell.
+    """
+    signature = types.UniTuple(types.float32, 8)(flat, o, dy, dx, *(types.float32,) * 6)
+    number, vector = ir.IntType(32), ir.VectorType(ir.FloatType(), 4)
+    nothing, first = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(number, 4), [0] * 4)
+
+    def generate(target, builder, signature, args):  # type: ignore[no-untyped-def]
+        data = target.make_array(signature.args[0])(target, builder, args[0]).data
+        low, to_y, to_x = args[1], args[2], args[3]
+        to_z = ir.Constant(ir.IntType(64), 4)
+
+        def corner(*steps):  # type: ignore[no-untyped-def]
+            at = low
+            for step in steps:
+                at = builder.add(at, step)
+            return builder.load(builder.bitcast(builder.gep(data, [at]), vector.as_pointer()), align=4)
+
+        def spread(value):  # type: ignore[no-untyped-def]
+            return builder.shuffle_vector(builder.insert_element(nothing, value, number(0)), nothing, first)
+
+        def along(a, change, part):  # type: ignore[no-untyped-def]
+            return builder.fadd(a, builder.fmul(part, change, _FREE), _FREE)
+
+        def between(a, b, part):  # type: ignore[no-untyped-def]
+            return along(a, builder.fsub(b, a, _FREE), part)
+
+        edges = []
+        for steps in ((), (to_y,), (to_x,), (to_x, to_y)):
+            below = corner(*steps)
+            edges.append((below, builder.fsub(corner(*steps, to_z), below, _FREE)))
+        found = []
+        for x, y, z in (map(spread, args[4:7]), map(spread, args[7:10])):
+            a, b, c, d = (along(below, change, z) for below, change in edges)
+            value = between(between(a, b, y), between(c, d, y), x)
+            found += [builder.extract_element(value, number(n)) for n in range(4)]
+        return target.make_tuple(builder, signature.return_type, found)
+
+    return signature, generate
+
+
+_two_points: Any = intrinsic(_generator)
 
 
 @kernel
@@ -106,8 +190,8 @@ def radiances(start, stop, values, skips, pose, lens, width, samples, parts, ima
     dy = np.uint64(4 * (nz + 1))
     dx = dy * np.uint64(ny + 1)
     weight = np.float32(1.0 / (samples * samples))
+    share = 1.0 / parts
     ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
-    u1, u2, u3 = np.uint64(1), np.uint64(2), np.uint64(3)
     for row in range(start, stop):
         for column in range(width):
             sum_r, sum_g, sum_b, sum_a = _ZERO, _ZERO, _ZERO, _ZERO
@@ -123,27 +207,41 @@ def radiances(start, stop, values, skips, pose, lens, width, samples, parts, ima
                 t, end = _slab(oz, rz, float(nz), t, end)
                 if t >= end:
                     continue
+                ix, iy, iz = _inverse(rx), _inverse(ry), _inverse(rz)
                 i, j, k = _first(ox, rx, t, nx), _first(oy, ry, t, ny), _first(oz, rz, t, nz)
                 through = _ONE
                 r, g, b = _ZERO, _ZERO, _ZERO
                 while 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
                     skip = int(skips[i, j, k])
                     reach = max(skip - 1, 0)
-                    tx, ty, tz = _leave(ox, rx, i, reach), _leave(oy, ry, j, reach), _leave(oz, rz, k, reach)
+                    tx, ty, tz = _leave(ox, ix, i, reach), _leave(oy, iy, j, reach), _leave(oz, iz, k, reach)
                     out = min(tx, min(ty, tz))
                     if skip == 0 and out > t:
                         o = np.uint64(i) * dx + np.uint64(j) * dy + np.uint64(4 * k)
-                        step = (out - t) / parts
-                        half = np.float32(0.5 * step)
-                        for point in range(2 * parts):
-                            s = t + step * (point // 2 + (_GAUSS if point % 2 == 0 else 1.0 - _GAUSS))
-                            x, y, z = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j), np.float32(oz + s * rz - k)
-                            mean, rest = _fading(half * _blend(flat, o, dy, dx, x, y, z))
-                            gain = through * half * mean
-                            r += gain * _blend(flat, o + u1, dy, dx, x, y, z)
-                            g += gain * _blend(flat, o + u2, dy, dx, x, y, z)
-                            b += gain * _blend(flat, o + u3, dy, dx, x, y, z)
+                        step = (out - t) * share
+                        part = step
+                        begin = t
+                        while begin < out and through > _OPAQUE:
+                            s = begin + part * _GAUSS
+                            x1, y1, z1 = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j), np.float32(oz + s * rz - k)
+                            s = begin + part * (1.0 - _GAUSS)
+                            x2, y2, z2 = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j), np.float32(oz + s * rz - k)
+                            s1, r1, g1, b1, s2, r2, g2, b2 = _two_points(flat, o, dy, dx, x1, y1, z1, x2, y2, z2)
+                            half = np.float32(0.5 * part)
+                            s1 *= half
+                            s2 *= half
+                            if s1 + s2 > _HALF and part > _SHORTEST * step:
+                                part *= 0.5 if s1 + s2 < _ONE else 0.25
+                                continue
+                            p, q, rest = _gains(s1, s2)
+                            p *= through * half
+                            q *= through * half
+                            r += p * r1 + q * r2
+                            g += p * g1 + q * g2
+                            b += p * b1 + q * b2
                             through *= rest
+                            begin += part
+                            part = min(step, out - begin)
                         if through < _OPAQUE:
                             break
                     i = _next(ox, rx, i, reach, out, tx == out)
@@ -182,6 +280,7 @@ def depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignore[no-un
         result: (X, Y, Z) float32, written where sigma > 0; a ray stops at a depth of 16.
     """
     nx, ny, nz = skips.shape
+    ix, iy, iz = _inverse(rx), _inverse(ry), _inverse(rz)
     for a in range(start, stop):
         for b in range(ny + 1):
             for c in range(nz + 1):
@@ -193,7 +292,7 @@ def depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignore[no-un
                 while 0 <= i < nx and 0 <= j < ny and 0 <= k < nz and depth < _DARK:
                     skip = int(skips[i, j, k])
                     reach = max(skip - 1, 0)
-                    tx, ty, tz = _leave(ox, rx, i, reach), _leave(oy, ry, j, reach), _leave(oz, rz, k, reach)
+                    tx, ty, tz = _leave(ox, ix, i, reach), _leave(oy, iy, j, reach), _leave(oz, iz, k, reach)
                     out = min(tx, min(ty, tz))
                     if skip == 0 and out > t:
                         for point in range(2):

@@ -108,7 +108,7 @@ def test_random_media_against_a_slow_march(seed: int) -> None:
     assert np.abs(rough - expected).max() < 1e-3
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_halving_the_step_moves_no_pixel(seed: int) -> None:
     medium = sheet(seed)
     views = [camera((1.6, -1.5, 1.5), 64), camera((-2.6, 0.4, 0.5), 128)]

@@ -14,8 +14,8 @@ __all__ = ["AXES", "rig"]
 AXES = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 """Up directions by name."""
 
-_TEST = (0.3, 0.65)
-"""Where the test cameras stand in the sequence, which goes from the rim to the pole: inside of the set, far from each other."""
+_TEST = (0.4, 0.75)
+"""Where the test cameras stand in the sequence, which goes from the rim to the pole: neighbours on all sides, 90 degrees apart."""
 
 
 def rig(

@@ -20,7 +20,9 @@ SHAPE = (13, 9, 11)
 
 def model(neurons: int = 5) -> Primitives:
     t = scenes.tensors(40, neurons, seed=2)
-    return Primitives(CosineDensity(neurons), SphericalHarmonics(0), {**{k: v for k, v in t.items() if k != "colors"}, "sh_dc": t["colors"]})
+    return Primitives(
+        CosineDensity(neurons), SphericalHarmonics(0), {**{k: v for k, v in t.items() if k != "colors"}, "sh_dc": t["colors"]}
+    )
 
 
 def oracle(m: Primitives, matrix: Tensor) -> Tensor:

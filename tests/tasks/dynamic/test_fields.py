@@ -62,7 +62,9 @@ def test_equation_13_has_the_papers_number_of_parameters(degree: int, expected: 
 
 
 def test_windows_with_motion_take_as_many_as_equation_13() -> None:
-    sizes = {time: sum(s.size for s in TimeDensity(8, time).parameters()) for time in ("none", "phase", "offset", "window+motion", "window")}
+    sizes = {
+        time: sum(s.size for s in TimeDensity(8, time).parameters()) for time in ("none", "phase", "offset", "window+motion", "window")
+    }
     assert sizes == {"none": 41, "phase": 49, "offset": 49, "window+motion": 49, "window": 43}
 
 

@@ -116,7 +116,14 @@ def test_a_second_call_renders_nothing_and_an_interrupted_one_goes_on(
 
 def test_whatever_matters_is_part_of_the_key(folder: Path, tmp_path: Path) -> None:
     names = {dataset(folder, tmp_path).folder}
-    for change in ({"size": 20}, {"samples": 2}, {"cameras": 5}, {"look": "dust_tornado"}, {"optics": {"extinction": 3.0}}, {"frames": "9:11"}):
+    for change in (
+        {"size": 20},
+        {"samples": 2},
+        {"cameras": 5},
+        {"look": "dust_tornado"},
+        {"optics": {"extinction": 3.0}},
+        {"frames": "9:11"},
+    ):
         names.add(dataset(folder, tmp_path, **change).folder)
     write_vdb(folder / "ball_11.vdb", blob(17.0))
     names.add(dataset(folder, tmp_path).folder)
@@ -224,6 +231,26 @@ def test_damaged_points_say_what_to_do(folder: Path, tmp_path: Path) -> None:
     (data.folder / "frame_00010" / "points.npz").write_bytes(b"not a zip")
     with pytest.raises(DataError, match="delete its folder to render the frame again"):
         dataset(folder, tmp_path)
+
+
+def test_a_frame_without_the_wanted_grid_is_empty(folder: Path, tmp_path: Path) -> None:
+    write_vdb(folder / "ball_10.vdb", blob(12.0, ("temperature",)))
+    data = dataset(folder, tmp_path)
+    alpha = [pixels.alpha for pixels in map(data.test.pixels, range(4))]
+    assert [a is not None and bool(a.any()) for a in alpha] == [False, True, False, True]
+
+
+def test_voxel_sizes_and_bounds_may_change(folder: Path, tmp_path: Path) -> None:
+    before = dataset(folder, tmp_path).test.pixels(2)
+    index = np.stack(np.meshgrid(*(np.arange(48, dtype=np.float32),) * 3, indexing="ij"), -1)
+    value = np.clip(1 - np.linalg.norm(index - np.array([24, 24, 24], np.float32), axis=-1) / 10, 0, None)
+    fine = scale_transform(VOXEL / 2, (10.0, 0.0, -3.0))
+    write_vdb(
+        folder / "ball_10.vdb", [Grid.from_dense(n, value * (0.2 if n == "flames" else 1), transform=fine) for n in ("density", "flames")]
+    )
+    after = dataset(folder, tmp_path).test.pixels(2)
+    assert before.alpha is not None and after.alpha is not None
+    assert float((before.alpha - after.alpha).abs().mean()) < 0.01 < float(before.alpha.mean())
 
 
 def test_nan_and_infinite_voxels_count_as_nothing(folder: Path, tmp_path: Path) -> None:

@@ -19,10 +19,13 @@ from neuprim.tasks.dynamic.dead import dead_fraction
 from neuprim.tasks.dynamic.volume.compare import compare_with_truth
 from neuprim.tasks.dynamic.volume.shoot import Shoot
 
-__all__ = ["MEMORY", "FrameViews", "VolumeDataset"]
+__all__ = ["MEMORY", "MEMORY_TEST", "FrameViews", "VolumeDataset"]
 
-MEMORY = 2**30
-"""Bytes of decoded images that a split keeps; beyond them the oldest are read again when needed."""
+MEMORY = 3 * 2**28
+"""Bytes of decoded images that the training split keeps, 768 MiB; beyond them the oldest are read again when needed."""
+
+MEMORY_TEST = 2**27
+"""The same of the test split, which is gone through in order."""
 
 _MATTER = 1.0 / 255.0  # alpha from which a pixel belongs to the union mask
 
@@ -33,9 +36,7 @@ class FrameViews(ViewSet):
     ``every`` = n leaves out all but every n-th frame; times stay those of the whole sequence.
     """
 
-    def __init__(
-        self, shoot: Shoot, folder: Path, cameras: Sequence[int], exposure: float, every: int = 1, memory: int = MEMORY
-    ) -> None:
+    def __init__(self, shoot: Shoot, folder: Path, cameras: Sequence[int], exposure: float, every: int = 1, memory: int = MEMORY) -> None:
         self.shoot, self.folder, self.cameras, self.exposure, self.memory = shoot, folder, list(cameras), exposure, memory
         self._kept: OrderedDict[int, Tensor] = OrderedDict()
         count = len(shoot.frames)
@@ -76,7 +77,9 @@ class VolumeDataset(Dataset):
     color_space = "linear"
     random_background = True
 
-    def __init__(self, name: str, source: DataSource, shoot: Shoot, folder: Path, held_out: Sequence[int], up: Tensor, every: int = 1) -> None:
+    def __init__(
+        self, name: str, source: DataSource, shoot: Shoot, folder: Path, held_out: Sequence[int], up: Tensor, every: int = 1
+    ) -> None:
         self.name, self.data_source = name, source
         self.shoot, self.folder, self.every = shoot, folder, every
         stored = [_stored(shoot.points(folder, frame)) for frame in shoot.frames]
@@ -86,7 +89,7 @@ class VolumeDataset(Dataset):
         self.weights = [float(s["weight"]) for s in stored]
         learned = [c for c in range(len(shoot.cameras)) if c not in held_out]
         self.train = FrameViews(shoot, folder, learned, self.exposure, every)
-        self.test = FrameViews(shoot, folder, held_out, self.exposure)
+        self.test = FrameViews(shoot, folder, held_out, self.exposure, memory=MEMORY_TEST)
         self.extent = camera_extent(shoot.cameras)
         self.background = torch.zeros(3)
         camera = shoot.cameras[0]

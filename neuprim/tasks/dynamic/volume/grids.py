@@ -26,6 +26,11 @@ class GridReader:
 
     names: Mapping[str, str]
 
+    @property
+    def extinction(self) -> str:
+        """The meaning of the grid that absorbs: "density", or "temperature" in sequences without one."""
+        return "density" if "density" in self.names else "temperature"
+
     def read(self, path: Path) -> dict[str, Grid]:
         """The grids of one file by meaning; those that the file lacks are left out (an exporter drops empty ones)."""
         there = {grid.name for grid in read_header(path).grids}

@@ -98,19 +98,18 @@ def _survey(frames: list[Frame], reader: GridReader, progress: Progress) -> tupl
         DataError: no frame has any active voxel.
     """
     lows, highs, hottest = [], [], 0.0
-    extinction = "density" if "density" in reader.names else "temperature"
     for i, frame in enumerate(frames):
         progress("looking through the frames", i / len(frames))
         for meaning, grid in reader.read(frame.path).items():
             bounds = grid.world_bounds()
             if bounds is None:
                 continue
-            if meaning == extinction:
+            if meaning == reader.extinction:
                 lows.append(bounds[0])
                 highs.append(bounds[1])
             elif meaning == "flames" and grid.range is not None:
                 hottest = max(hottest, grid.range[1])
     if not lows:
         where = os.path.commonpath([f.path for f in frames])
-        raise DataError(f"{where}: no frame has an active voxel of {reader.names[extinction]!r}; expected matter in at least one")
+        raise DataError(f"{where}: no frame has an active voxel of {reader.names[reader.extinction]!r}; expected matter in at least one")
     return np.stack([np.min(lows, 0), np.max(highs, 0)]), hottest

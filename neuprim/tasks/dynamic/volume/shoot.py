@@ -70,8 +70,11 @@ class Shoot:
         return hashlib.sha256(json.dumps(parts, default=_plain).encode()).hexdigest()[:16]
 
     def medium(self, frame: Frame) -> Medium:
-        """What a frame's file holds, as extinction and radiance."""
-        return medium_of(self.reader.read(frame.path), self.look, self.normalisation)
+        """What a frame's file holds, as extinction and radiance; nothing where it lacks the grid that absorbs in the others."""
+        grids = self.reader.read(frame.path)
+        if self.reader.extinction not in grids:
+            return Medium.nothing()
+        return medium_of(grids, self.look, self.normalisation)
 
     def image(self, folder: Path, frame: Frame, camera: int) -> Path:
         """File of one image."""

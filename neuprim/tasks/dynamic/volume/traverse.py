@@ -1,0 +1,306 @@
+"""The two kernels that walk rays through the cells between voxel centres, and the steps they share.
+
+A cell is the cube between eight voxel centres. Along a straight line through it a trilinear field is a cubic polynomial, which
+two Gauss points integrate exactly: the optical depth of a ray has no discretisation error at all. For the radiance, the points'
+sources are weighted by the transmittance up to each, and the weights scaled so that a constant source is integrated exactly: fourth
+order in the step. Steps of an optical depth above 0.5 are made shorter where the ray is, so thick smoke needs no setting.
+
+Both kernels are in one file because numba's cache does not notice edits of other files.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from neuprim.core.render.cpu.compile import inline, kernel
+
+__all__ = ["depths", "radiances"]
+
+_GAUSS = 0.5 - math.sqrt(3.0) / 6.0
+_FAR = 1e30
+_OPAQUE = np.float32(1e-4)
+_SHORTEST = 1.0 / 64.0
+_LESS, _MORE = np.float32(math.sqrt(1.0 / 3.0) - 0.5), np.float32(math.sqrt(1.0 / 3.0) + 0.5)
+_TINY = np.float32(1e-30)
+_DARK = 16.0
+_HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
+_C2, _C3, _C4, _C5, _C6, _C7 = (np.float32(1.0 / n) for n in range(2, 8))
+
+
+@inline
+def _slab(o, d, size, near, far):  # type: ignore[no-untyped-def]
+    """The part of [near, far] in which ``o + t d`` is within 0..size."""
+    if abs(d) < 1e-12:
+        return (near, far) if 0.0 <= o <= size else (_FAR, -_FAR)
+    a, b = -o / d, (size - o) / d
+    return max(near, min(a, b)), min(far, max(a, b))
+
+
+@inline
+def _first(o, d, t, cells):  # type: ignore[no-untyped-def]
+    """The cell of a point, per axis."""
+    return min(max(math.floor(o + t * d), 0), cells - 1)
+
+
+@inline
+def _inverse(d):  # type: ignore[no-untyped-def]
+    """1 / d; 0 where the ray runs along the cells."""
+    return 1.0 / d if abs(d) > 1e-12 else 0.0
+
+
+@inline
+def _leave(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
+    """Where the ray leaves the cells ``cell - reach … cell + reach`` of one axis."""
+    if inverse > 0.0:
+        return (cell + reach + 1 - o) * inverse
+    if inverse < 0.0:
+        return (cell - reach - o) * inverse
+    return _FAR
+
+
+@inline
+def _next(o, d, cell, reach, t, crossed):  # type: ignore[no-untyped-def]
+    """The cell beyond ``t``, per axis: exact on the axis that is crossed, so that rounding never holds a ray up."""
+    if crossed:
+        return cell + reach + 1 if d > 0.0 else cell - reach - 1
+    if reach == 0:
+        return cell
+    return min(max(math.floor(o + t * d), cell - reach), cell + reach)
+
+
+@inline
+def _fading(depth):  # type: ignore[no-untyped-def]
+    """(1 - exp(-depth)) / depth and exp(-depth), float32; without cancellation and mostly without an exponential."""
+    if depth < _HALF:
+        mean = _ONE - depth * _C7
+        mean = _ONE - depth * _C6 * mean
+        mean = _ONE - depth * _C5 * mean
+        mean = _ONE - depth * _C4 * mean
+        mean = _ONE - depth * _C3 * mean
+        mean = _ONE - depth * _C2 * mean
+        return mean, _ONE - depth * mean
+    rest = math.exp(-depth)
+    return (_ONE - rest) / depth, rest
+
+
+@inline
+def _transmittance(depth):  # type: ignore[no-untyped-def]
+    """exp(-depth) for depths of -0.05 to 0.55, to 3e-6; float32."""
+    rest = _ONE - depth * _C6
+    rest = _ONE - depth * _C5 * rest
+    rest = _ONE - depth * _C4 * rest
+    rest = _ONE - depth * _C3 * rest
+    rest = _ONE - depth * _C2 * rest
+    return _ONE - depth * rest
+
+
+@inline
+def _gains(a, b):  # type: ignore[no-untyped-def]
+    """How much of the sources of two Gauss points leaves a step, and its transmittance, float32.
+
+    Args:
+        a, b: optical depth that each point stands for.
+    """
+    depth = a + b
+    if depth > _HALF:  # the shortest steps of something all but solid: one point behind the other, never out of range
+        p, rest = _fading(a)
+        q, last = _fading(b)
+        return p, rest * q, rest * last
+    mean, rest = _fading(depth)
+    # depths up to the points if extinction is linear between and beyond them; the first may come out as a trifle below zero
+    p, q = _transmittance(_HALF * a - _LESS * b), _transmittance(_MORE * a + _HALF * b)
+    whole = a * p + b * q
+    scale = mean * depth / whole if whole > _TINY else _ONE
+    return p * scale, q * scale, rest
+
+
+_FREE = ("nsz", "contract", "reassoc")
+"""What LLVM may do with the arithmetic of ``_two_points``."""
+
+
+def _generator(context, flat, o, dy, dx, x1, y1, z1, x2, y2, z2):  # type: ignore[no-untyped-def]
+    """Trilinear values of the four channels at two points of one cell, eight numbers: one vector of four per corner.
+
+    Written in LLVM's vectors because its optimiser does not find them in scalar code; without them an image takes 1.4 times as long.
+
+    Args:
+        flat: float32 array of the interleaved voxels. o, dy, dx: uint64, offsets of the cell's lowest corner and between neighbours
+            in y and x; those in z are 4 apart. x1 … z2: float32 fractions within the cell.
+    """
+    signature = types.UniTuple(types.float32, 8)(flat, o, dy, dx, *(types.float32,) * 6)
+    number, vector = ir.IntType(32), ir.VectorType(ir.FloatType(), 4)
+    nothing, first = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(number, 4), [0] * 4)
+
+    def generate(target, builder, signature, args):  # type: ignore[no-untyped-def]
+        data = target.make_array(signature.args[0])(target, builder, args[0]).data
+        low, to_y, to_x = args[1], args[2], args[3]
+        to_z = ir.Constant(ir.IntType(64), 4)
+
+        def corner(*steps):  # type: ignore[no-untyped-def]
+            at = low
+            for step in steps:
+                at = builder.add(at, step)
+            return builder.load(builder.bitcast(builder.gep(data, [at]), vector.as_pointer()), align=4)
+
+        def spread(value):  # type: ignore[no-untyped-def]
+            return builder.shuffle_vector(builder.insert_element(nothing, value, number(0)), nothing, first)
+
+        def along(a, change, part):  # type: ignore[no-untyped-def]
+            return builder.fadd(a, builder.fmul(part, change, _FREE), _FREE)
+
+        def between(a, b, part):  # type: ignore[no-untyped-def]
+            return along(a, builder.fsub(b, a, _FREE), part)
+
+        edges = []
+        for steps in ((), (to_y,), (to_x,), (to_x, to_y)):
+            below = corner(*steps)
+            edges.append((below, builder.fsub(corner(*steps, to_z), below, _FREE)))
+        found = []
+        for x, y, z in (map(spread, args[4:7]), map(spread, args[7:10])):
+            a, b, c, d = (along(below, change, z) for below, change in edges)
+            value = between(between(a, b, y), between(c, d, y), x)
+            found += [builder.extract_element(value, number(n)) for n in range(4)]
+        return target.make_tuple(builder, signature.return_type, found)
+
+    return signature, generate
+
+
+_two_points: Any = intrinsic(_generator)
+
+
+@kernel
+def radiances(start, stop, values, skips, pose, lens, width, samples, parts, image):  # type: ignore[no-untyped-def]
+    """Image rows start … stop.
+
+    Args:
+        values: (X, Y, Z, 4) float32. skips: (X-1, Y-1, Z-1) uint8. See Medium.
+        pose: (3, 4) float64, camera axes to indices; its lengths are scene units on the camera's side.
+        lens: (4,) float64 fx fy cx cy.
+        samples: rays per pixel side. parts: sub-intervals per cell.
+        image: (H, W, 4) float32, premultiplied RGBA, written.
+    """
+    nx, ny, nz = skips.shape
+    flat = values.reshape(-1)
+    dy = np.uint64(4 * (nz + 1))
+    dx = dy * np.uint64(ny + 1)
+    weight = np.float32(1.0 / (samples * samples))
+    share = 1.0 / parts
+    ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
+    for row in range(start, stop):
+        for column in range(width):
+            sum_r, sum_g, sum_b, sum_a = _ZERO, _ZERO, _ZERO, _ZERO
+            for sample in range(samples * samples):
+                cx = (column + (sample % samples + 0.5) / samples - lens[2]) / lens[0]
+                cy = (row + (sample // samples + 0.5) / samples - lens[3]) / lens[1]
+                unit = 1.0 / math.sqrt(cx * cx + cy * cy + 1.0)
+                rx = (pose[0, 0] * cx + pose[0, 1] * cy + pose[0, 2]) * unit
+                ry = (pose[1, 0] * cx + pose[1, 1] * cy + pose[1, 2]) * unit
+                rz = (pose[2, 0] * cx + pose[2, 1] * cy + pose[2, 2]) * unit
+                t, end = _slab(ox, rx, float(nx), 0.0, _FAR)
+                t, end = _slab(oy, ry, float(ny), t, end)
+                t, end = _slab(oz, rz, float(nz), t, end)
+                if t >= end:
+                    continue
+                ix, iy, iz = _inverse(rx), _inverse(ry), _inverse(rz)
+                i, j, k = _first(ox, rx, t, nx), _first(oy, ry, t, ny), _first(oz, rz, t, nz)
+                through = _ONE
+                r, g, b = _ZERO, _ZERO, _ZERO
+                while 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
+                    skip = int(skips[i, j, k])
+                    reach = max(skip - 1, 0)
+                    tx, ty, tz = _leave(ox, ix, i, reach), _leave(oy, iy, j, reach), _leave(oz, iz, k, reach)
+                    out = min(tx, min(ty, tz))
+                    if skip == 0 and out > t:
+                        o = np.uint64(i) * dx + np.uint64(j) * dy + np.uint64(4 * k)
+                        step = (out - t) * share
+                        part = step
+                        begin = t
+                        while begin < out and through > _OPAQUE:
+                            s = begin + part * _GAUSS
+                            x1, y1, z1 = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j), np.float32(oz + s * rz - k)
+                            s = begin + part * (1.0 - _GAUSS)
+                            x2, y2, z2 = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j), np.float32(oz + s * rz - k)
+                            s1, r1, g1, b1, s2, r2, g2, b2 = _two_points(flat, o, dy, dx, x1, y1, z1, x2, y2, z2)
+                            half = np.float32(0.5 * part)
+                            s1 *= half
+                            s2 *= half
+                            if s1 + s2 > _HALF and part > _SHORTEST * step:
+                                part *= 0.5 if s1 + s2 < _ONE else 0.25
+                                continue
+                            p, q, rest = _gains(s1, s2)
+                            p *= through * half
+                            q *= through * half
+                            r += p * r1 + q * r2
+                            g += p * g1 + q * g2
+                            b += p * b1 + q * b2
+                            through *= rest
+                            begin += part
+                            part = min(step, out - begin)
+                        if through < _OPAQUE:
+                            break
+                    i = _next(ox, rx, i, reach, out, tx == out)
+                    j = _next(oy, ry, j, reach, out, ty == out)
+                    k = _next(oz, rz, k, reach, out, tz == out)
+                    t = max(t, out)
+                sum_r += r
+                sum_g += g
+                sum_b += b
+                sum_a += _ONE - through
+            image[row, column, 0] = sum_r * weight
+            image[row, column, 1] = sum_g * weight
+            image[row, column, 2] = sum_b * weight
+            image[row, column, 3] = sum_a * weight
+
+
+@inline
+def _between(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def]
+    """Trilinear value of an (X, Y, Z) array at fractions of cell (i, j, k)."""
+    a = v[i, j, k] + z * (v[i, j, k + 1] - v[i, j, k])
+    b = v[i, j + 1, k] + z * (v[i, j + 1, k + 1] - v[i, j + 1, k])
+    c = v[i + 1, j, k] + z * (v[i + 1, j, k + 1] - v[i + 1, j, k])
+    d = v[i + 1, j + 1, k] + z * (v[i + 1, j + 1, k + 1] - v[i + 1, j + 1, k])
+    a += y * (b - a)
+    c += y * (d - c)
+    return a + x * (c - a)
+
+
+@kernel
+def depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignore[no-untyped-def]
+    """Optical depth from the voxels of slices start … stop in one direction to the end of the grid.
+
+    Args:
+        sigma: (X, Y, Z) float32. skips: as in :func:`radiances`.
+        rx, ry, rz: the direction, indices per scene unit.
+        result: (X, Y, Z) float32, written where sigma > 0; a ray stops at a depth of 16.
+    """
+    nx, ny, nz = skips.shape
+    ix, iy, iz = _inverse(rx), _inverse(ry), _inverse(rz)
+    for a in range(start, stop):
+        for b in range(ny + 1):
+            for c in range(nz + 1):
+                if sigma[a, b, c] <= 0.0:
+                    continue
+                ox, oy, oz = float(a), float(b), float(c)
+                i, j, k = min(a, nx - 1), min(b, ny - 1), min(c, nz - 1)
+                t, depth = 0.0, 0.0
+                while 0 <= i < nx and 0 <= j < ny and 0 <= k < nz and depth < _DARK:
+                    skip = int(skips[i, j, k])
+                    reach = max(skip - 1, 0)
+                    tx, ty, tz = _leave(ox, ix, i, reach), _leave(oy, iy, j, reach), _leave(oz, iz, k, reach)
+                    out = min(tx, min(ty, tz))
+                    if skip == 0 and out > t:
+                        for point in range(2):
+                            s = t + (out - t) * (_GAUSS if point == 0 else 1.0 - _GAUSS)
+                            x, y, z = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j), np.float32(oz + s * rz - k)
+                            depth += 0.5 * (out - t) * _between(sigma, i, j, k, x, y, z)
+                    i = _next(ox, rx, i, reach, out, tx == out)
+                    j = _next(oy, ry, j, reach, out, ty == out)
+                    k = _next(oz, rz, k, reach, out, tz == out)
+                    t = max(t, out)
+                result[a, b, c] = depth

@@ -1,0 +1,184 @@
+"""Whole runs of the dynamic task, small: files, simulation and images in; report, films and animations out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from PIL import Image
+from rich.console import Console
+
+from neuprim.cli import main
+from neuprim.config import compose
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.vdb import write_vdb
+from neuprim.evaluate import evaluate_run, load_run, render_run
+from neuprim.run import run
+from neuprim.tasks.dynamic import TASK
+from neuprim.tasks.dynamic.time import parse_times
+from tests.tasks.dynamic.test_volume_scene import blob
+
+SMALL = ["scene.size=24", "scene.cameras=6", "scene.samples=1", "model.primitives=60", "model.neurons=2", "train.max_seconds=null"]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("ball")
+    for number in range(1, 5):
+        write_vdb(folder / f"ball_{number}.vdb", blob(6.0 + 3 * number))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(files: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fit(files, tmp_path_factory.mktemp("run") / "run", "train.iterations=500")
+
+
+def fit(files: Path, target: Path, *words: str) -> Path:
+    scene = ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'", "scene.look=smoke_fire"]
+    return run(compose([*scene, *SMALL, f"output_dir='{target}'", *words]), Console(quiet=True))
+
+
+def metrics(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "metrics.json").read_text())  # type: ignore[no-any-return]
+
+
+def test_a_run_learns_and_reports_every_number(finished: Path) -> None:
+    m = metrics(finished)
+    assert m["psnr_mask"] > m["psnr_black_image_mask"] + 4
+    assert m["psnr"] > m["psnr_mask"] and m["psnr_pooled_mask"] <= m["psnr_mask"] + 1e-9
+    assert len(m["per_frame"]) == 4 and all({"psnr", "psnr_mask", "psnr_black_image"} <= f.keys() for f in m["per_frame"])
+    assert m["psnr_srgb"] > 0 and m["ssim_srgb"] > 0 and m["color_space"] == "linear"
+    assert m["sigma_correlation_middle"] > 0.5 and 0 < m["sigma_relative_l2_middle"] < 1
+    assert m["vdb_bytes"] > 0 and 0 <= m["dead_fraction"] <= 1 and m["data_source"] == "real"
+
+
+def test_the_report_shows_films_beside_their_truth(finished: Path) -> None:
+    films = sorted((finished / "renders").glob("clip_*.webp"))
+    assert len(films) == 2
+    with Image.open(films[0]) as film:
+        assert film.size == (48, 24) and getattr(film, "n_frames", 1) == 4
+    page = (finished / "report.html").read_text()
+    assert "Held-out films" in page and "PSNR over the frames" in page and "PSNR inside the mask" in page
+
+
+def test_eval_gives_the_same_numbers(finished: Path) -> None:
+    again, first = evaluate_run(finished), metrics(finished)
+    for key in ("psnr", "psnr_mask", "psnr_pooled_mask", "ssim_srgb", "sigma_correlation_late"):
+        assert again[key] == pytest.approx(first[key], abs=1e-9), key
+
+
+@pytest.mark.parametrize("suffix", ["webp", "gif", "mp4"])
+def test_an_animation_over_time(finished: Path, tmp_path: Path, suffix: str) -> None:
+    if suffix == "mp4":
+        pytest.importorskip("av", reason="MP4 needs neuprim[video]")
+    target = tmp_path / f"film.{suffix}"
+    assert main(["render", str(finished), "--camera", "orbit", "--time", "0:1:7", "--frames", "7", "--out", str(target)]) == 0
+    if suffix == "mp4":
+        import av
+
+        with av.open(str(target)) as film:
+            frames = [f.to_ndarray(format="rgb24") for f in film.decode(video=0)]
+        assert len(frames) == 7 and frames[3].shape == (24, 24, 3) and frames[3].max() > 60
+    else:
+        with Image.open(target) as image:
+            assert getattr(image, "n_frames", 1) == 7
+
+
+def test_time_alone_changes_the_picture(finished: Path, tmp_path: Path) -> None:
+    early, late = (render_run(finished, "orbit", None, "exr", tmp_path / t, 1, {"time": t})[0] for t in ("0", "1"))
+    assert early.read_bytes() != late.read_bytes()
+
+
+def test_an_orbit_without_a_time_runs_through_the_sequence(finished: Path, tmp_path: Path) -> None:
+    paths = render_run(finished, "orbit", None, "png", tmp_path / "o", 3, {})
+    assert len(paths) == 3
+
+
+def test_cameras_of_a_file_need_a_time(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, task, _, _ = load_run(finished)
+    assert task is TASK
+    matrix = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2.7], [0, 0, 0, 1]]
+    cameras = {"w": 24, "h": 24, "camera_angle_x": 0.5, "frames": [{"name": "a", "transform_matrix": matrix}]}
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps(cameras))
+    assert main(["render", str(finished), "--camera", str(path)]) == 2
+    assert "has no time, which task 'dynamic' needs; give --time" in capsys.readouterr().err
+    assert main(["render", str(finished), "--camera", str(path), "--time", "0.5", "--out", str(tmp_path / "a.png")]) == 0
+
+
+@pytest.mark.parametrize("text", ["2", "-0.1", "0:2", "nan", "a", "0:1:1", "0:1:2:3", "", "0:1:1e9"])
+def test_impossible_times(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"expected a time in 0\.\.1"):
+        parse_times(text)
+
+
+def test_resuming_equals_going_on(files: Path, tmp_path: Path) -> None:
+    words = ["model.density.time=phase+window+motion", "train.population.every=5", "train.population.start=0", "train.iterations=40"]
+    whole = fit(files, tmp_path / "whole", *words)
+    part = tmp_path / "part"
+
+    class Stop(Exception):
+        pass
+
+    from neuprim.core.train.trainer import Trainer
+
+    original, steps = Trainer.train_step, []
+
+    def stopping(self: Trainer) -> Any:
+        if self.step == 20 and len(self.model.params["means"]) == 60 and not steps:
+            steps.append(self.step)
+            raise KeyboardInterrupt
+        return original(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Trainer, "train_step", stopping)
+        with pytest.raises(KeyboardInterrupt):
+            fit(files, part, *words, "train.checkpoint_every_seconds=0.0")
+    fit(files, part, *words, "resume=true")
+    first, second = (load_run(folder)[2].params for folder in (whole, part))
+    assert all(torch.equal(first[k], second[k]) for k in first)
+
+
+@pytest.mark.parametrize("time", ["phase", "offset", "window+phase", "none"])
+def test_every_variant_runs(files: Path, tmp_path: Path, time: str) -> None:
+    folder = fit(
+        files, tmp_path / "run", "train.iterations=5", f"model.density.time={time}", "model.colour.powers=4", "model.colour.waves=4"
+    )
+    assert load_run(folder)[2].density.settings() == {"neurons": 2, "time": time if time != "window+phase" else "phase+window"}
+
+
+def test_the_papers_preset_runs(files: Path, tmp_path: Path) -> None:
+    words = ["preset=paper", "train.iterations=20", "train.population.every=5", "model.neurons=8"]
+    model = load_run(fit(files, tmp_path / "run", *words))[2]
+    assert model.parameters_per_primitive == 143
+
+
+def test_a_simulated_scene_says_so(tmp_path: Path) -> None:
+    words = ["task=dynamic", "scene=smoke_fire", "scene.resolution=16", "scene.timesteps=4", *SMALL, "train.iterations=5"]
+    folder = run(compose([*words, f"output_dir='{tmp_path / 'run'}'"]), Console(quiet=True))
+    m = metrics(folder)
+    assert m["data_source"] == "simulated" and "simulated" in m["dataset"]
+    assert "simulated data" in (folder / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("model.density.time=windows", r"model\.density\.time: 'windows': expected none or some of phase, offset, window, motion"),
+        ("model.density.tme=phase", r"model\.density\.tme: no such setting; did you mean 'time'"),
+        ("model.colour.frequencies=odd", r"model\.colour\.frequencies='odd': expected turns or printed"),
+        ("model.colour.waves=99", r"model\.colour: .*expected 0\.\.16"),
+    ],
+)
+def test_wrong_choices_are_found_before_anything_is_simulated(word: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        compose(["task=dynamic", word])
+
+
+def test_a_missing_folder(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such folder"):
+        fit(tmp_path / "nothing", tmp_path / "run")

@@ -5,7 +5,7 @@
 DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free fire animation, frames 1 to 40). Parts:
 
     main       preset quick, 5,000 primitives, 300 s
-    variants   every model.density.time, 2,000 primitives, the same iterations; a table of parameters and quality
+    variants   ways of varying in time, 2,000 primitives, the same iterations; a table of parameters and quality
     control    times shuffled among the training images: a model of time must lose by it
     between    every second frame is learned; the others are compared with the real ones, and steps between frames are measured
 
@@ -38,7 +38,12 @@ from neuprim.plugins.registry import load_task
 from neuprim.run import make_trainer, warm_up
 
 RESULTS = Path(__file__).parent / "results" / "dynamic_quality.json"
-VARIANTS = ("phase", "offset", "phase+offset", "window", "phase+motion", "window+motion")
+COLOUR = ("model.colour.powers=4", "model.colour.waves=4")
+VARIANTS = {
+    **{time: (f"model.density.time={time}",) for time in ("phase", "offset", "window", "phase+offset", "phase+motion", "window+motion")},
+    "phase, colour in time": ("model.density.time=phase", *COLOUR),
+    "window+motion, colour in time": ("model.density.time=window+motion", *COLOUR),
+}
 KEYS = (
     "psnr", "psnr_mask", "psnr_pooled_mask", "psnr_black_image", "psnr_black_image_mask", "psnr_srgb", "ssim", "ssim_srgb",
     "sigma_correlation_early", "sigma_correlation_middle", "sigma_correlation_late",
@@ -145,7 +150,7 @@ def main() -> None:
                 keep("main", {k: m[k] for k in KEYS} | {"per_frame": [round(f["psnr_mask"], 3) for f in m["per_frame"]]})
             if "variants" in args.parts:
                 for time in args.variants:
-                    _, m = fit([*own, *short, f"model.density.time={time}"])
+                    _, m = fit([*own, *short, *VARIANTS[time]])
                     keep("variants", {"time": time, **{k: m[k] for k in KEYS}})
             if "control" in args.parts:
                 for name, change in (("true times", lambda trainer: None), ("shuffled times", shuffled_times)):

@@ -1,0 +1,1 @@
+"""Dynamic volumes: smoke and fire over time."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import NamedTuple
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -11,8 +14,13 @@ from torch.nn.functional import embedding_bag
 
 __all__ = ["Stencil", "advect", "stencil"]
 
-SLAB = 1 << 16
+Job = TypeVar("Job")
+
+SLAB = 1 << 15
 """Cells worked on at once: their stencils stay in a processor's cache, which is worth a factor of two."""
+
+NOTHING = 1e-4
+"""Values that nobody sees; most of a box holds no more, and need not be corrected."""
 
 
 class Stencil(NamedTuple):
@@ -45,17 +53,16 @@ def stencil(points: list[Tensor], shape: tuple[int, int, int]) -> Stencil:
     _, y_count, z_count = shape
     # Floats hold these integers exactly below 2^24 cells, and are faster.
     base = lower[0].mul_(y_count).add_(lower[1]).mul_(z_count).add_(lower[2]).int()
-    corners = [(a * y_count + b) * z_count + c for a in (0, 1) for b in (0, 1) for c in (0, 1)]
     x, y, z = parts
     weights = torch.empty(len(x), 8)
     both = x * y
     for pair, edge in enumerate((1 - x - y + both, y - both, x - both, both)):  # (0, 0), (0, 1), (1, 0), (1, 1) along x and y
         upper = torch.mul(edge, z, out=weights[:, 2 * pair + 1])
         torch.sub(edge, upper, out=weights[:, 2 * pair])
-    return Stencil(base[:, None] + torch.tensor(corners, dtype=torch.int32), weights)
+    return Stencil(base[:, None] + torch.tensor(_corners(shape), dtype=torch.int32), weights)
 
 
-def advect(fields: Tensor, velocity: Tensor, time: float, cell: float) -> Tensor:
+def advect(fields: Tensor, velocity: Tensor, time: float, cell: float, blurred: int = 0) -> Tensor:
     """(C, X, Y, Z) fields, carried for ``time`` seconds by a velocity (3, X, Y, Z) in world units per second at the centres.
 
     Traces back with the midpoint rule, then corrects the interpolation's blur (MacCormack; Selle, Fedkiw, Kim, Liu and Rossignac
@@ -64,54 +71,70 @@ def advect(fields: Tensor, velocity: Tensor, time: float, cell: float) -> Tensor
         q1 = A(q),   q2 = A^-1(q1),   q' = q1 + (q - q2) / 2,
 
     limited to the values of the eight cells that ``q1`` is made of, so that no new extremum can appear.
+
+    Args:
+        blurred: the first so many fields are left uncorrected, as are cells with next to nothing in the others.
     """
-    sizes = fields.shape[1:]
-    shape = (sizes[0], sizes[1], sizes[2])
-    table = _table(fields)
-    winds = _table(velocity)
-    scale = time / cell
+    shape = (fields.shape[1], fields.shape[2], fields.shape[3])
+    table, winds = _table(fields), _table(velocity)
+    sharp = table[:, blurred:].contiguous()
+    scale, cells = time / cell, _indices(shape)
     carried, behind, place = torch.empty_like(table), torch.empty_like(winds), torch.empty(len(table), dtype=torch.int32)
-    for rows, here in _slabs(shape):
+
+    def carry(rows: slice) -> None:
+        here = [axis[rows] for axis in cells]
         wind = winds[rows]
-        halfway = stencil([p - (0.5 * scale) * wind[:, k] for k, p in enumerate(here)], shape)
-        behind[rows] = halfway.read(winds)
+        behind[rows] = stencil([p - (0.5 * scale) * wind[:, k] for k, p in enumerate(here)], shape).read(winds)
         back = stencil([p - scale * behind[rows, k] for k, p in enumerate(here)], shape)
         carried[rows] = back.read(table)
         place[rows] = back.rows[:, 0]
-    lowest, highest = _corner_range(table, shape)
-    result = torch.empty_like(table)
-    for rows, here in _slabs(shape):
+
+    _on_all_cores(carry, [slice(first, min(first + SLAB, len(table))) for first in range(0, len(table), SLAB)])
+    blurry = carried[:, blurred:].contiguous()
+
+    def correct(at: Tensor) -> None:
         # The wind half a step ahead is not sampled but extrapolated: as much more than here as the one behind is less.
-        ahead = [p + scale * (2 * winds[rows, k] - behind[rows, k]) for k, p in enumerate(here)]
-        better = carried[rows] + 0.5 * (table[rows] - stencil(ahead, shape).read(carried))
-        at = place[rows]
-        torch.minimum(torch.maximum(better, lowest.index_select(0, at)), highest.index_select(0, at), out=result[rows])
-    return result.T.reshape(fields.shape)
+        step = scale * (2 * winds.index_select(0, at) - behind.index_select(0, at))
+        ahead = [axis.index_select(0, at) + step[:, k] for k, axis in enumerate(cells)]
+        gone = sharp.index_select(0, at) - stencil(ahead, shape).read(blurry)
+        lowest, highest = _corner_range(sharp, place.index_select(0, at), shape)
+        better = blurry.index_select(0, at) + 0.5 * gone
+        carried[at, blurred:] = torch.minimum(torch.maximum(better, lowest), highest)
+
+    _on_all_cores(correct, (blurry.abs() > NOTHING).any(1).nonzero().squeeze(1).split(SLAB))
+    return carried.T.reshape(fields.shape)
 
 
 def _table(fields: Tensor) -> Tensor:
     return fields.reshape(len(fields), -1).T.contiguous()
 
 
-def _slabs(shape: tuple[int, int, int]) -> Iterator[tuple[slice, list[Tensor]]]:
-    """Rows of a table, and the indices of their cells along each axis, float32."""
-    thick = max(1, SLAB // (shape[1] * shape[2]))
-    ahead = [torch.arange(n, dtype=torch.float32) for n in shape]
-    for first in range(0, shape[0], thick):
-        here = torch.meshgrid(ahead[0][first : first + thick], ahead[1], ahead[2], indexing="ij")
-        start = first * shape[1] * shape[2]
-        yield slice(start, start + here[0].numel()), [p.reshape(-1) for p in here]
+def _on_all_cores(work: Callable[[Job], None], jobs: Iterable[Job]) -> None:
+    """Calls that write to different places, in threads of our own.
+
+    torch's threads wait for each other in a busy loop after every operation, which on a machine with other things to do takes many
+    times longer than the work; these meet once. The jobs are the same for any number of threads, and so is the result.
+    """
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        list(pool.map(work, jobs))
 
 
-def _corner_range(table: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
-    """Least and greatest of the cells that a stencil reads, tables (X * Y * Z, C) for every lowest corner but the last ones' (any value)."""
-    grid = table.reshape(*shape, -1)
-    lowest, highest = torch.empty_like(grid), torch.empty_like(grid)
-    thick = max(1, SLAB // (shape[1] * shape[2]))
-    for first in range(0, shape[0] - 1, thick):
-        part = grid[first : first + thick + 1]
-        for choose, target in ((torch.minimum, lowest), (torch.maximum, highest)):
-            x = choose(part[:-1], part[1:])
-            y = choose(x[:, :-1], x[:, 1:])
-            choose(y[:, :, :-1], y[:, :, 1:], out=target[first : first + len(x), :-1, :-1])
-    return lowest.reshape(table.shape), highest.reshape(table.shape)
+@lru_cache(maxsize=2)
+def _indices(shape: tuple[int, int, int]) -> tuple[Tensor, ...]:
+    """Indices along each axis of the cells in a table's rows, three of (X * Y * Z,) float32."""
+    axes = torch.meshgrid(*(torch.arange(n, dtype=torch.float32) for n in shape), indexing="ij")
+    return tuple(axis.reshape(-1) for axis in axes)
+
+
+def _corner_range(table: Tensor, lowest_corner: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
+    """(N, C) least and greatest values of the eight cells that a stencil reads."""
+    low = high = table.index_select(0, lowest_corner)
+    for offset in _corners(shape)[1:]:
+        values = table.index_select(0, lowest_corner + offset)
+        low, high = torch.minimum(low, values), torch.maximum(high, values)
+    return low, high
+
+
+def _corners(shape: tuple[int, int, int]) -> list[int]:
+    """How many rows of a table the eight cells of a stencil lie after the first."""
+    return [(a * shape[1] + b) * shape[2] + c for a in (0, 1) for b in (0, 1) for c in (0, 1)]

@@ -16,8 +16,9 @@ import hashlib
 import json
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -98,7 +99,6 @@ def cache_key(scene: Scene, frames: int, resolution: int, seed: int) -> str:
         "scene": scene.name,
         "frame_time": scene.frame_time,
         "grids": scene.grids,
-        "scales": dict(scene.scales),
         "solver": asdict(scene.solver),
         "threshold": THRESHOLD,
         "frames": frames,
@@ -124,7 +124,7 @@ def grids_of(state: State, scene: Scene, box: Box) -> list[Grid]:
         if name == "color":
             values = _albedo(state)
         else:
-            values = fields[name].numpy() * np.float32(scene.scales.get(name, 1.0))
+            values = fields[name].numpy()
             values = np.where(values < THRESHOLD, np.float32(0), values)
         grids.append(Grid.from_dense(name, values, transform=transform, half=True))
     return grids
@@ -148,7 +148,7 @@ def _write(scene: Scene, count: int, resolution: int, seed: int, folder: Path, p
     pool, writing = ThreadPoolExecutor(1), None
     try:
         for frame in range(count):
-            with torch.no_grad():
+            with _one_torch_thread():
                 state = advance(state, scene.solver, box, scene.forcing(stage, state.time), scene.frame_time)
             _finish(writing)
             path = folder / f"{scene.name}_{frame}.vdb"
@@ -157,6 +157,17 @@ def _write(scene: Scene, count: int, resolution: int, seed: int, folder: Path, p
         _finish(writing)
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """The solver divides its work itself; matrix products might round differently when torch divides them too."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _finish(writing: Future[None] | None) -> None:

@@ -51,9 +51,9 @@ class SolverSettings:
     heat: float = 0.0
     soot: float = 0.0
     expansion: float = 0.0
-    smoothing: float = 0.05
-    cfl: float = 2.0
-    most_steps: int = 3
+    smoothing: float = 0.1
+    cfl: float = 3.0
+    most_steps: int = 2
 
 
 @dataclass(frozen=True)
@@ -108,13 +108,13 @@ class Forcing:
 
     Attributes:
         sources: applied in order.
-        acceleration: (3, X, Y, Z) or None.
+        gusts: (3, X, Y, Z) acceleration of what is not clear air, or None; full where density, temperature and fuel add up to 1/2.
         expansion: (X, Y, Z) volume made per volume and second, or None.
-        fade: (X, Y, Z) per second: how fast smoke, heat, fuel and motion vanish; above 0 near open ends only. None is nowhere.
+        fade: (X, Y, Z) per second: how fast smoke, heat and fuel vanish; above 0 near open ends only. None is nowhere.
     """
 
     sources: Sequence[Source] = ()
-    acceleration: Tensor | None = None
+    gusts: Tensor | None = None
     expansion: Tensor | None = None
     fade: Tensor | None = None
 
@@ -137,7 +137,8 @@ def step(state: State, settings: SolverSettings, box: Box, forcing: Forcing, tim
         wind = before + to_centres(expansion_flow(making, box))
     scalars = torch.stack([state.density, state.temperature, state.fuel])
     fields = [before, scalars] if state.colour is None else [before, scalars, state.colour]
-    moved = advect(torch.cat(fields), wind, time, box.cell)
+    # The velocity stays blurred: sharp, it gathers motion of the finest scale, which shows as streaks along the axes.
+    moved = advect(torch.cat(fields), wind, time, box.cell, blurred=3)
     after, (density, temperature, fuel) = moved[:3], moved[3:6]
     colour = None if state.colour is None else moved[6:9]
 
@@ -147,8 +148,8 @@ def step(state: State, settings: SolverSettings, box: Box, forcing: Forcing, tim
     colour = None if colour is None else colour * faded
 
     after = after + time * _forces(after, density, temperature, settings, box)
-    if forcing.acceleration is not None:
-        after = after + time * forcing.acceleration
+    if forcing.gusts is not None:
+        after = after + (2 * time * (density + temperature + fuel)).clamp_max(time) * forcing.gusts
     after = after * math.exp(-settings.drag * time)
     state = State(state.velocity, density, temperature, fuel, colour, state.time + time)
     for source in forcing.sources:
@@ -157,7 +158,6 @@ def step(state: State, settings: SolverSettings, box: Box, forcing: Forcing, tim
         keep = torch.exp(-time * forcing.fade)
         colour = None if state.colour is None else state.colour * keep
         state = replace(state, density=state.density * keep, temperature=state.temperature * keep, fuel=state.fuel * keep, colour=colour)
-        after = after * keep
     return replace(state, velocity=project(_changed(state.velocity, before, after, settings.smoothing), box))
 
 

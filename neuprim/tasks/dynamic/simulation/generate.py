@@ -1,0 +1,202 @@
+"""A simulated scene as a sequence of OpenVDB files.
+
+    NAME_0.vdb ... NAME_{T-1}.vdb     fog volumes of half floats, Blosc, numbers not padded, as EmberGen writes them
+
+    density        amount of smoke
+    temperature    0 is the air's
+    flames         fuel that is burning (scenes with fire)
+    color          albedo of the smoke, vec3s, not multiplied by density (scenes with colours)
+
+Values are about 0 to 1. Voxels are cubes; the box is one world unit wide and deep, centred at x = y = 0, its ground at z = 0, z up.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from neuprim.core.errors import ConfigError, DataError, nearest
+from neuprim.core.vdb import Grid, scale_transform, write_vdb
+from neuprim.tasks.dynamic.simulation.projection import Box
+from neuprim.tasks.dynamic.simulation.scenes import SCENES, Scene, Stage
+from neuprim.tasks.dynamic.simulation.solver import State, advance
+
+__all__ = ["RESOLUTIONS", "SOLVER_VERSION", "THRESHOLD", "TIMESTEPS", "box_of", "cache_key", "grids_of", "simulate"]
+
+SOLVER_VERSION = 1
+"""Part of the cache's key: to be raised with every change to the solver, the scenes' sources or the files' layout."""
+
+THRESHOLD = 2e-3
+"""Values below are background: nobody sees them, and files stay small."""
+
+RESOLUTIONS = (16, 192)
+"""Least and most cells across the box; advection counts cells in float32, which is exact up to 2^24."""
+
+TIMESTEPS = (1, 1000)
+
+Progress = Callable[[str, float], None]
+
+
+def simulate(
+    name: str,
+    frames: int | None,
+    resolution: int,
+    seed: int,
+    cache_dir: Path,
+    progress: Progress = lambda text, fraction: None,
+) -> Path:
+    """Run a scene unless a complete sequence is there; returns its folder ``cache_dir/sim-NAME-KEY``.
+
+    Equal arguments give equal grids on one machine, whatever the number of threads. The folder appears under its name only when
+    complete, so an interrupted run leaves nothing that could be taken for a sequence.
+
+    Args:
+        name: one of :data:`~neuprim.tasks.dynamic.simulation.scenes.SCENES`.
+        frames: how many frames from the start; None is the scene's own number.
+        resolution: cells across the box, which is half as high again as it is wide.
+        seed: of the turbulence; not negative.
+        progress: is told (text, fraction done).
+
+    Raises:
+        ConfigError: unknown scene or impossible value.
+        DataError: the cache directory cannot be written.
+    """
+    scene = _scene(name)
+    count = _whole("scene.timesteps", scene.timesteps if frames is None else frames, *TIMESTEPS)
+    _whole("scene.resolution", resolution, *RESOLUTIONS)
+    _whole("seed", seed, 0, 2**63 - 1)
+    final = Path(cache_dir) / f"sim-{name}-{cache_key(scene, count, resolution, seed)}"
+    if _complete(final, name, count):
+        return final
+    try:
+        final.parent.mkdir(parents=True, exist_ok=True)
+        draft = Path(tempfile.mkdtemp(prefix=f".{final.name}-", dir=final.parent))
+        try:
+            draft.chmod(0o755)  # mkdtemp's 0700 would hide a shared cache from its other users
+            _write(scene, count, resolution, seed, draft, progress)
+            _publish(draft, final, name, count)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+    except OSError as error:
+        raise DataError(f"scene {name}: cannot write the simulated frames to {final}: {error}") from error
+    return final
+
+
+def cache_key(scene: Scene, frames: int, resolution: int, seed: int) -> str:
+    """A short hash of everything that the files depend on."""
+    settings = {
+        "version": SOLVER_VERSION,
+        "scene": scene.name,
+        "frame_time": scene.frame_time,
+        "grids": scene.grids,
+        "solver": asdict(scene.solver),
+        "threshold": THRESHOLD,
+        "frames": frames,
+        "resolution": resolution,
+        "seed": seed,
+    }
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def box_of(resolution: int) -> Box:
+    """One world unit wide and deep, 1.5 high, rounded up to whole blocks of 8 voxels."""
+    return Box((resolution, resolution, -(-3 * resolution // 16) * 8), 1.0 / resolution)
+
+
+def grids_of(state: State, scene: Scene, box: Box) -> list[Grid]:
+    """What is written of a state: the scene's grids, in half floats, without the faint."""
+    half = (box.cell * 0.5, box.cell * 0.5)
+    corner = (half[0] - box.shape[0] * half[0], half[1] - box.shape[1] * half[1], half[0])  # the centre of voxel 0
+    transform = scale_transform(box.cell, corner)
+    fields = {"density": state.density, "temperature": state.temperature, "flames": state.fuel}
+    grids = []
+    for name in scene.grids:
+        if name == "color":
+            values = _albedo(state)
+        else:
+            values = fields[name].numpy()
+            values = np.where(values < THRESHOLD, np.float32(0), values)
+        grids.append(Grid.from_dense(name, values, transform=transform, half=True))
+    return grids
+
+
+def _albedo(state: State) -> np.ndarray:
+    """(X, Y, Z, 3) in 0..1, where there is smoke."""
+    assert state.colour is not None
+    density = state.density
+    straight = (state.colour / density.clamp_min(THRESHOLD)).clamp(0, 1)
+    straight = torch.where(density < THRESHOLD, 0.0, straight)
+    return np.ascontiguousarray(straight.permute(1, 2, 3, 0).numpy())
+
+
+def _write(scene: Scene, count: int, resolution: int, seed: int, folder: Path, progress: Progress) -> None:
+    text = f"{scene.name}: simulating {count} frames"
+    progress(text, 0.0)
+    box = box_of(resolution)
+    stage, state = Stage(box, seed), State.empty(box, scene.coloured)
+    metadata = {"creator": "neuprim simulation", "comment": f"simulated by neuprim: {scene.name}, seed {seed}"}
+    pool, writing = ThreadPoolExecutor(1), None
+    try:
+        for frame in range(count):
+            with _one_torch_thread():
+                state = advance(state, scene.solver, box, scene.forcing(stage, state.time), scene.frame_time)
+            _finish(writing)
+            path = folder / f"{scene.name}_{frame}.vdb"
+            writing = pool.submit(write_vdb, path, grids_of(state, scene, box), metadata=metadata)
+            progress(text, (frame + 1) / count)
+        _finish(writing)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """The solver divides its work itself; matrix products might round differently when torch divides them too."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _finish(writing: Future[None] | None) -> None:
+    if writing is not None:
+        writing.result()  # raises what the writer raised
+
+
+def _complete(folder: Path, name: str, count: int) -> bool:
+    return all((folder / f"{name}_{i}.vdb").is_file() for i in range(count))
+
+
+def _publish(draft: Path, final: Path, name: str, count: int) -> None:
+    """Give the draft its name. Another process may have been faster: its files are the same ones."""
+    if final.exists() and not _complete(final, name, count):
+        shutil.rmtree(final)  # somebody deleted part of it
+    try:
+        draft.rename(final)
+    except OSError:
+        if not _complete(final, name, count):
+            raise
+
+
+def _scene(name: str) -> Scene:
+    if name not in SCENES:
+        raise ConfigError(f"scene {name!r} is not simulated{nearest(str(name), SCENES)}")
+    return SCENES[name]
+
+
+def _whole(key: str, value: int, lowest: int, highest: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
+        raise ConfigError(f"{key} is {value!r}; expected a whole number from {lowest} to {highest}")
+    return value

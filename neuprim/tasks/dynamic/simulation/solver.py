@@ -1,0 +1,244 @@
+"""A smoke-and-fire solver: incompressible air on a staggered grid that carries smoke, heat, fuel and colour.
+
+One step is advection, reaction, forces, projection (Stam 1999, "Stable fluids"; Fedkiw, Stam and Jensen 2001, "Visual simulation of
+smoke"). Lengths are world units, times seconds; density, temperature and fuel have no unit and are about 0 to 1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from neuprim.tasks.dynamic.simulation.advection import advect
+from neuprim.tasks.dynamic.simulation.projection import Box, Faces, expansion_flow, project, to_centres, to_faces
+
+__all__ = ["Forcing", "SolverSettings", "Source", "State", "advance", "step"]
+
+
+@dataclass(frozen=True)
+class SolverSettings:
+    """What the gas is like.
+
+    Attributes:
+        buoyancy: upward acceleration at temperature 1.
+        weight: downward acceleration at density 1.
+        confinement: strength of vorticity confinement; 0 is none, above 1 is noise.
+        cooling: share of the temperature lost per second.
+        radiation: further loss of temperature per second, at temperature 1; it goes with the fourth power.
+        dissipation: share of the density lost per second.
+        drag: share of the velocity lost per second.
+        burn: fuel that burns per second, whatever its concentration; 1 / burn is the life of a flame.
+        heat: temperature released per fuel burnt.
+        soot: density released per fuel burnt, most of it at the flame's end.
+        expansion: volume made per fuel burnt.
+        smoothing: share of the face velocities, per step, that is replaced by the means of those at the centres.
+        cfl: cells that gas may cross in one step; faster gas makes more steps per frame.
+        most_steps: steps per frame at most.
+    """
+
+    buoyancy: float = 2.0
+    weight: float = 0.1
+    confinement: float = 0.3
+    cooling: float = 0.3
+    radiation: float = 0.0
+    dissipation: float = 0.1
+    drag: float = 0.0
+    burn: float = 2.0
+    heat: float = 0.0
+    soot: float = 0.0
+    expansion: float = 0.0
+    smoothing: float = 0.1
+    cfl: float = 3.0
+    most_steps: int = 2
+
+
+@dataclass(frozen=True)
+class State:
+    """The gas at one time.
+
+    Attributes:
+        velocity: at the faces, free of divergence.
+        density, temperature, fuel: (X, Y, Z) float32. Fuel is the reaction coordinate: 1 as it leaves the source, 0 when burnt.
+        colour: (3, X, Y, Z) albedo times density, so that where two smokes mix, each counts by its amount; None without colours.
+        time: seconds since the start.
+    """
+
+    velocity: Faces
+    density: Tensor
+    temperature: Tensor
+    fuel: Tensor
+    colour: Tensor | None = None
+    time: float = 0.0
+
+    @staticmethod
+    def empty(box: Box, coloured: bool = False) -> State:
+        """Clear, cold air at rest."""
+        nothing = torch.zeros(box.shape)
+        return State(box.still(), nothing, nothing, nothing, torch.zeros(3, *box.shape) if coloured else None)
+
+
+@dataclass(frozen=True)
+class Source:
+    """A place where gas takes given values, as fast as ``rate`` says. What is None is left alone.
+
+    Attributes:
+        where: slices of the cells that ``rate`` covers.
+        rate: (x, y, z) per second; after a time t the gas has gone 1 - exp(-rate * t) of the way.
+        density, temperature, fuel: the values it takes, numbers or fields over ``where``.
+        colour: albedo of the smoke, three numbers.
+        velocity: three numbers or (3, x, y, z), world units per second.
+    """
+
+    where: tuple[slice, slice, slice]
+    rate: Tensor
+    density: Tensor | float | None = None
+    temperature: Tensor | float | None = None
+    fuel: Tensor | float | None = None
+    colour: tuple[float, float, float] | None = None
+    velocity: Tensor | tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Forcing:
+    """What a scene does to the gas at one time.
+
+    Attributes:
+        sources: applied in order.
+        gusts: (3, X, Y, Z) acceleration of what is not clear air, or None; full where density, temperature and fuel add up to 1/2.
+        expansion: (X, Y, Z) volume made per volume and second, or None.
+        fade: (X, Y, Z) per second: how fast smoke, heat and fuel vanish; above 0 near open ends only. None is nowhere.
+    """
+
+    sources: Sequence[Source] = ()
+    gusts: Tensor | None = None
+    expansion: Tensor | None = None
+    fade: Tensor | None = None
+
+
+def advance(state: State, settings: SolverSettings, box: Box, forcing: Forcing, time: float) -> State:
+    """As many equal steps over ``time`` seconds as the fastest gas needs."""
+    fastest = max(float(component.abs().max()) for component in state.velocity)
+    count = min(max(math.ceil(fastest * time / box.cell / settings.cfl), 1), settings.most_steps)
+    for _ in range(count):
+        state = step(state, settings, box, forcing, time / count)
+    return state
+
+
+def step(state: State, settings: SolverSettings, box: Box, forcing: Forcing, time: float) -> State:
+    """The gas ``time`` seconds later; its velocity is free of divergence, to rounding, under :func:`projection.divergence`."""
+    before = to_centres(state.velocity)
+    wind = before
+    making = _expansion(state, settings, forcing, time)
+    if making is not None:
+        wind = before + to_centres(expansion_flow(making, box))
+    scalars = torch.stack([state.density, state.temperature, state.fuel])
+    fields = [before, scalars] if state.colour is None else [before, scalars, state.colour]
+    # The velocity stays blurred: sharp, it gathers motion of the finest scale, which shows as streaks along the axes.
+    moved = advect(torch.cat(fields), wind, time, box.cell, blurred=3)
+    after, (density, temperature, fuel) = moved[:3], moved[3:6]
+    colour = None if state.colour is None else moved[6:9]
+
+    density, temperature, fuel = _react(density, temperature, fuel, settings, time)
+    faded = math.exp(-settings.dissipation * time)
+    density = density * faded
+    colour = None if colour is None else colour * faded
+
+    after = after + time * _forces(after, density, temperature, settings, box)
+    if forcing.gusts is not None:
+        after = after + (2 * time * (density + temperature + fuel)).clamp_max(time) * forcing.gusts
+    after = after * math.exp(-settings.drag * time)
+    state = State(state.velocity, density, temperature, fuel, colour, state.time + time)
+    for source in forcing.sources:
+        state, after = _emit(state, after, source, time)
+    if forcing.fade is not None:
+        keep = torch.exp(-time * forcing.fade)
+        colour = None if state.colour is None else state.colour * keep
+        state = replace(state, density=state.density * keep, temperature=state.temperature * keep, fuel=state.fuel * keep, colour=colour)
+    return replace(state, velocity=project(_changed(state.velocity, before, after, settings.smoothing), box))
+
+
+def _changed(velocity: Faces, before: Tensor, after: Tensor, smoothing: float) -> Faces:
+    """Face velocities from what happened at the centres: they take the *change*, since the mean of means would blur all motion at
+    every step. The little smoothing removes what the centres cannot see: motion that alternates from face to face."""
+    change, mean = to_faces(after - before), to_faces(before)
+    parts = [old + more + smoothing * (m - old) for old, more, m in zip(velocity, change, mean, strict=True)]
+    return parts[0], parts[1], parts[2]
+
+
+def _expansion(state: State, settings: SolverSettings, forcing: Forcing, time: float) -> Tensor | None:
+    if not settings.expansion:
+        return forcing.expansion
+    burnt = state.fuel.clamp_max(settings.burn * time) * (settings.expansion / time)
+    return burnt if forcing.expansion is None else burnt + forcing.expansion
+
+
+def _react(density: Tensor, temperature: Tensor, fuel: Tensor, settings: SolverSettings, time: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Fuel burns at a constant rate (Nguyen, Fedkiw and Jensen 2002), which gives flames a sharp end; then the gas cools."""
+    burnt = fuel.clamp_max(settings.burn * time)
+    density = density + (2 * settings.soot) * burnt * (1 - fuel).clamp_min(0)
+    temperature = temperature + settings.heat * burnt
+    if settings.radiation:  # dT/dt = -r T^4 in closed form
+        temperature = temperature * (1 + 3 * settings.radiation * time * temperature**3) ** (-1 / 3)
+    return density, temperature * math.exp(-settings.cooling * time), fuel - burnt
+
+
+def _forces(velocity: Tensor, density: Tensor, temperature: Tensor, settings: SolverSettings, box: Box) -> Tensor:
+    """(3, X, Y, Z) acceleration: buoyancy, weight, and vorticity confinement ``e h (N x w)`` with w = curl u and N = grad |w| / |grad |w||
+    (Fedkiw, Stam and Jensen 2001), which gives small eddies back what interpolation takes from them."""
+    if settings.confinement:
+        w = _curl(velocity, box.cell)
+        size = (w * w).sum(0).sqrt()
+        n = torch.stack([_slope(size, axis, box.cell) for axis in range(3)])
+        n = n / ((n * n).sum(0).sqrt() + 1e-3 / box.cell)  # no direction where nothing turns
+        force = torch.stack([n[1] * w[2] - n[2] * w[1], n[2] * w[0] - n[0] * w[2], n[0] * w[1] - n[1] * w[0]])
+        force *= settings.confinement * box.cell
+    else:
+        force = torch.zeros_like(velocity)
+    force[2] += settings.buoyancy * temperature - settings.weight * density
+    return force
+
+
+def _slope(field: Tensor, axis: int, cell: float) -> Tensor:
+    """Central difference along one axis, zero in the first and last cell."""
+    result = torch.zeros_like(field)
+    count = field.shape[axis] - 2
+    result.narrow(axis, 1, count).copy_((field.narrow(axis, 2, count) - field.narrow(axis, 0, count)) * (0.5 / cell))
+    return result
+
+
+def _curl(velocity: Tensor, cell: float) -> Tensor:
+    u, v, w = velocity
+    return torch.stack(
+        [
+            _slope(w, 1, cell) - _slope(v, 2, cell),
+            _slope(u, 2, cell) - _slope(w, 0, cell),
+            _slope(v, 0, cell) - _slope(u, 1, cell),
+        ]
+    )
+
+
+def _emit(state: State, velocity: Tensor, source: Source, time: float) -> tuple[State, Tensor]:
+    """State and velocity at the centres after a source has worked for ``time`` seconds."""
+    share = 1 - torch.exp(-source.rate * time)
+
+    def towards(field: Tensor, value: Tensor | float) -> Tensor:
+        field = field.clone()
+        field[source.where] += share * (value - field[source.where])
+        return field
+
+    density, temperature, fuel, colour = state.density, state.temperature, state.fuel, state.colour
+    if source.density is not None:
+        density = towards(density, source.density)
+        if colour is not None and source.colour is not None:
+            colour = torch.stack([towards(c, albedo * source.density) for c, albedo in zip(colour, source.colour, strict=True)])
+    if source.temperature is not None:
+        temperature = towards(temperature, source.temperature)
+    if source.fuel is not None:
+        fuel = towards(fuel, source.fuel)
+    if source.velocity is not None:
+        velocity = torch.stack([towards(component, value) for component, value in zip(velocity, source.velocity, strict=True)])
+    return replace(state, density=density, temperature=temperature, fuel=fuel, colour=colour), velocity

@@ -57,7 +57,7 @@ class VolumeSettings:
             if name not in known:
                 raise ConfigError(f"scene.{name} is not a setting of this scene{nearest(str(name), known)}")
         made = VolumeSettings(**{**settings, "vdb": Path(settings["vdb"]) if settings.get("vdb") else None})
-        limits = (("resolution", 8, 512), ("size", 8, 4096), ("cameras", 4, 1000), ("samples", 1, 16), ("train_every", 1, 1000))
+        limits = (("resolution", 16, 192), ("size", 8, 4096), ("cameras", 4, 1000), ("samples", 1, 16), ("train_every", 1, 1000))
         for name, lowest, highest in limits:
             value = getattr(made, name)
             if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:

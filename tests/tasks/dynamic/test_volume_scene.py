@@ -209,6 +209,17 @@ def test_a_grid_by_another_name(folder: Path, tmp_path: Path) -> None:
     assert dataset(other, tmp_path, grids={"density": "soup"}).exposure > 0
 
 
+def test_a_look_chosen_by_the_grids(folder: Path, tmp_path: Path) -> None:
+    assert dataset(folder, tmp_path, look="auto").shoot.look.extinction_grids == ("density", "temperature")
+    other = tmp_path / "hot"
+    other.mkdir()
+    for number in (1, 2):
+        write_vdb(other / f"x{number}.vdb", blob(10.0 + number, ("temperature", "flames")))
+    data = dataset(other, tmp_path, look="auto")
+    assert data.shoot.look.extinction_grids == ("temperature",)
+    assert data.shoot.look.flame_range == (0.0, pytest.approx(0.2, abs=0.01))  # the hottest flame of the files
+
+
 def test_level_sets_are_refused_by_name(tmp_path: Path) -> None:
     other = tmp_path / "sets"
     other.mkdir()

@@ -38,10 +38,11 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         DataError: files that are missing, damaged, or without a usable grid; a cache that cannot be written.
     """
     asked = VolumeSettings.parse(settings)
-    look = _look(asked)  # a typing error shows before anything is simulated
+    _look(asked, AUTO[0])  # a typing error shows before anything is simulated
     folder, name, source = _files(asked, context)
     frames = _frames(folder, asked)
     reader = find_grids(frames, asked.grids)
+    look = _look(asked, AUTO[reader.extinction == "temperature"])
     box, hottest = _survey(frames, reader, context.progress)
     if "flame_range" not in asked.optics and source == "real":
         look = dataclasses.replace(look, flame_range=(0.0, hottest)) if hottest > 0 else look
@@ -68,13 +69,17 @@ def _frames(folder: Path, asked: VolumeSettings) -> list[Frame]:
     return [f for f in found if f.number in set(chosen)]
 
 
-def _look(asked: VolumeSettings) -> Look:
+AUTO = ("smoke_fire", "embergen_fire")
+"""Looks that ``look=auto`` takes for files with a density, and for those where the hot gas itself has to absorb."""
+
+
+def _look(asked: VolumeSettings, automatic: str) -> Look:
     """The look by name with the user's changes.
 
     Raises:
         ConfigError: no such look or setting, or an impossible value.
     """
-    look = named_look(asked.look, asked.up)
+    look = named_look(automatic if asked.look == "auto" else asked.look, asked.up)
     known = {f.name: f for f in dataclasses.fields(Look)}
     changes: dict[str, Any] = {}
     for key, value in asked.optics.items():

@@ -27,7 +27,7 @@ class VolumeSettings:
         timesteps: of the simulation; None: as many as the scene has.
         frames: "all", "FIRST:LAST" or "FIRST:LAST:STEP" by number, LAST included.
         grids: meaning -> name in the files.
-        look: name of the look; optics: changes to its settings.
+        look: name of the look, or "auto"; optics: changes to its settings.
         size: width and height of the images in pixels.
         cameras: on the upper hemisphere; two are held out.
         samples: rays per pixel side.
@@ -41,7 +41,7 @@ class VolumeSettings:
     timesteps: int | None = None
     frames: str = "all"
     grids: Mapping[str, str] = field(default_factory=dict)
-    look: str = "fire"
+    look: str = "auto"
     optics: Mapping[str, Any] = field(default_factory=dict)
     size: int = 64
     cameras: int = 40

@@ -193,6 +193,12 @@ class ColourField(Field):
 
     channels: int
 
+    def derive(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions) -> Conditions:
+        """Conditions of this frame that follow from its other ones and from the primitives themselves, such as which of them a
+        light reaches; added before :meth:`lower`.
+        """
+        return conditions
+
     @abstractmethod
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> LoweredColour:
         """The frame's closed form."""

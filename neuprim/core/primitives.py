@@ -85,7 +85,9 @@ class Primitives:
         own, tint = ({s.name: params[s.name] for s in field.parameters()} for field in (self.density, self.colour))
         geometry = Geometry(params["means"], params["log_scales"], params["quats"])
         geometry = self.density.move(own, geometry, conditions)
-        return Lowered(geometry, self.density.lower(own, geometry, conditions), self.colour.lower(tint, geometry, camera, conditions), rows)
+        density = self.density.lower(own, geometry, conditions)
+        conditions = self.colour.derive(geometry, density, conditions)
+        return Lowered(geometry, density, self.colour.lower(tint, geometry, camera, conditions), rows)
 
     def rows(self, index: Tensor) -> dict[str, Tensor]:
         """Detached copies of some rows of every parameter."""

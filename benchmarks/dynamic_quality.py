@@ -1,10 +1,11 @@
 """Quality of the dynamic task on a real sequence, and which way of varying in time is worth its parameters.
 
-    python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--parts main variants control between] [--seeds 3] [--readme] [--docs]
+    python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--rows 2000x60 5000x300] [--seeds 3]
+        [--parts main variants control between] [--readme] [--docs]
 
 DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free fire animation, frames 1 to 40). Parts:
 
-    main       preset quick, 5,000 primitives, 300 s
+    main       preset quick by primitives and seconds (--rows)
     variants   ways of varying in time, 2,000 primitives, the same iterations; a table of parameters and quality
     control    times shuffled among the training images: a model of time must lose by it
     between    every second frame is learned; the others are compared with the real ones, and steps between frames are measured
@@ -118,6 +119,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--frames", default="1:40")
     parser.add_argument("--parts", nargs="*", default=["main", "variants", "control", "between"])
+    parser.add_argument("--rows", nargs="*", default=["2000x60", "5000x300"], help="PRIMITIVESxSECONDS")
     parser.add_argument("--variants", nargs="*", default=list(VARIANTS))
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--iterations", type=int, default=2500, help="of every run but those of main")
@@ -138,16 +140,20 @@ def main() -> None:
             RESULTS.write_text(json.dumps(recorded, indent=1) + "\n")  # after every run: a long benchmark may be cut short
             print(part, json.dumps({k: round(v, 4) if isinstance(v, float) else v for k, v in entry.items()}), flush=True)
 
-        for part in args.parts:
-            if part != "variants":
-                recorded[part] = []
+        for part in {"control", "between"} & set(args.parts):
+            recorded[part] = []
+        rows = [tuple(int(n) for n in row.split("x")) for row in args.rows]
+        if "main" in args.parts:
+            recorded["main"] = [e for e in recorded.get("main", []) if _row(e) not in rows]
         if "variants" in args.parts:
             recorded["variants"] = [e for e in recorded.get("variants", []) if e["time"] not in args.variants]
         for seed in range(args.seeds):
             own = [*data, f"seed={seed}"]
             if "main" in args.parts:
-                _, m = fit([*own, "model.primitives=5000", "train.max_seconds=300", "train.iterations=1000000"])
-                keep("main", {k: m[k] for k in KEYS} | {"per_frame": [round(f["psnr_mask"], 3) for f in m["per_frame"]]})
+                for primitives, seconds in rows:
+                    budget = [f"model.primitives={primitives}", f"train.max_seconds={seconds}", "train.iterations=1000000"]
+                    _, m = fit([*own, *budget])
+                    keep("main", {k: m[k] for k in KEYS} | {"per_frame": [round(f["psnr_mask"], 3) for f in m["per_frame"]]})
             if "variants" in args.parts:
                 for time in args.variants:
                     _, m = fit([*own, *short, *VARIANTS[time]])
@@ -176,28 +182,38 @@ def _spread(runs: list[dict[str, Any]], key: str, digits: int = 2) -> str:
     return spread([r[key] for r in runs], digits) if runs else "–"
 
 
+def _row(run: dict[str, Any]) -> tuple[int, int]:
+    return run["primitives"], round(run["train_seconds"])
+
+
 def main_table(recorded: dict[str, Any]) -> str:
-    """The main run, one row per number."""
+    """One column per budget, one row per number, beside what a black image scores."""
     runs = recorded.get("main", [])
     if not runs:
         return "not measured"
+    columns = [[r for r in runs if _row(r) == row] for row in sorted({_row(r) for r in runs})]
     black, inside = runs[0]["psnr_black_image"], runs[0]["psnr_black_image_mask"]
-    lines = [
-        f"| {runs[0]['primitives']:,} primitives, {runs[0]['train_seconds']:.0f} s of training, {len(runs)} seed(s) | model | black image |",
-        "| --- | --- | --- |",
-        f"| PSNR, whole image | {_spread(runs, 'psnr')} dB | {black:.1f} dB |",
-        f"| PSNR inside the union mask | {_spread(runs, 'psnr_mask')} dB | {inside:.1f} dB |",
-        f"| PSNR of the pooled error inside the mask | {_spread(runs, 'psnr_pooled_mask')} dB | |",
-        f"| PSNR after the sRGB curve | {_spread(runs, 'psnr_srgb')} dB | |",
-        f"| SSIM, linear / sRGB | {_spread(runs, 'ssim', 4)} / {_spread(runs, 'ssim_srgb', 4)} | |",
-    ]
-    for key, name in (("correlation", "correlation of σ with the files"), ("relative_l2", "relative L2 error of σ")):
-        thirds = " / ".join(_spread(runs, f"sigma_{key}_{third}", 3) for third in ("early", "middle", "late"))
-        lines.append(f"| {name}, early / middle / late frames | {thirds} | |")
-    size = f"{runs[0]['model_bytes'] / 1e6:.2f} MB ({runs[0]['vdb_bytes'] / runs[0]['model_bytes']:.1f} times less than the .vdb files)"
-    lines.append(f"| model | {size} | |")
-    lines.append(f"| primitives that never show | {100 * statistics.mean(r['dead_fraction'] for r in runs):.1f} % | |")
-    return "\n".join(lines)
+
+    def line(name: str, cell: Callable[[list[dict[str, Any]]], str], baseline: str = "") -> str:
+        return f"| {name} | " + " | ".join(cell(own) for own in columns) + f" | {baseline} |"
+
+    def thirds(key: str) -> Callable[[list[dict[str, Any]]], str]:
+        return lambda own: " / ".join(_spread(own, f"sigma_{key}_{third}", 3) for third in ("early", "middle", "late"))
+
+    return "\n".join([
+        line("", lambda own: f"{own[0]['primitives']:,} primitives, {own[0]['train_seconds']:.0f} s", "black image"),
+        "| --- |" + " --- |" * (len(columns) + 1),
+        line("PSNR, whole image", lambda own: f"{_spread(own, 'psnr')} dB", f"{black:.1f} dB"),
+        line("PSNR inside the union mask", lambda own: f"{_spread(own, 'psnr_mask')} dB", f"{inside:.1f} dB"),
+        line("PSNR of the pooled error inside the mask", lambda own: f"{_spread(own, 'psnr_pooled_mask')} dB"),
+        line("PSNR after the sRGB curve", lambda own: f"{_spread(own, 'psnr_srgb')} dB"),
+        line("SSIM, linear / sRGB", lambda own: f"{_spread(own, 'ssim', 4)} / {_spread(own, 'ssim_srgb', 4)}"),
+        line("correlation of σ with the files, early / middle / late frames", thirds("correlation")),
+        line("relative L2 error of σ, early / middle / late frames", thirds("relative_l2")),
+        line("model", lambda own: f"{own[0]['model_bytes'] / 1e6:.2f} MB, {own[0]['vdb_bytes'] / own[0]['model_bytes']:.0f} times less than the .vdb files"),
+        line("primitives that never show", lambda own: f"{100 * statistics.mean(r['dead_fraction'] for r in own):.1f} %"),
+        line("steps, seeds", lambda own: f"{round(statistics.mean(r['iterations'] for r in own)):,}, {len(own)}"),
+    ])  # fmt: skip
 
 
 def variants_table(recorded: dict[str, Any]) -> str:

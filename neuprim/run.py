@@ -22,7 +22,6 @@ from neuprim.core.data import Dataset, View
 from neuprim.core.errors import CheckpointError, DataError
 from neuprim.core.files import write_json, write_text
 from neuprim.core.primitives import Primitives
-from neuprim.core.render.cpu.compile import cache_directory
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer, initial_model
 from neuprim.evaluate import load_dataset
@@ -30,6 +29,7 @@ from neuprim.measure import display, draw, measure, summary
 from neuprim.plugins.registry import load_task
 from neuprim.progress import RunProgress
 from neuprim.report import error_map, write_report
+from neuprim.warm import compiling
 
 __all__ = ["make_trainer", "run", "warm_up"]
 
@@ -49,7 +49,10 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
     console = console or Console(stderr=True)
     task = load_task(config.task)
     directory = config.output_dir
-    with RunProgress(console, f"{config.task}/{config.scene_name}") as progress:
+    with (
+        compiling(config.renderer.backend != "reference") as kernels,
+        RunProgress(console, f"{config.task}/{config.scene_name}") as progress,
+    ):
         dataset = load_dataset(config, task, progress.preparing)
         if len(dataset.test) == 0:
             raise DataError(f"{dataset.name}: the test split is empty")
@@ -64,6 +67,9 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
             progress.note(f"resumed at step {trainer.step}")
         directory.mkdir(parents=True, exist_ok=True)
         write_text(directory / "config.yaml", config.to_yaml())
+        if kernels.running:
+            progress.preparing("compiling kernels, once per installation (about a minute)", 0.0)
+            kernels.wait()
         interrupted = _train(trainer, config, dataset, progress)
         progress.finishing("measuring held-out views")
         _finish(trainer, config, dataset, directory)
@@ -91,8 +97,6 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset) -> Trainer
 def _train(trainer: Trainer, config: RunConfig, dataset: Dataset, progress: RunProgress) -> bool:
     """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
     directory = config.output_dir
-    if not any(cache_directory().rglob("*backward_tiles*.nbc")):
-        progress.preparing("compiling kernels, once per installation (about a minute)", 0.0)
     warm_up(trainer)
     curve = _open_curve(directory / "metrics.jsonl", trainer.step)
     last_saved, next_eval = time.monotonic(), _next_evaluation(trainer)

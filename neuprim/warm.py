@@ -1,0 +1,96 @@
+"""Compile the renderer's kernels in a process of their own, while a run is still busy with its data.
+
+Compiling takes a minute of one core, once per installation, and its result is kept on disk, so that the run finds it there when it
+needs it. Nothing depends on it: a run that finds no kernels compiles them itself.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from neuprim.core.render.cpu.compile import cache_directory
+
+__all__ = ["Compiling", "compiled", "compiling", "main"]
+
+_LIMIT = 600.0  # seconds after which the run goes on alone
+
+
+def compiled() -> bool:
+    """Whether the slowest kernel to compile is already on disk."""
+    return any(cache_directory().rglob("*backward_tiles*.nbc"))
+
+
+class Compiling:
+    """A process that compiles, or none where there is nothing to do."""
+
+    def __init__(self, process: subprocess.Popen[bytes] | None) -> None:
+        self._process = process
+
+    @property
+    def running(self) -> bool:
+        return self._process is not None and self._process.poll() is None
+
+    def wait(self) -> None:
+        """Until it is done, however it ends: what it leaves out the run does itself."""
+        if self._process is not None:
+            try:
+                self._process.wait(_LIMIT)
+            except subprocess.TimeoutExpired:
+                self.stop()
+
+    def stop(self) -> None:
+        """End it now."""
+        if self.running and self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+
+@contextmanager
+def compiling(wanted: bool = True) -> Iterator[Compiling]:
+    """Start compiling unless that has been done or is not ``wanted``; the process never outlives the block."""
+    process = None
+    if wanted and not compiled() and sys.executable:
+        quiet = subprocess.DEVNULL
+        process = subprocess.Popen([sys.executable, "-m", "neuprim.warm"], stdin=quiet, stdout=quiet, stderr=quiet)
+    started = Compiling(process)
+    try:
+        yield started
+    finally:
+        started.stop()
+
+
+def main() -> None:
+    """A training step on a model of a few primitives: forward, backward, colours, loss, optimiser."""
+    from neuprim.core.cameras import Camera, look_at
+    from neuprim.core.cosine import CosineDensity
+    from neuprim.core.primitives import Primitives
+    from neuprim.core.render import RenderSettings, render
+    from neuprim.core.schema import InitContext
+    from neuprim.core.train.losses import photometric
+    from neuprim.core.train.optimizer import RowAdam
+    from neuprim.tasks.static.fields import SphericalHarmonics
+
+    torch.set_num_threads(1)
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand((8, 3), generator=generator) - 0.5
+    context = InitContext(means, torch.full((8,), 0.3), torch.full((8, 3), 0.5), generator)
+    eye = torch.tensor([0.0, -3.0, 0.5], dtype=torch.float64)
+    camera = Camera(look_at(eye, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0])), 30.0, 30.0, 16.0, 16.0, 32, 32)
+    model = Primitives.initialise(CosineDensity(), SphericalHarmonics(3), context)
+    for value in model.params.values():
+        value.requires_grad_()
+    output = render(model, camera, {}, RenderSettings(backend="cpu"), torch.ones(3))
+    output.stats.pixel_error = torch.ones(output.rgb.shape[:2])
+    loss, _ = photometric({"ssim_weight": 0.2})(output.rgb, torch.zeros_like(output.rgb))
+    loss.backward()
+    optimizer = RowAdam(model.specs, {k: v.detach() for k, v in model.params.items()})
+    optimizer.step(model.params, {spec.name: 1e-3 for spec in model.specs})
+
+
+if __name__ == "__main__":
+    main()

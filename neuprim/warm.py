@@ -65,31 +65,35 @@ def compiling(wanted: bool = True) -> Iterator[Compiling]:
 
 
 def main() -> None:
-    """A training step on a model of a few primitives: forward, backward, colours, loss, optimiser."""
+    """A training step on a few primitives: forward, backward, colours, loss, optimiser."""
     from neuprim.core.cameras import Camera, look_at
     from neuprim.core.cosine import CosineDensity
-    from neuprim.core.primitives import Primitives
-    from neuprim.core.render import RenderSettings, render
-    from neuprim.core.schema import InitContext
+    from neuprim.core.fields import Constant
+    from neuprim.core.geometry import GEOMETRY_SPECS, Geometry
+    from neuprim.core.primitives import Lowered
+    from neuprim.core.render import RenderSettings, render_lowered
+    from neuprim.core.schema import InitContext, ParameterSpec
+    from neuprim.core.sh_cpu import fused_colors
     from neuprim.core.train.losses import photometric
     from neuprim.core.train.optimizer import RowAdam
-    from neuprim.tasks.static.fields import SphericalHarmonics
 
     torch.set_num_threads(1)
     generator = torch.Generator().manual_seed(0)
     means = torch.rand((8, 3), generator=generator) - 0.5
     context = InitContext(means, torch.full((8,), 0.3), torch.full((8, 3), 0.5), generator)
+    density = CosineDensity()
+    dc = ParameterSpec("dc", (3,), 1e-3, lambda c: torch.zeros(c.count, 3))
+    specs = [*GEOMETRY_SPECS, *density.parameters(), dc, ParameterSpec("rest", (15, 3), 1e-3, lambda c: torch.zeros(c.count, 15, 3))]
+    params = {spec.name: spec.init(context).float().contiguous().requires_grad_() for spec in specs}
     eye = torch.tensor([0.0, -3.0, 0.5], dtype=torch.float64)
     camera = Camera(look_at(eye, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0])), 30.0, 30.0, 16.0, 16.0, 32, 32)
-    model = Primitives.initialise(CosineDensity(), SphericalHarmonics(3), context)
-    for value in model.params.values():
-        value.requires_grad_()
-    output = render(model, camera, {}, RenderSettings(backend="cpu"), torch.ones(3))
+    geometry = Geometry(params["means"], params["log_scales"], params["quats"])
+    colour = Constant(fused_colors(params["means"], params["dc"], params["rest"], camera.position, 3) + 0.5)
+    output = render_lowered(Lowered(geometry, density.lower(params, geometry, {}), colour), camera, RenderSettings(backend="cpu"))
     output.stats.pixel_error = torch.ones(output.rgb.shape[:2])
     loss, _ = photometric({"ssim_weight": 0.2})(output.rgb, torch.zeros_like(output.rgb))
     loss.backward()
-    optimizer = RowAdam(model.specs, {k: v.detach() for k, v in model.params.items()})
-    optimizer.step(model.params, {spec.name: 1e-3 for spec in model.specs})
+    RowAdam(specs, params).step(params, {spec.name: 1e-3 for spec in specs})
 
 
 if __name__ == "__main__":

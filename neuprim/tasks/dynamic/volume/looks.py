@@ -23,11 +23,11 @@ scores: ``benchmarks/dynamic_quality.py`` prints it beside every number.
 
 SMOKE_FIRE = Look(
     extinction=14.0,
-    albedo=(0.30, 0.29, 0.29),
+    albedo=(0.42, 0.41, 0.41),
     ambient=(0.10, 0.11, 0.13),
-    light=Light((-0.6, -0.35, 0.7), (3.2, 3.2, 3.4)),
+    light=Light((-0.6, -0.35, 0.7), (5.0, 5.0, 5.2)),
     kelvin=(1100.0, 2400.0),
-    emission=2.0,
+    emission=1.5,
     flame_extinction=14.0,
 )
 """Dark smoke under a soft light, and flames that outshine it."""

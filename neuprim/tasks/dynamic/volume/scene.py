@@ -47,7 +47,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     if "flame_range" not in asked.optics and source == "real":
         look = dataclasses.replace(look, flame_range=(0.0, hottest)) if hottest > 0 else look
     normalisation = Normalisation.from_bounds(box)
-    train, test = rig(asked.size, asked.cameras, up=asked.up)
+    train, test = rig(asked.size, asked.cameras, up=asked.up, field_of_view=asked.field_of_view)
     shoot = Shoot(frames, reader, look, [*train, *test], asked.samples, normalisation, normalisation.to_scene(box))
     rendered = shoot.take(context.cache_dir, context.progress)
     held_out = range(len(train), len(train) + len(test))

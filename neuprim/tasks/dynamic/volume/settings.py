@@ -30,6 +30,7 @@ class VolumeSettings:
         look: name of the look, or "auto"; optics: changes to its settings.
         size: width and height of the images in pixels.
         cameras: on the upper hemisphere; two are held out.
+        field_of_view: of the cameras, degrees.
         samples: rays per pixel side.
         train_every: learn from every n-th frame only; the test views keep all.
         up: "y" or "z", the upward axis of the files.
@@ -45,6 +46,7 @@ class VolumeSettings:
     optics: Mapping[str, Any] = field(default_factory=dict)
     size: int = 64
     cameras: int = 40
+    field_of_view: float = 27.0
     samples: int = 2
     train_every: int = 1
     up: str = "z"
@@ -64,6 +66,8 @@ class VolumeSettings:
                 raise ConfigError(f"scene.{name}={value!r}: expected a whole number from {lowest} to {highest}")
         if made.timesteps is not None and not (isinstance(made.timesteps, int) and 2 <= made.timesteps <= 10_000):
             raise ConfigError(f"scene.timesteps={made.timesteps!r}: expected a whole number from 2 to 10000, or null")
+        if isinstance(made.field_of_view, bool) or not isinstance(made.field_of_view, int | float) or not 1 <= made.field_of_view <= 120:
+            raise ConfigError(f"scene.field_of_view={made.field_of_view!r}: expected degrees from 1 to 120")
         if made.up not in ("y", "z"):
             raise ConfigError(f"scene.up={made.up!r}: expected y or z")
         for meaning, grid in made.grids.items():

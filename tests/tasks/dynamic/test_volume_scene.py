@@ -120,6 +120,7 @@ def test_whatever_matters_is_part_of_the_key(folder: Path, tmp_path: Path) -> No
         {"size": 20},
         {"samples": 2},
         {"cameras": 5},
+        {"field_of_view": 30.0},
         {"look": "dust_tornado"},
         {"optics": {"extinction": 3.0}},
         {"frames": "9:11"},

@@ -83,7 +83,7 @@ def draw(
     dtype = torch.float64 if backend == "reference" else torch.float32
     leaves = {k: v.detach().to(dtype).requires_grad_() for k, v in t.items()}
     view = camera.viewmat.detach().clone().requires_grad_(with_view)
-    background = torch.linspace(0.2, 0.9, t["colors"].shape[1]).to(dtype).requires_grad_()
+    background = torch.linspace(0.2, 0.9, scenes.channels(t)).to(dtype).requires_grad_()
     output = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(settings, backend=backend), background)  # type: ignore[arg-type]
     h, w, C = output.rgb.shape
     keep = torch.ones(h, w, dtype=torch.float64) if skip is None else (~skip).double()

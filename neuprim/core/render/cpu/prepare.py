@@ -52,7 +52,7 @@ from neuprim.core.render.cpu.layout import (
     YC,
 )  # fmt: skip
 
-__all__ = ["CULLED", "NON_FINITE", "VISIBLE", "prepare", "prepare_backward", "prepare_wide"]
+__all__ = ["CULLED", "NON_FINITE", "VISIBLE", "prepare", "prepare_backward", "prepare_wide", "rotation", "rotation_backward"]
 
 VISIBLE, CULLED, NON_FINITE = 0, 1, 2
 _FLOAT32_MAX = 3.0e38
@@ -69,7 +69,7 @@ strict = njit(error_model="numpy", forceinline=True)
 
 
 @strict
-def _rotation(q, out):  # type: ignore[no-untyped-def]
+def rotation(q, out):  # type: ignore[no-untyped-def]
     w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])  # float32 squares would scale the rotation
     n = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * n, x * n, y * n, z * n
@@ -86,7 +86,7 @@ def _rotation(q, out):  # type: ignore[no-untyped-def]
 
 
 @strict
-def _rotation_backward(q, n, g, out):  # type: ignore[no-untyped-def]
+def rotation_backward(q, n, g, out):  # type: ignore[no-untyped-def]
     """dL/dq from dL/dR; the normalisation projects out the radial part."""
     w, x, y, z = q[0] * n, q[1] * n, q[2] * n, q[3] * n
     gw = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
@@ -118,7 +118,7 @@ def _frame(mean, log_scale, quat, R, t, cam, near, local, B, axes, c, anchor):  
 
     The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same number.
     """
-    n = _rotation(quat, local)
+    n = rotation(quat, local)
     top = max(np.float64(log_scale[0]), np.float64(log_scale[1]), np.float64(log_scale[2]))
     m = np.exp(top)
     for i in range(3):
@@ -356,7 +356,7 @@ def prepare_backward(  # type: ignore[no-untyped-def]
                 gL[a, j] += R[0, a] * gB[0, j] + R[1, a] * gB[1, j] + R[2, a] * gB[2, j]
         for j in range(4):
             q[j] = quats[i, j]
-        _rotation_backward(q, inverse, gL, gq)
+        rotation_backward(q, inverse, gL, gq)
         for j in range(4):
             g_quats[i, j] = gq[j]
         if want_view:

@@ -60,7 +60,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
     "cuts off": ({}, {}, {"alpha_min": 0.0, "transmittance_min": 0.0}),
     "low ceiling": ({}, {}, {"alpha_max": 0.2}),
     "two rays a side": ({}, {"width": 24, "height": 17}, {"samples": 2}),
-    "20 rad over a chord": ({"colour_frequency": 10.0}, {}, {}),
+    "30 rad over a chord": ({"colour_frequency": 15.0}, {}, {}),
     "100 rad over a chord": ({"colour_frequency": 50.0}, {}, {}),
     "1000 rad over a chord": ({"colour_frequency": 500.0}, {}, {}),
     "1000 rad, inside": ({"colour_frequency": 500.0, "count": 90}, {"distance": 0.15, "fov": 70.0}, {}),
@@ -70,29 +70,30 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
     "needles": ({"axes": (1.0, 0.02, 0.03), "radius": 0.5}, {}, {}),
     "discs": ({"axes": (1.0, 0.9, 0.01)}, {}, {}),
     "needles, inside": ({"axes": (1.0, 0.02, 0.03), "radius": 0.5}, {"distance": 0.5, "fov": 60.0}, {"depth_floor": 1e-3}),
-    "thin discs, far": ({"axes": (1.0, 0.8, 1e-3), "radius": 0.01, "spread": 0.05}, {"distance": 100.0, "fov": 0.06}, {}),
+    "thin discs, far": ({"seed": 10, "axes": (1.0, 0.8, 1e-3), "radius": 0.01, "spread": 0.05, "denser": 50.0}, {"distance": 100.0, "fov": 0.06}, {}),
 }
 
 
 def case(name: str) -> tuple[dict[str, Tensor], Camera, RenderSettings]:
     model, view, knobs = CASES[name]
     model = {"seed": 7, "hidden": 8, **model}
-    spread, axes = model.pop("spread", 1.0), model.pop("axes", None)
+    spread, axes, denser = model.pop("spread", 1.0), model.pop("axes", None), model.pop("denser", 1.0)
     t = scenes.tensors(**model)
     t["means"] *= spread
+    t["b2"] *= denser  # thin discs have short chords
     if axes:
         t = along_the_axes(t, *axes)
     return t, scenes.camera(**{"width": 40, "height": 29, **view}), RenderSettings(**knobs)
 
 
-@pytest.mark.parametrize("sort", ORDERS)
-@pytest.mark.parametrize("name", CASES)
+# at distance/radius 1e5 entries differ by less than float32 knows of their depth
+@pytest.mark.parametrize(("name", "sort"), [(n, s) for n in CASES for s in ORDERS if s == "center" or "1e5" not in n])
 def test_extremes(name: str, sort: str) -> None:
     t, camera, settings = case(name)
     fast, slow = assert_same_frame(t, camera, replace(settings, sort=sort))  # type: ignore[arg-type]
     assert slow.output.alpha.max() > 0.1, "the view must show something"
-    if "rad" in name:
-        assert fast.output.stats.extra["delicate"] > 30, "float32 does not know such phases"
+    if " rad" in name:  # float32 knows the slower phases well enough, the others not
+        assert (fast.output.stats.extra["delicate"] > 30) == ("30 rad" not in name)
 
 
 def test_cases_mean_what_they_say() -> None:

@@ -13,13 +13,12 @@ import numpy as np
 
 from neuprim.core.render.cpu.compile import exact_kernel
 from neuprim.core.render.cpu.layout import NET_OUT, PHASE, WX, net_row_width
-from neuprim.core.render.cpu.prepare import rotation, rotation_backward
+from neuprim.core.render.cpu.prepare import DELICATE_TURNS, rotation, rotation_backward
 from neuprim.core.render.cpu.threads import parallel_for
 
 __all__ = ["Net", "net_backward", "net_rows", "prepare_net"]
 
 _TURNS = 1.0 / (2.0 * np.pi)
-_DELICATE_TURNS = 2.0  # of a unit over half a chord: beyond, float32 no longer knows its phase well enough
 _PRIMITIVES_PER_CHUNK = 512
 Array = np.ndarray[Any, Any]
 
@@ -62,7 +61,7 @@ def prepare_net(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast
             row[o + PHASE] = phase - np.rint(phase)
             for c in range(C):
                 row[o + NET_OUT + c] = Wout[i, c, j]
-            fast[n] |= square > _DELICATE_TURNS**2
+            fast[n] |= square > DELICATE_TURNS**2
 
 
 def net_rows(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:

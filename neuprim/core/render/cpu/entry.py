@@ -11,6 +11,8 @@ Entries that agree in float32 keep the order of the centres, and so do all chord
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from neuprim.core.render.cpu.backward import opacity
@@ -175,11 +177,13 @@ def composite_tiles_by_entry(  # type: ignore[no-untyped-def]
     across = (width + TILE - 1) // TILE
     C = colors.shape[1]
     tmin = limits[2]
-    scratch, hidden = BACKWARD_SCRATCH, 0
+    scratch = BACKWARD_SCRATCH
+    waves: Any = None
+    hues: Any = None
     if net is not None:
-        scratch, hidden = BACKWARD_SCRATCH + 2 * C * LANES, net.hidden
+        scratch = BACKWARD_SCRATCH + 2 * C * LANES
+        waves, hues = np.zeros((net.hidden, NET_SCRATCH), np.float32), np.empty((1, C), np.float32)
     S, D = np.zeros(scratch + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
-    waves, hues = np.zeros((hidden, NET_SCRATCH), np.float32), np.empty((1, C), np.float32)
     state = np.zeros(NORM + PIXELS + 2 * TILE, np.float32)
     bounds, offset = np.zeros(2 * TILE, np.int32), np.zeros(TILE, np.int32)
     rows_live, color = np.zeros(TILE, np.float32), np.zeros(C, np.float32)
@@ -239,11 +243,13 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
     C = colors.shape[1]
     color_at = G_NEURONS + PER_NEURON * neurons
     tmin, floor = limits[2], limits[3]
-    scratch, hidden = BACKWARD_SCRATCH, 0
+    scratch = BACKWARD_SCRATCH
+    waves: Any = None
+    hues: Any = None
     if net is not None:
-        scratch, hidden = BACKWARD_SCRATCH + 2 * C * LANES, net.hidden
+        scratch = BACKWARD_SCRATCH + 2 * C * LANES
+        waves, hues = np.zeros((net.hidden, NET_SCRATCH), np.float32), np.empty((1, C), np.float32)
     S, D = np.zeros(scratch + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
-    waves, hues = np.zeros((hidden, NET_SCRATCH), np.float32), np.empty((1, C), np.float32)
     V = np.zeros((neurons, NEURON_SCRATCH), np.float32)
     state = np.zeros(NORM + PIXELS + 2 * TILE, np.float32)
     bounds, offset = np.zeros(2 * TILE, np.int32), np.zeros(TILE, np.int32)

@@ -52,7 +52,17 @@ from neuprim.core.render.cpu.layout import (
     YC,
 )  # fmt: skip
 
-__all__ = ["CULLED", "NON_FINITE", "VISIBLE", "prepare", "prepare_backward", "prepare_wide", "rotation", "rotation_backward"]
+__all__ = [
+    "CULLED",
+    "DELICATE_TURNS",
+    "NON_FINITE",
+    "VISIBLE",
+    "prepare",
+    "prepare_backward",
+    "prepare_wide",
+    "rotation",
+    "rotation_backward",
+]
 
 VISIBLE, CULLED, NON_FINITE = 0, 1, 2
 _FLOAT32_MAX = 3.0e38
@@ -60,7 +70,7 @@ _FLOAT32_MAX = 3.0e38
 # Where the pixel stage leaves float32 (bounds found with benchmarks/numerics.py).
 _DELICATE_RADII = 8.0  # terms of a point on the ray this many radii of the thinnest axis long: they cancel
 _DELICATE_ANCHOR = 1.25  # the same of the centre seen from an anchor at the camera: most cameras outside, but near
-_DELICATE_TURNS = 4.0  # of a neuron over half a chord
+DELICATE_TURNS = 4.0  # of a neuron, or a unit of a colour network, over half a chord
 _DELICATE_PIXELS = 16384.0  # from the corner of the image to the anchor
 _DELICATE_RATIO = 256.0  # of the axes; for the gradients
 _DELICATE_RATIO_NEAR = 16.0  # of the axes of a primitive anchored at the camera, which its chords pass closely
@@ -218,7 +228,7 @@ def prepare(  # type: ignore[no-untyped-def]
         for j in range(row.shape[0]):
             rows[i, j] = row[j]
         tc = row[TC]
-        delicate[i] = (K > 0 and rate[K - 1] > _DELICATE_TURNS) or max(abs(row[UX]), abs(row[UY])) > _DELICATE_PIXELS
+        delicate[i] = (K > 0 and rate[K - 1] > DELICATE_TURNS) or max(abs(row[UX]), abs(row[UY])) > _DELICATE_PIXELS
         delicate[i] |= _dot(xa, xa) > _DELICATE_ANCHOR**2  # centre far from the anchor, in the thinnest axis
         thinnest = min(axes[0], axes[1], axes[2])
         delicate[i] |= thinnest * (_DELICATE_RATIO_NEAR if tc == 0.0 else _DELICATE_RATIO) < 1.0

@@ -70,7 +70,11 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
     "needles": ({"axes": (1.0, 0.02, 0.03), "radius": 0.5}, {}, {}),
     "discs": ({"axes": (1.0, 0.9, 0.01)}, {}, {}),
     "needles, inside": ({"axes": (1.0, 0.02, 0.03), "radius": 0.5}, {"distance": 0.5, "fov": 60.0}, {"depth_floor": 1e-3}),
-    "thin discs, far": ({"seed": 10, "axes": (1.0, 0.8, 1e-3), "radius": 0.01, "spread": 0.05, "denser": 50.0}, {"distance": 100.0, "fov": 0.06}, {}),
+    "thin discs, far": (
+        {"seed": 10, "axes": (1.0, 0.8, 1e-3), "radius": 0.01, "spread": 0.05, "denser": 50.0},
+        {"distance": 100.0, "fov": 0.06},
+        {},
+    ),
 }
 
 

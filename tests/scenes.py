@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.fields import Constant, Cosine
+from neuprim.core.fields import Constant, Cosine, LoweredColour, RayNet
 from neuprim.core.geometry import Geometry
 from neuprim.core.primitives import Lowered
 
@@ -29,8 +29,13 @@ def tensors(
     radius: float = 0.25,
     frequency: float = 1.0 / 3.0,
     dtype: torch.dtype = torch.float32,
+    hidden: int | None = None,
+    colour_frequency: float = 2.0,
 ) -> dict[str, Tensor]:
-    """Random primitives in the unit cube: overlapping, anisotropic, of positive and negative density."""
+    """Random primitives in the unit cube: overlapping, anisotropic, of positive and negative density.
+
+    Their colours are constant, or with ``hidden`` networks of so many units, clamped here and there.
+    """
     g = torch.Generator().manual_seed(seed)
 
     def u(*shape: int) -> Tensor:
@@ -46,9 +51,26 @@ def tensors(
         "b2": 0.3 + 0.4 * u(count, 1),
         "colors": u(count, channels) * 0.5 + 0.5,
     }
+    if hidden is not None:
+        base = values.pop("colors")
+        values |= {
+            "Wx": u(count, hidden, 3) * colour_frequency,
+            "bias": u(count, hidden) * 3.0,
+            "Wout": u(count, channels, hidden) * 0.8 / max(hidden, 1) ** 0.5,
+            "base": base - 0.1,
+        }
     return {k: v.to(dtype) for k, v in values.items()}
+
+
+def colour(t: dict[str, Tensor]) -> LoweredColour:
+    """The colour form that a dictionary of :func:`tensors` holds."""
+    return Constant(t["colors"]) if "colors" in t else RayNet(t["Wx"], t["bias"], t["Wout"], t["base"])
+
+
+def channels(t: dict[str, Tensor]) -> int:
+    return int(t["colors" if "colors" in t else "base"].shape[1])
 
 
 def lowered(t: dict[str, Tensor]) -> Lowered:
     """The renderer's input from a dictionary of :func:`tensors`."""
-    return Lowered(Geometry(t["means"], t["log_scales"], t["quats"]), Cosine(t["W1"], t["b1"], t["w2"], t["b2"]), Constant(t["colors"]))
+    return Lowered(Geometry(t["means"], t["log_scales"], t["quats"]), Cosine(t["W1"], t["b1"], t["w2"], t["b2"]), colour(t))

@@ -29,6 +29,7 @@ __all__ = [
     "LoweredDensity",
     "Opaque",
     "OpaqueColour",
+    "RayNet",
 ]
 
 Conditions = Mapping[str, Tensor]
@@ -104,7 +105,43 @@ class OpaqueColour:
     channels: int
 
 
-LoweredColour = Constant | OpaqueColour
+@dataclass(frozen=True)
+class RayNet:
+    """A colour network per primitive, evaluated where each pixel's ray passes through it.
+
+        c(pixel) = max(0, base + Wout cos(Wx . x~_m + bias)),   x~_m = (x_m - mu)/m
+
+    with x_m the middle of the ray's chord, after the cut by the near plane if there is one: the point that the closed form of the
+    density is anchored at. One hidden layer of H cosine units, H = 0 to 16, phases in radians; H = 0 is the constant colour
+    max(0, base). Whatever does not change within a primitive (view direction at its centre, light) a field folds into ``bias``,
+    ``Wout`` and ``base``. A colour of exactly 0 still passes its gradient, as ``clamp_min`` does.
+
+    Attributes:
+        Wx: (N, H, 3) on scene axes, radians per m; bias: (N, H), radians.
+        Wout: (N, C, H), base: (N, C), any channel count C.
+    """
+
+    Wx: Tensor
+    bias: Tensor
+    Wout: Tensor
+    base: Tensor
+
+    @property
+    def channels(self) -> int:
+        return int(self.base.shape[1])
+
+    @property
+    def hidden(self) -> int:
+        return int(self.Wx.shape[1])
+
+    def radiance(self, prim: Tensor, local: Tensor) -> Tensor:
+        """(M, C) float64 colours of primitives ``prim`` (M,) at local chord middles ``local`` = x~_m (M, 3) float64; differentiable."""
+        phase = (self.Wx.double()[prim] * local[:, None, :]).sum(-1) + self.bias.double()[prim]
+        mixed = (self.Wout.double()[prim] * phase.cos()[:, None, :]).sum(-1)
+        return (self.base.double()[prim] + mixed).clamp_min(0)
+
+
+LoweredColour = Constant | RayNet | OpaqueColour
 
 
 # ---------------------------------------------------------------- fields

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.fields import OpaqueColour
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from neuprim.core.render.reference import pixel_directions
 from tests import scenes
@@ -30,7 +31,7 @@ def undecided(t: dict[str, Tensor], camera: Camera, settings: RenderSettings) ->
     """(H, W) pixels on which float32 and float64 may rightly fall on different sides of a cut.
 
     Those whose reference image jumps when alpha_min or transmittance_min moves by 1e-5 (of itself, for the latter 1e-3). Where the
-    order is that of entries, also those with :func:`near_ties`.
+    order is that of entries, also those with :func:`near_ties`; where colours are networks, those with :func:`near_black`.
     """
     wide = scenes.lowered({k: v.detach().double() for k, v in t.items()})
     images = []
@@ -46,7 +47,27 @@ def undecided(t: dict[str, Tensor], camera: Camera, settings: RenderSettings) ->
             )
             images.append(render_lowered(wide, camera, moved).alpha)
     jumps = images[0] != images[1]
+    if "Wx" in t:
+        jumps |= near_black(t, camera, settings)
     return jumps | near_ties(t, camera, settings.near) if settings.sort == "entry" else jumps
+
+
+def near_black(t: dict[str, Tensor], camera: Camera, settings: RenderSettings, gap: float = 4e-6) -> Tensor:
+    """(H, W) pixels with a colour within ``gap`` of where max(0, .) clamps it: float32 may pass its gradient where float64 does not."""
+    w = {k: v.detach().double() for k, v in t.items()}
+    low = scenes.lowered(w)
+    m = low.geometry.length_scale
+
+    def close(prim: Tensor, x: Tensor, d: Tensor) -> Tensor:
+        local = (x - w["means"][prim]) / m[prim, None]
+        waves = ((w["Wx"][prim] * local[:, None, :]).sum(-1) + w["bias"][prim]).cos()
+        value = w["base"][prim] + (w["Wout"][prim] * waves[:, None, :]).sum(-1)
+        size = w["base"][prim].abs() + w["Wout"][prim].abs().sum(-1)
+        return ((value.abs() < gap * size) & (size > 0)).any(1, keepdim=True).double()
+
+    with torch.no_grad():
+        found = render_lowered(replace(low, colour=OpaqueColour(close, 1)), camera, replace(settings, backend="reference", depth=False))
+    return found.rgb[..., 0] > 0
 
 
 def entries(t: dict[str, Tensor], camera: Camera, near: float) -> Tensor:
@@ -83,7 +104,7 @@ def draw(
     dtype = torch.float64 if backend == "reference" else torch.float32
     leaves = {k: v.detach().to(dtype).requires_grad_() for k, v in t.items()}
     view = camera.viewmat.detach().clone().requires_grad_(with_view)
-    background = torch.linspace(0.2, 0.9, t["colors"].shape[1]).to(dtype).requires_grad_()
+    background = torch.linspace(0.2, 0.9, scenes.channels(t)).to(dtype).requires_grad_()
     output = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(settings, backend=backend), background)  # type: ignore[arg-type]
     h, w, C = output.rgb.shape
     keep = torch.ones(h, w, dtype=torch.float64) if skip is None else (~skip).double()

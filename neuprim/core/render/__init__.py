@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.core.fields import Constant, Cosine
+from neuprim.core.fields import Constant, Cosine, RayNet
 from neuprim.core.primitives import Lowered, Primitives
 from neuprim.core.ray_cameras import AnyCamera, RayCamera
 from neuprim.core.render.output import RenderOutput, RenderStats
@@ -28,13 +28,15 @@ def choose_backend(lowered: Lowered, settings: RenderSettings, camera: AnyCamera
     Raises:
         BackendUnavailable: when the fast backend is asked for by name but does not know the model's forms or the camera.
     """
-    known = isinstance(lowered.density, Cosine) and isinstance(lowered.colour, Constant)
+    known = isinstance(lowered.density, Cosine) and isinstance(lowered.colour, Constant | RayNet)
     pinhole = not isinstance(camera, RayCamera)
     if settings.backend == "auto":
         return "cpu" if known and pinhole else "reference"
     if settings.backend == "cpu" and not known:
         forms = f"{type(lowered.density).__name__} density, {type(lowered.colour).__name__} colour"
-        raise BackendUnavailable(f"renderer.backend=cpu cannot draw {forms}; it knows Cosine and Constant. Use renderer.backend=reference")
+        raise BackendUnavailable(
+            f"renderer.backend=cpu cannot draw {forms}; it knows Cosine, and Constant or RayNet. Use renderer.backend=reference"
+        )
     if settings.backend == "cpu" and not pinhole:
         raise BackendUnavailable(
             "renderer.backend=cpu cannot draw a RayCamera (fisheye, equirectangular); it knows pinhole cameras. Use renderer.backend=reference"

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import ConfigError
-from neuprim.core.fields import Constant, Cosine
+from neuprim.core.fields import Constant, Cosine, RayNet
 from neuprim.core.geometry import quaternion_to_matrix
 from neuprim.core.metrics import psnr
 from neuprim.core.primitives import Lowered
@@ -202,7 +202,11 @@ def _march(
     if isinstance(colour, Constant):
         c = colour.rgb.detach().double()[prim]
     else:
-        c = colour.radiance(prim, origin + ((t0 + t1) / 2)[:, None] * world[ray], world[ray]).double()
+        x = origin + ((t0 + t1) / 2)[:, None] * world[ray]
+        if isinstance(colour, RayNet):
+            c = colour.radiance(prim, (x - g.means.double()[prim]) / g.log_length_scale.double().exp()[prim, None])
+        else:
+            c = colour.radiance(prim, x, world[ray]).double()
     cells = middle.shape[1]
     at = ray[chord] * cells + cell
     depth = torch.zeros(P * cells, dtype=torch.float64).index_add(0, at, tau)

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.fields import Constant, Cosine
+from neuprim.core.fields import Constant, Cosine, RayNet
 from neuprim.core.geometry import quaternion_to_matrix
 from neuprim.core.primitives import Lowered
 from neuprim.core.ray_cameras import AnyCamera
@@ -159,9 +159,9 @@ def _trace(
     xm = p + mid[:, None] * v  # whitened chord middle
 
     world_d = dj @ frame.rotation
+    local = (frame.local[prim] @ (frame.axes[prim] * xm)[:, :, None])[..., 0]  # (x - mu)/m of the chord middle, scene axes
     if isinstance(lowered.density, Cosine):
         f = lowered.density
-        local = (frame.local[prim] @ (frame.axes[prim] * xm)[:, :, None])[..., 0]  # (x - mu)/m, scene axes
         W1 = f.W1.double()[prim]
         phase = f.omega0 * ((W1 * local[:, None, :]).sum(-1) + f.b1.double()[prim])
         rate = f.omega0 * (W1 * world_d[:, None, :]).sum(-1)
@@ -199,8 +199,11 @@ def _trace(
     if isinstance(lowered.colour, Constant):
         rgb = weights.T @ lowered.colour.rgb.double()[rows]
     else:
-        xw = frame.origin + (mid * m)[:, None] * world_d
-        c = lowered.colour.radiance(prim, xw, world_d).double()
+        if isinstance(lowered.colour, RayNet):
+            c = lowered.colour.radiance(prim, local)
+        else:
+            xw = frame.origin + (mid * m)[:, None] * world_d
+            c = lowered.colour.radiance(prim, xw, world_d).double()
         rgb = torch.zeros(P, channels, dtype=torch.float64).index_add(0, j, weights[i, j][:, None] * c)
     z = torch.zeros(P, dtype=torch.float64).index_add(0, j, weights[i, j] * mid * m * rays.depth[j]) if settings.depth else T[-1] * 0
     return torch.cat([rgb, T[-1][:, None], z[:, None]], -1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.fields import Constant, Cosine
+from neuprim.core.fields import Constant, Cosine, RayNet
 from neuprim.core.primitives import Lowered
 
 __all__ = ["refuse_non_finite"]
@@ -24,6 +24,9 @@ def refuse_non_finite(lowered: Lowered) -> None:
         tensors |= {"W1": f.W1, "b1": f.b1, "w2": f.w2, "b2": f.b2}
     if isinstance(lowered.colour, Constant):
         tensors["colors"] = lowered.colour.rgb
+    elif isinstance(lowered.colour, RayNet):
+        c = lowered.colour
+        tensors |= {"Wx": c.Wx, "bias": c.bias, "Wout": c.Wout, "base": c.base}
     with torch.no_grad():
         for name, value in tensors.items():
             if value.numel() and not bool(torch.isfinite(value).all()):

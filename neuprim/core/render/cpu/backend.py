@@ -12,10 +12,11 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.fields import Constant, Cosine
+from neuprim.core.fields import Constant, Cosine, RayNet
 from neuprim.core.primitives import Lowered
 from neuprim.core.render.cpu.backward import backward_tiles, sum_rows
 from neuprim.core.render.cpu.binning import TileLists, bin_primitives
+from neuprim.core.render.cpu.colour_net import Net, net_backward, net_rows
 from neuprim.core.render.cpu.entry import backward_tiles_by_entry, composite_tiles_by_entry
 from neuprim.core.render.cpu.forward import composite_tiles
 from neuprim.core.render.cpu.layout import G_ERROR, G_NEURONS, G_WEIGHT, PER_NEURON, SPAN_WIDTH, TILE, gradient_width, row_width
@@ -28,6 +29,7 @@ __all__ = ["render"]
 
 _PRIMITIVES_PER_CHUNK = 512
 _TURN = 2.0 * np.pi
+_NET = ("Wx", "bias", "Wout", "base")
 Array = np.ndarray[Any, Any]
 
 
@@ -53,6 +55,7 @@ class _Frame:
     norms: Array
     limits: Array
     lists: TileLists
+    net: Net | None
 
     @property
     def intrinsics(self) -> Array:
@@ -101,6 +104,10 @@ def _prepare(
     )  # fmt: skip
     if bool((status == NON_FINITE).any()):
         raise _non_finite(tensors, int(np.flatnonzero(status == NON_FINITE)[0]))
+    net_narrow = None
+    if "Wx" in tensors:
+        net_narrow, fast = net_rows(np.arange(count), tensors, False, settings.threads)
+        delicate |= fast
     slots, which = np.full(count, -1, np.int32), np.flatnonzero(delicate & (status == VISIBLE))
     slots[which] = np.arange(len(which), dtype=np.int32)
     wide = np.empty((len(which), rows.shape[1]))
@@ -108,6 +115,10 @@ def _prepare(
         prepare_wide, len(which), _PRIMITIVES_PER_CHUNK, settings.threads, which, *(tensors[n] for n in names),
         R, t, cam, settings.near, omega0 / _TURN, order, wide,
     )  # fmt: skip
+    net = None
+    if net_narrow is not None:
+        hidden = tensors["Wx"].shape[1]
+        net = Net(net_narrow, net_rows(which, tensors, True, settings.threads)[0], hidden + hidden % 2)
     stats.extra["delicate"] = len(which)
     lists = bin_primitives(rows, spans, boxes, depth, status, camera.width, camera.height, settings.threads)
     stats.pairs = lists.pairs
@@ -131,7 +142,16 @@ def _prepare(
         _norms(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy),
         limits,
         lists,
+        net,
     )
+
+
+def _check_colours(tensors: dict[str, Array], names: tuple[str, ...]) -> None:
+    for name in names:
+        if not np.isfinite(tensors[name].sum(dtype=np.float64)):
+            bad = np.flatnonzero(~np.isfinite(tensors[name]).reshape(len(tensors[name]), -1).all(axis=1))
+            if bad.size:
+                raise _non_finite(tensors, int(bad[0]))
 
 
 def _non_finite(tensors: dict[str, Array], row: int) -> NonFiniteError:
@@ -149,28 +169,28 @@ class _Rasterize(torch.autograd.Function):
     def forward(  # type: ignore[override]
         ctx: Any, means: Tensor, log_scales: Tensor, quats: Tensor, W1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor,
         colors: Tensor, viewmat: Tensor, background: Tensor, camera: Camera, omega0: float, settings: RenderSettings, stats: RenderStats,
+        *net: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         names = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
         tensors = {n: _array(v) for n, v in zip(names, (means, log_scales, quats, W1, b1, w2, b2), strict=True)}
-        tensors["colors"] = _array(colors)
-        if not np.isfinite(tensors["colors"].sum(dtype=np.float64)):
-            bad = np.flatnonzero(~np.isfinite(tensors["colors"]).all(axis=1))
-            if bad.size:
-                raise _non_finite(tensors, int(bad[0]))
+        tint = _NET if net else ("colors",)
+        tensors |= {n: _array(v) for n, v in zip(tint, (*net, colors), strict=True)}
+        _check_colours(tensors, tint)
         frame = _prepare(tensors, camera, viewmat.detach().double().numpy(), omega0, _array(background.float()), settings, stats)
         h, w, C = camera.height, camera.width, colors.shape[1]
         rgb, T = np.empty((h, w, C), np.float32), np.empty((h, w), np.float32)
         z, last = np.zeros((h, w) if settings.depth else (1, 1), np.float32), np.empty((h, w), np.int32)
-        palette = np.ascontiguousarray(tensors["colors"], np.float32)
+        palette = np.ascontiguousarray(tensors[tint[-1]], np.float32)
         tiles = composite_tiles_by_entry if settings.sort == "entry" else composite_tiles
         lanes = parallel_for(
             tiles, frame.tiles, frame.chunk, settings.threads, frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
             frame.lists.starts, frame.lists.ids, palette, frame.norms, frame.background, frame.limits, settings.depth, frame.neurons,
-            rgb, T, z, last,
+            rgb, T, z, last, frame.net,
         )  # fmt: skip
         stats.extra["forward_lanes"] = sum(lanes)
         ctx.frame, ctx.tensors, ctx.palette, ctx.last, ctx.T = frame, tensors, palette, last, T
         ctx.dtypes = [x.dtype for x in (means, log_scales, quats, W1, b1, w2, b2, colors)]
+        ctx.net_dtypes = [x.dtype for x in net]
         ctx.view_dtype, ctx.background_dtype = viewmat.dtype, background.dtype
         return torch.from_numpy(rgb), torch.from_numpy(T), torch.from_numpy(z)
 
@@ -185,13 +205,13 @@ class _Rasterize(torch.autograd.Function):
         gz = np.ascontiguousarray(g_z.numpy(), np.float32)
         wanted = frame.stats.pixel_error
         error = np.zeros((h, w), np.float32) if wanted is None else np.ascontiguousarray(wanted.detach().numpy(), np.float32)
-        width = gradient_width(frame.neurons, C)
+        width = gradient_width(frame.neurons, C, frame.net.hidden if frame.net else 0)
         pair_rows = np.empty((frame.lists.pairs, width), np.float32)
         tiles = backward_tiles_by_entry if s.sort == "entry" else backward_tiles
         lanes = parallel_for(
             tiles, frame.tiles, frame.chunk, s.threads, frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
             frame.lists.starts, frame.lists.ids, ctx.palette, frame.norms, frame.limits, s.depth, frame.neurons,
-            ctx.T, ctx.last, grad_rgb, gT, gz, error, pair_rows,
+            ctx.T, ctx.last, grad_rgb, gT, gz, error, pair_rows, frame.net,
         )  # fmt: skip
         frame.stats.extra["backward_lanes"] = sum(lanes)
         grads, touched = np.empty((count, width), np.float32), np.empty(count, np.bool_)
@@ -217,6 +237,12 @@ class _Rasterize(torch.autograd.Function):
             *out, g_b2, g_view, want_view,
         )  # fmt: skip
         base = G_NEURONS + PER_NEURON * frame.neurons
+        g_net = [np.zeros(t[n].shape, np.float32) for n in ("Wx", "bias", "Wout")] if frame.net else []
+        if frame.net:
+            parallel_for(
+                net_backward, count, _PRIMITIVES_PER_CHUNK, s.threads, t["log_scales"], t["quats"], t["Wx"], frame.net.rows,
+                grads, base + C, touched, out[1], out[2], *g_net,
+            )  # fmt: skip
         if wanted is not None:
             frame.stats.weight = torch.from_numpy(grads[:, G_WEIGHT].copy())
             frame.stats.error_weight = torch.from_numpy(grads[:, G_ERROR].copy())
@@ -230,20 +256,22 @@ class _Rasterize(torch.autograd.Function):
         g_background = None
         if ctx.needs_input_grad[9]:
             g_background = (g_rgb * torch.from_numpy(ctx.T)[..., None]).sum((0, 1)).to(ctx.background_dtype)
-        return (*tensors, view, g_background, None, None, None, None)
+        nets = (torch.from_numpy(r).to(d) for r, d in zip(g_net, ctx.net_dtypes, strict=True))
+        return (*tensors, view, g_background, None, None, None, None, *nets)
 
 
 def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
-    """Render a lowered model whose density is :class:`Cosine` and colour :class:`Constant`; see ``neuprim.core.render.render``."""
+    """Render a :class:`Cosine` density with :class:`Constant` or :class:`RayNet` colours; see ``neuprim.core.render.render``."""
     density, colour = lowered.density, lowered.colour
-    assert isinstance(density, Cosine) and isinstance(colour, Constant), "the caller chooses a backend that knows the forms"
+    assert isinstance(density, Cosine) and isinstance(colour, Constant | RayNet), "the caller chooses a backend that knows the forms"
     stats = RenderStats("cpu")
     g = lowered.geometry
+    palette, net = (colour.base, (colour.Wx, colour.bias, colour.Wout)) if isinstance(colour, RayNet) else (colour.rgb, ())
     if background is None:
-        background = torch.zeros(colour.rgb.shape[1])
+        background = torch.zeros(palette.shape[1])
     rgb, T, zsum = _Rasterize.apply(
-        g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1), colour.rgb,
-        camera.viewmat, background, camera, density.omega0, settings, stats,
+        g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1), palette,
+        camera.viewmat, background, camera, density.omega0, settings, stats, *net,
     )  # fmt: skip
     dtype = g.means.dtype
     alpha = 1 - T

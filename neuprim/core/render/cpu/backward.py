@@ -26,8 +26,10 @@ from neuprim.core.render.cpu.layout import (
     GRAD,
     GZ,
     HALF,
+    LANES,
     LAST,
     MID,
+    NET_SCRATCH,
     NEURON_SCRATCH,
     NORM,
     NORM_L,
@@ -38,12 +40,14 @@ from neuprim.core.render.cpu.layout import (
     SLOPE,
     T_,
     TILE,
+    TINT,
     UNIT,
     UX,
     UY,
 )
 from neuprim.core.render.cpu.neurons import field_with_slopes
 from neuprim.core.render.cpu.tiles import compact, row_spans
+from neuprim.core.render.cpu.tints import tint_gradient, tint_gradient_row, tints, uncomposite_rgb_tints, weigh_tints
 from neuprim.core.render.cpu.turns import one_minus_exp
 
 __all__ = ["backward_tiles", "opacity", "sum_rows"]
@@ -143,15 +147,22 @@ def _total(sums, first):  # type: ignore[no-untyped-def]
 @kernel
 def backward_tiles(  # type: ignore[no-untyped-def]
     start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, limits, with_depth, neurons,
-    transmittance, last, g_rgb, g_transmittance, g_z, error, pair_rows,
+    transmittance, last, g_rgb, g_transmittance, g_z, error, pair_rows, net,
 ):  # fmt: skip
-    """Gradient rows of every pair of tiles ``start:stop``. ``g_transmittance`` already holds the background's share."""
+    """Gradient rows of every pair of tiles ``start:stop``. ``g_transmittance`` already holds the background's share.
+
+    ``net``: as for :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
+    """
     height, width = norms.shape
     across = (width + TILE - 1) // TILE
     C = colors.shape[1]
     color_at = G_NEURONS + PER_NEURON * neurons
     amin, amax, floor = limits[0], limits[1], limits[3]
-    S, D = np.zeros(BACKWARD_SCRATCH + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
+    scratch = BACKWARD_SCRATCH
+    if net is not None:
+        scratch = BACKWARD_SCRATCH + 2 * C * LANES
+        waves = np.zeros((net.hidden, NET_SCRATCH), np.float32)
+    S, D = np.zeros(scratch + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
     V = np.zeros((neurons, NEURON_SCRATCH), np.float32)
     state = np.zeros((6 + C) * PIXELS + 2 * TILE, np.float32)
     w, cg, sums = np.zeros(TILE, np.float32), np.zeros(TILE, np.float32), np.zeros((2 + C) * TILE, np.float32)
@@ -202,6 +213,11 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             opacity(S, n16, amin, amax)
             for k in range(n, n16):
                 S[GRAD + k] = f(0)
+            if net is not None:
+                tints(S, D, waves, n16, i, net, slots, colors[i], True)
+                for c in range(C, 2 * C):
+                    for k in range(n, n16):
+                        S[TINT + c * LANES + k] = f(0)
             for k in range(n16):
                 S[GMID + k] = f(0)
             sums[:] = f(0)
@@ -210,23 +226,32 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                 if b > a:
                     at = offset[y] - a
                     if C == 3 and not with_depth:
-                        _uncomposite_rgb_row(state, S, y * TILE, at, sums, a, b, rank, colors[i, 0], colors[i, 1], colors[i, 2])
+                        if net is None:
+                            _uncomposite_rgb_row(state, S, y * TILE, at, sums, a, b, rank, colors[i, 0], colors[i, 1], colors[i, 2])
+                        else:
+                            uncomposite_rgb_tints(state, S, y * TILE, at, sums, a, b, rank)
                         continue
                     cg[:] = f(0)
-                    for c in range(C):
-                        st, color = state[G_COLOR + c * PIXELS + y * TILE :], colors[i, c]
-                        for k in range(TILE):
-                            cg[k] += color * st[k]
+                    if net is None:
+                        for c in range(C):
+                            st, color = state[G_COLOR + c * PIXELS + y * TILE :], colors[i, c]
+                            for k in range(TILE):
+                                cg[k] += color * st[k]
+                    else:
+                        weigh_tints(state, S, y * TILE, at, cg, C)
                     if with_depth:
                         st = state[GZ + y * TILE :]
                         for k in range(a, b):
                             cg[k] += st[k] * (p[ANCHOR_Z] + p[UNIT] * (S[MID + at + k] + S[SLIDE + at + k]))
                     _uncomposite_row(state[y * TILE :], S[ALPHA + at :], cg, w, a, b, rank)
                     _tally(state[y * TILE :], w, sums)
-                    for c in range(C):
-                        st = state[G_COLOR + c * PIXELS + y * TILE :]
-                        for k in range(TILE):
-                            sums[(2 + c) * TILE + k] += w[k] * st[k]
+                    if net is None:
+                        for c in range(C):
+                            st = state[G_COLOR + c * PIXELS + y * TILE :]
+                            for k in range(TILE):
+                                sums[(2 + c) * TILE + k] += w[k] * st[k]
+                    else:
+                        tint_gradient_row(state, S, y * TILE, at, w, a, b, C)
                     if with_depth:
                         st = state[GZ + y * TILE :]
                         for k in range(a, b):
@@ -235,11 +260,14 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             if weight == f(0):
                 continue  # hidden or below the cut everywhere: every gradient is zero
             out[G_WEIGHT], out[G_ERROR] = weight, _total(sums, TILE)
-            for c in range(C):
-                out[color_at + c] = _total(sums, (2 + c) * TILE)
+            if net is None:
+                for c in range(C):
+                    out[color_at + c] = _total(sums, (2 + c) * TILE)
             field_gradient(S, n16, out)
             for m in range(0, neurons, 2):
                 two_neurons(S, V[m], V[m + 1], n16, p, m, out)
+            if net is not None:
+                tint_gradient(S, waves, n16, i, net, C, out, color_at)
             chord_gradient(S, n16, p, out)
     return evaluated
 

@@ -52,7 +52,7 @@ from neuprim.core.render.cpu.layout import (
 )
 from neuprim.core.render.cpu.turns import TAU, cos_turns, dsinc_turns, sinc_turns
 
-__all__ = ["DELICATE_SCRATCH", "delicate_chords", "delicate_neurons", "delicate_slopes"]
+__all__ = ["DELICATE_SCRATCH", "delicate_chords", "delicate_neurons", "delicate_phase", "delicate_slopes"]
 
 f = np.float32
 # float64 lanes: chord middle and half chord vector in whitened space
@@ -109,6 +109,13 @@ def delicate_chords(S, X, bounds, y0, y1, tx, ty, n, p, depth_floor, with_mid, b
         if backward:
             for a in (PX, PY, PZ, TM, IA, UNCUT, HEIGHT, SLIDE, DH):
                 S[a + k] = f(0)
+
+
+@inline
+def delicate_phase(X, k, p, o):  # type: ignore[no-untyped-def]
+    """Phase at the chord's middle of the unit at ``o`` of a float64 row, reduced to half a turn."""
+    u = X[k + _Q0] * p[o + WX] + X[k + _Q1] * p[o + WY] + X[k + _Q2] * p[o + WZ] + p[o + PHASE]
+    return f(u - np.rint(u))
 
 
 @inline

@@ -11,6 +11,8 @@ Entries that agree in float32 keep the order of the centres, and so do all chord
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from neuprim.core.render.cpu.backward import opacity
@@ -27,7 +29,9 @@ from neuprim.core.render.cpu.layout import (
     GMID,
     GRAD,
     HALF,
+    LANES,
     MID,
+    NET_SCRATCH,
     NEURON_SCRATCH,
     NORM,
     PER_NEURON,
@@ -35,6 +39,7 @@ from neuprim.core.render.cpu.layout import (
     SLIDE,
     SLOPE,
     TILE,
+    TINT,
     UNCUT,
     UNIT,
     UX,
@@ -42,6 +47,7 @@ from neuprim.core.render.cpu.layout import (
 )
 from neuprim.core.render.cpu.neurons import field_values, field_with_slopes
 from neuprim.core.render.cpu.tiles import compact, row_spans
+from neuprim.core.render.cpu.tints import tint_gradient, tints
 
 __all__ = ["backward_tiles_by_entry", "composite_tiles_by_entry"]
 
@@ -91,11 +97,11 @@ def _room(first, end, ids, boxes, tx, ty):  # type: ignore[no-untyped-def]
 @inline
 def _list_hits(  # type: ignore[no-untyped-def]
     S, D, state, offset, bounds, rows_live, first, end, tx, ty, rows, wide, slots, spans, kinds, boxes, ids, limits, neurons,
-    hits, marks, starts_of,
+    hits, marks, starts_of, colors, net, waves, hues,
 ):  # fmt: skip
     """List the hits of a tile in the order of its pairs; those of pair r lie in ``starts_of[r] : starts_of[r + 1]``.
 
-    Returns (hits, evaluated lanes).
+    With a ``net`` their colours go to ``hues``. Returns (hits, evaluated lanes).
     """
     amin, amax, floor = limits[0], limits[1], limits[3]
     count, evaluated = 0, 0
@@ -110,6 +116,8 @@ def _list_hits(  # type: ignore[no-untyped-def]
         evaluated += n16
         field_values(S, D, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, False, True)
         opacity(S, n16, amin, amax)
+        if net is not None:
+            tints(S, D, waves, n16, i, net, slots, colors[i], False)
         anchor, unit = p[ANCHOR_Z], p[UNIT]
         for y in range(y0, y1):
             at = offset[y] - bounds[y]
@@ -121,6 +129,9 @@ def _list_hits(  # type: ignore[no-untyped-def]
                     hits[count, H_ALPHA], hits[count, H_SLOPE] = S[ALPHA + k], S[SLOPE + k]
                     hits[count, H_DEPTH] = anchor + unit * middle
                     marks[count, H_PIXEL], marks[count, H_LANE], marks[count, H_PAIR] = y * TILE + x, k, q - first
+                    if net is not None:
+                        for c in range(hues.shape[1]):
+                            hues[count, c] = max(S[TINT + c * LANES + k], f(0))
                     count += 1
     starts_of[end - first] = count
     return count, evaluated
@@ -159,14 +170,20 @@ def _sort_hits(count, hits, marks, begin, listing):  # type: ignore[no-untyped-d
 @kernel
 def composite_tiles_by_entry(  # type: ignore[no-untyped-def]
     start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, background, limits, with_depth, neurons,
-    rgb, transmittance, zsum, last,
+    rgb, transmittance, zsum, last, net,
 ):  # fmt: skip
     """As :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``last`` receives how many hits each pixel composited."""
     height, width = norms.shape
     across = (width + TILE - 1) // TILE
     C = colors.shape[1]
     tmin = limits[2]
-    S, D = np.zeros(BACKWARD_SCRATCH + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
+    scratch = BACKWARD_SCRATCH
+    waves: Any = None
+    hues: Any = None
+    if net is not None:
+        scratch = BACKWARD_SCRATCH + 2 * C * LANES
+        waves, hues = np.zeros((net.hidden, NET_SCRATCH), np.float32), np.empty((1, C), np.float32)
+    S, D = np.zeros(scratch + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
     state = np.zeros(NORM + PIXELS + 2 * TILE, np.float32)
     bounds, offset = np.zeros(2 * TILE, np.int32), np.zeros(TILE, np.int32)
     rows_live, color = np.zeros(TILE, np.float32), np.zeros(C, np.float32)
@@ -180,11 +197,13 @@ def composite_tiles_by_entry(  # type: ignore[no-untyped-def]
         room = _room(first, end, ids, boxes, tx, ty)
         if room > listing.shape[0]:
             hits, marks, listing = np.empty((room, H_FLOATS), np.float32), np.empty((room, H_INTS), np.int32), np.empty(room, np.int32)
+            if net is not None:
+                hues = np.empty((room, C), np.float32)
         if end - first >= starts_of.shape[0]:
             starts_of = np.empty(end - first + 1, np.int32)
         count, lanes = _list_hits(
             S, D, state, offset, bounds, rows_live, first, end, tx, ty, rows, wide, slots, spans, kinds, boxes, ids, limits, neurons,
-            hits, marks, starts_of,
+            hits, marks, starts_of, colors, net, waves, hues,
         )  # fmt: skip
         evaluated += lanes
         _sort_hits(count, hits, marks, begin, listing)
@@ -200,7 +219,7 @@ def composite_tiles_by_entry(  # type: ignore[no-untyped-def]
                     i = ids[first + marks[s, H_PAIR]]
                     weight = hits[s, H_ALPHA] * T
                     for c in range(C):
-                        color[c] += weight * colors[i, c]
+                        color[c] += weight * (colors[i, c] if net is None else hues[s, c])
                     z += weight * hits[s, H_DEPTH]
                     T -= weight
                     drawn += 1
@@ -216,7 +235,7 @@ def composite_tiles_by_entry(  # type: ignore[no-untyped-def]
 @kernel
 def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
     start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, limits, with_depth, neurons,
-    transmittance, last, g_rgb, g_transmittance, g_z, error, pair_rows,
+    transmittance, last, g_rgb, g_transmittance, g_z, error, pair_rows, net,
 ):  # fmt: skip
     """As :func:`~neuprim.core.render.cpu.backward.backward_tiles`. Composites anew, so ``transmittance`` and ``last`` are not read."""
     height, width = norms.shape
@@ -224,7 +243,13 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
     C = colors.shape[1]
     color_at = G_NEURONS + PER_NEURON * neurons
     tmin, floor = limits[2], limits[3]
-    S, D = np.zeros(BACKWARD_SCRATCH + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
+    scratch = BACKWARD_SCRATCH
+    waves: Any = None
+    hues: Any = None
+    if net is not None:
+        scratch = BACKWARD_SCRATCH + 2 * C * LANES
+        waves, hues = np.zeros((net.hidden, NET_SCRATCH), np.float32), np.empty((1, C), np.float32)
+    S, D = np.zeros(scratch + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
     V = np.zeros((neurons, NEURON_SCRATCH), np.float32)
     state = np.zeros(NORM + PIXELS + 2 * TILE, np.float32)
     bounds, offset = np.zeros(2 * TILE, np.int32), np.zeros(TILE, np.int32)
@@ -239,11 +264,13 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
         room = _room(first, end, ids, boxes, tx, ty)
         if room > listing.shape[0]:
             hits, marks, listing = np.empty((room, H_FLOATS), np.float32), np.empty((room, H_INTS), np.int32), np.empty(room, np.int32)
+            if net is not None:
+                hues = np.empty((room, C), np.float32)
         if end - first >= starts_of.shape[0]:
             starts_of = np.empty(end - first + 1, np.int32)
         count, lanes = _list_hits(
             S, D, state, offset, bounds, rows_live, first, end, tx, ty, rows, wide, slots, spans, kinds, boxes, ids, limits, neurons,
-            hits, marks, starts_of,
+            hits, marks, starts_of, colors, net, waves, hues,
         )  # fmt: skip
         evaluated += lanes
         _sort_hits(count, hits, marks, begin, listing)
@@ -267,7 +294,7 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
                     i = ids[first + marks[s, H_PAIR]]
                     cg = f(0)
                     for c in range(C):
-                        cg += colors[i, c] * g_rgb[Y, X, c]
+                        cg += (colors[i, c] if net is None else hues[s, c]) * g_rgb[Y, X, c]
                     if with_depth:
                         cg += g_z[Y, X] * hits[s, H_DEPTH]
                     hits[s, H_GRAD] = (hits[s, H_BEFORE] * cg - behind / (f(1) - hits[s, H_ALPHA])) * hits[s, H_SLOPE]
@@ -283,8 +310,9 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
                 Y, X = ty + j // TILE, tx + j % TILE
                 weight += w
                 wrong += w * error[Y, X]
-                for c in range(C):
-                    out[color_at + c] += w * g_rgb[Y, X, c]
+                if net is None:
+                    for c in range(C):
+                        out[color_at + c] += w * g_rgb[Y, X, c]
             if weight == f(0):
                 continue  # hidden or below the cut everywhere: every gradient is zero
             out[G_WEIGHT], out[G_ERROR] = weight, wrong
@@ -294,13 +322,24 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
             field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor)
             for k in range(n16):
                 S[GRAD + k], S[GMID + k] = f(0), f(0)
+            if net is not None:
+                tints(S, D, waves, n16, i, net, slots, colors[i], True)
+                for c in range(C, 2 * C):
+                    for k in range(n16):
+                        S[TINT + c * LANES + k] = f(0)
             for s in range(starts_of[q - first], starts_of[q - first + 1]):
                 k, j = marks[s, H_LANE], marks[s, H_PIXEL]
                 S[GRAD + k] = hits[s, H_GRAD]
+                if net is not None:
+                    for c in range(C):
+                        if S[TINT + c * LANES + k] >= f(0):
+                            S[TINT + (C + c) * LANES + k] = hits[s, H_WEIGHT] * g_rgb[ty + j // TILE, tx + j % TILE, c]
                 if with_depth:
                     S[GMID + k] = hits[s, H_WEIGHT] * g_z[ty + j // TILE, tx + j % TILE] * p[UNIT]
             field_gradient(S, n16, out)
             for m in range(0, neurons, 2):
                 two_neurons(S, V[m], V[m + 1], n16, p, m, out)
+            if net is not None:
+                tint_gradient(S, waves, n16, i, net, C, out, color_at)
             chord_gradient(S, n16, p, out)
     return evaluated

@@ -9,12 +9,15 @@ from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH
 from neuprim.core.render.cpu.layout import (
     ALPHA,
     ANCHOR_Z,
+    BACKWARD_SCRATCH,
     COLOR,
     FIELD,
     FORWARD_SCRATCH,
     HALF,
+    LANES,
     LAST,
     MID,
+    NET_SCRATCH,
     NORM,
     NORM_L,
     PIXELS,
@@ -27,6 +30,7 @@ from neuprim.core.render.cpu.layout import (
 )
 from neuprim.core.render.cpu.neurons import field_values
 from neuprim.core.render.cpu.tiles import compact, row_spans
+from neuprim.core.render.cpu.tints import add_tints, composite_rgb_tints, tints
 from neuprim.core.render.cpu.turns import one_minus_exp
 
 __all__ = ["composite_tiles"]
@@ -80,19 +84,24 @@ def _composite_row(st, lanes, w, a, b, tmin, rank):  # type: ignore[no-untyped-d
 @kernel
 def composite_tiles(  # type: ignore[no-untyped-def]
     start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, background, limits, with_depth, neurons,
-    rgb, transmittance, zsum, last,
+    rgb, transmittance, zsum, last, net,
 ):  # fmt: skip
     """Draw tiles ``start:stop``; returns the number of evaluated lanes.
 
     limits = (alpha_min, alpha_max, transmittance_min, depth_floor), all float32. ``norms`` (H, W) is the length of the
     pixel's ray direction whose camera-z is 1. Where ``slots[i]`` is not -1, primitive i is drawn in float64 from that row of
-    ``wide``. ``last`` receives the rank + 1 of each pixel's last contributor.
+    ``wide``. ``last`` receives the rank + 1 of each pixel's last contributor. ``net`` is None where ``colors`` is all there is to a
+    colour, which leaves no trace of it in the compiled kernel, or the :class:`~neuprim.core.render.cpu.colour_net.Net` on that base.
     """
     height, width = norms.shape
     across = (width + TILE - 1) // TILE
     C = colors.shape[1]
     amin, amax, tmin, floor = limits[0], limits[1], limits[2], limits[3]
-    S, D = np.zeros(FORWARD_SCRATCH + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
+    scratch = FORWARD_SCRATCH
+    if net is not None:
+        scratch = BACKWARD_SCRATCH + 2 * C * LANES
+        waves = np.zeros((net.hidden, NET_SCRATCH), np.float32)
+    S, D = np.zeros(scratch + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
     state = np.zeros((4 + C) * PIXELS + 2 * TILE, np.float32)
     w = np.zeros(TILE, np.float32)
     bounds, offset = np.zeros(2 * TILE, np.int32), np.zeros(TILE, np.int32)
@@ -121,19 +130,29 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                 evaluated += n16
                 field_values(S, D, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, with_depth, False)
                 _opacity(S, n16, amin, amax)
+                if net is not None:
+                    tints(S, D, waves, n16, i, net, slots, colors[i], False)
                 rank = f(q - starts[t] + 1)
                 for y in range(y0, y1):
                     a, b = bounds[y], bounds[y + TILE]
                     if b > a:
                         at = offset[y] - a  # the row's lanes start at offset[y], its pixels at a: shift so that both run with k
                         if C == 3 and not with_depth:
-                            _composite_rgb_row(state, S, y * TILE, ALPHA + at, a, b, tmin, rank, colors[i, 0], colors[i, 1], colors[i, 2])
+                            if net is None:
+                                _composite_rgb_row(
+                                    state, S, y * TILE, ALPHA + at, a, b, tmin, rank, colors[i, 0], colors[i, 1], colors[i, 2]
+                                )
+                            else:
+                                composite_rgb_tints(state, S, y * TILE, at, a, b, tmin, rank)
                         else:
                             _composite_row(state[y * TILE :], S[ALPHA + at :], w, a, b, tmin, rank)
-                            for c in range(C):
-                                st, color = state[COLOR + c * PIXELS + y * TILE :], colors[i, c]
-                                for k in range(TILE):
-                                    st[k] += w[k] * color
+                            if net is None:
+                                for c in range(C):
+                                    st, color = state[COLOR + c * PIXELS + y * TILE :], colors[i, c]
+                                    for k in range(TILE):
+                                        st[k] += w[k] * color
+                            else:
+                                add_tints(state, S, y * TILE, at, w, C)
                             if with_depth:
                                 st = state[ZSUM + y * TILE :]
                                 for k in range(a, b):

@@ -6,7 +6,7 @@ at constant offsets are what lets LLVM vectorise them; the names keep them reada
 
 from __future__ import annotations
 
-__all__ = ["gradient_width", "lane", "row_width"]
+__all__ = ["gradient_width", "lane", "net_row_width", "row_width"]
 
 # ---- one primitive, as a pixel kernel sees it (method: "float64 preparation, float32 pixels").
 # The ray of pixel offset (du, dv) from the anchor pixel (UX, UY) is, in whitened space with t in units of m,
@@ -25,6 +25,9 @@ NEURONS = 27  # then five numbers per neuron:
 WX, WY, WZ, PHASE, AMPLITUDE = 0, 1, 2, 3, 4  # W1 on whitened axes and b1 in turns, w2
 PER_NEURON = 5
 
+# ---- one primitive's colour network: per unit WX, WY, WZ, PHASE as above, then C output weights
+NET_OUT = 4
+
 # How fast a pair of neurons may turn over a half chord, in turns; neurons are stored by rising rate, so that pairs are alike.
 SLOW, MEDIUM, FAST = 0, 1, 2
 SLOW_TURNS, MEDIUM_TURNS = 0.4999, 1.4999
@@ -33,7 +36,7 @@ SLOW_TURNS, MEDIUM_TURNS = 0.4999, 1.4999
 G_OFFSET = 12
 G_LOG_M = 13  # sum of dL/dI I: the explicit 1/m of the density
 G_WEIGHT, G_ERROR = 14, 15  # sums of alpha T and alpha T x pixel error: statistics, not gradients
-G_NEURONS = 16  # five per neuron, then C colours
+G_NEURONS = 16  # five per neuron, then C colours, then the units of a colour network
 
 # ---- row spans of a primitive's silhouette, relative to its anchor pixel
 SKEW, XC, YC, HX, HY = 0, 1, 2, 3, 4
@@ -53,9 +56,14 @@ def row_width(neurons: int) -> int:
     return _padded(NEURONS + PER_NEURON * neurons)
 
 
-def gradient_width(neurons: int, channels: int) -> int:
-    """Floats per gradient row for K padded neurons and C colours, a multiple of 16."""
-    return _padded(G_NEURONS + PER_NEURON * neurons + channels)
+def net_row_width(hidden: int, channels: int) -> int:
+    """Floats per row of a colour network of H padded units, at least one."""
+    return max((NET_OUT + channels) * hidden, 1)
+
+
+def gradient_width(neurons: int, channels: int, hidden: int = 0) -> int:
+    """Floats per gradient row for K padded neurons, C colours and H padded units of a colour network, a multiple of 16."""
+    return _padded(G_NEURONS + PER_NEURON * neurons + channels + (NET_OUT + channels) * hidden)
 
 
 def lane(index: int) -> int:
@@ -86,9 +94,14 @@ HEIGHT = lane(31)  # half chord before the near plane cuts it
 SLIDE = lane(32)  # s: MID and TM are measured from a ray origin slid by this much
 FORWARD_SCRATCH = lane(20)
 BACKWARD_SCRATCH = lane(33)
+# with a colour network also, forward and backward: C arrays of colours before max(0, .), then C of dL/d those
+TINT = BACKWARD_SCRATCH
 # per neuron in the backward pass: cos sinc, -2 pi sin sinc, cos dsinc
 N_COS, N_SIN, N_DSINC = lane(0), lane(1), lane(2)
 NEURON_SCRATCH = lane(3)
+# per unit of a colour network: cos of its phase, and -2 pi sin, its derivative by turns
+NET_COS, NET_SIN = lane(0), lane(1)
+NET_SCRATCH = lane(2)
 
 # ---- per-tile pixel state
 PIXELS = TILE * TILE

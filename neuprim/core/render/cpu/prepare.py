@@ -52,7 +52,17 @@ from neuprim.core.render.cpu.layout import (
     YC,
 )  # fmt: skip
 
-__all__ = ["CULLED", "NON_FINITE", "VISIBLE", "prepare", "prepare_backward", "prepare_wide"]
+__all__ = [
+    "CULLED",
+    "DELICATE_TURNS",
+    "NON_FINITE",
+    "VISIBLE",
+    "prepare",
+    "prepare_backward",
+    "prepare_wide",
+    "rotation",
+    "rotation_backward",
+]
 
 VISIBLE, CULLED, NON_FINITE = 0, 1, 2
 _FLOAT32_MAX = 3.0e38
@@ -60,7 +70,7 @@ _FLOAT32_MAX = 3.0e38
 # Where the pixel stage leaves float32 (bounds found with benchmarks/numerics.py).
 _DELICATE_RADII = 8.0  # terms of a point on the ray this many radii of the thinnest axis long: they cancel
 _DELICATE_ANCHOR = 1.25  # the same of the centre seen from an anchor at the camera: most cameras outside, but near
-_DELICATE_TURNS = 4.0  # of a neuron over half a chord
+DELICATE_TURNS = 4.0  # of a neuron, or a unit of a colour network, over half a chord
 _DELICATE_PIXELS = 16384.0  # from the corner of the image to the anchor
 _DELICATE_RATIO = 256.0  # of the axes; for the gradients
 _DELICATE_RATIO_NEAR = 16.0  # of the axes of a primitive anchored at the camera, which its chords pass closely
@@ -69,7 +79,7 @@ strict = njit(error_model="numpy", forceinline=True)
 
 
 @strict
-def _rotation(q, out):  # type: ignore[no-untyped-def]
+def rotation(q, out):  # type: ignore[no-untyped-def]
     w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])  # float32 squares would scale the rotation
     n = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * n, x * n, y * n, z * n
@@ -86,7 +96,7 @@ def _rotation(q, out):  # type: ignore[no-untyped-def]
 
 
 @strict
-def _rotation_backward(q, n, g, out):  # type: ignore[no-untyped-def]
+def rotation_backward(q, n, g, out):  # type: ignore[no-untyped-def]
     """dL/dq from dL/dR; the normalisation projects out the radial part."""
     w, x, y, z = q[0] * n, q[1] * n, q[2] * n, q[3] * n
     gw = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
@@ -118,7 +128,7 @@ def _frame(mean, log_scale, quat, R, t, cam, near, local, B, axes, c, anchor):  
 
     The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same number.
     """
-    n = _rotation(quat, local)
+    n = rotation(quat, local)
     top = max(np.float64(log_scale[0]), np.float64(log_scale[1]), np.float64(log_scale[2]))
     m = np.exp(top)
     for i in range(3):
@@ -218,7 +228,7 @@ def prepare(  # type: ignore[no-untyped-def]
         for j in range(row.shape[0]):
             rows[i, j] = row[j]
         tc = row[TC]
-        delicate[i] = (K > 0 and rate[K - 1] > _DELICATE_TURNS) or max(abs(row[UX]), abs(row[UY])) > _DELICATE_PIXELS
+        delicate[i] = (K > 0 and rate[K - 1] > DELICATE_TURNS) or max(abs(row[UX]), abs(row[UY])) > _DELICATE_PIXELS
         delicate[i] |= _dot(xa, xa) > _DELICATE_ANCHOR**2  # centre far from the anchor, in the thinnest axis
         thinnest = min(axes[0], axes[1], axes[2])
         delicate[i] |= thinnest * (_DELICATE_RATIO_NEAR if tc == 0.0 else _DELICATE_RATIO) < 1.0
@@ -356,7 +366,7 @@ def prepare_backward(  # type: ignore[no-untyped-def]
                 gL[a, j] += R[0, a] * gB[0, j] + R[1, a] * gB[1, j] + R[2, a] * gB[2, j]
         for j in range(4):
             q[j] = quats[i, j]
-        _rotation_backward(q, inverse, gL, gq)
+        rotation_backward(q, inverse, gL, gq)
         for j in range(4):
             g_quats[i, j] = gq[j]
         if want_view:

@@ -26,7 +26,8 @@ def lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tuple[Array, Ar
     half: Array = eye + light
     half /= np.sqrt(np.maximum(dot(half, half), np.float32(1e-12)))[:, None]
     exponent = 6 + 110 * hits.gloss**2
-    return cosine, hits.specular * hits.gloss * (exponent + 8) / 8 * np.maximum(dot(hits.normal, half), 0) ** exponent
+    highlight = hits.specular * hits.gloss * (exponent + 8) / 8 * np.maximum(dot(hits.normal, half), 0) ** exponent
+    return cosine, highlight.astype(np.float32, copy=False)
 
 
 def reflected(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> Array:

@@ -27,10 +27,11 @@ def scores(rendered: Tensor, truth: Tensor) -> dict[str, float]:
     Args:
         rendered, truth: (H, W, 3) linear light over the exposure.
     """
-    linear = [x.clamp(0.0, 1.0) for x in (rendered, truth)]
-    shown = [linear_to_srgb(x) for x in linear]
-    result = {"psnr_linear_clamped": psnr(*linear), "psnr_display": psnr(*shown), "ssim_display": ssim(*shown)}
-    return result | ({"flip": flip(*shown)} if flip_available() else {})
+    first, second = rendered.clamp(0.0, 1.0), truth.clamp(0.0, 1.0)
+    result = {"psnr_linear_clamped": psnr(first, second)}
+    first, second = linear_to_srgb(first), linear_to_srgb(second)
+    result |= {"psnr_display": psnr(first, second), "ssim_display": ssim(first, second)}
+    return result | ({"flip": flip(first, second)} if flip_available() else {})
 
 
 def class_errors(rendered: Tensor, truth: Tensor, classes: Tensor) -> dict[str, float]:

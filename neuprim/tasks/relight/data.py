@@ -7,6 +7,7 @@ its radiant intensity per colour as the files give it, 1 where they do not.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
@@ -56,7 +57,10 @@ class PointLit(PosedImages):
 
     def judge(self, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
         """See :func:`neuprim.tasks.relight.measure.scores`."""
-        return scores(rendered, truth)
+        return self._judged(index, rendered, truth, structure=True)
+
+    def _judged(self, index: int, rendered: Tensor, truth: Tensor, structure: bool) -> dict[str, float]:
+        return scores(rendered, truth, structure)
 
     def diagnose(self, model: Primitives) -> dict[str, Any]:
         """How light is measured here, and how good a black image would be."""
@@ -64,9 +68,16 @@ class PointLit(PosedImages):
         return result if flip_available() else {**result, "flip_missing": "pip install 'neuprim[flip]'"}
 
     def baselines(self) -> dict[str, dict[str, Any]]:
-        """Means over the test views of what images that need no model score, by name."""
-        truths = [self.test.pixels(i).over(self.background) for i in range(len(self.test))]
-        return {"black": means([self.judge(i, torch.zeros_like(t), t) for i, t in enumerate(truths)])}
+        """Means over the test views of what images that need no model score, by name; SSIM and FLIP are left out, which take long."""
+        return {"black": self.guessed(lambda i, truth: torch.zeros_like(truth))}
+
+    def guessed(self, guess: Callable[[int, Tensor], Tensor]) -> dict[str, Any]:
+        """Means over the test views of what ``guess(index, truth)``, an (H, W, 3) image, scores."""
+        entries = []
+        for i in range(len(self.test)):
+            truth = self.test.pixels(i).over(self.background)
+            entries.append(self._judged(i, guess(i, truth), truth, structure=False))
+        return means(entries)
 
     def orbit(self, frames: int) -> list[View]:
         """Views circling the scene while the light circles it the other way, once, at its mean distance and height."""

@@ -21,17 +21,22 @@ CLASSES = ("background", "lit", "cast_shadow", "attached_shadow", "highlight")
 """Names of the values 0 to 4 of a map of pixel classes."""
 
 
-def scores(rendered: Tensor, truth: Tensor) -> dict[str, float]:
+def scores(rendered: Tensor, truth: Tensor, structure: bool = True) -> dict[str, float]:
     """``psnr_linear_clamped``, ``psnr_display``, ``ssim_display`` and, where its package is installed, ``flip``.
 
     Args:
         rendered, truth: (H, W, 3) linear light over the exposure.
+        structure: measure the last two as well, which take longest.
     """
     first, second = rendered.clamp(0.0, 1.0), truth.clamp(0.0, 1.0)
     result = {"psnr_linear_clamped": psnr(first, second)}
     first, second = linear_to_srgb(first), linear_to_srgb(second)
-    result |= {"psnr_display": psnr(first, second), "ssim_display": ssim(first, second)}
-    return result | ({"flip": flip(first, second)} if flip_available() else {})
+    result["psnr_display"] = psnr(first, second)
+    if structure:
+        result["ssim_display"] = ssim(first, second)
+        if flip_available():
+            result["flip"] = flip(first, second)
+    return result
 
 
 def class_errors(rendered: Tensor, truth: Tensor, classes: Tensor) -> dict[str, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ from neuprim.core.data import Clip
 from neuprim.core.datasets.views import ImageViews
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.images import read_image
-from neuprim.core.metrics import means
 from neuprim.core.primitives import Primitives
 from neuprim.core.task import SceneContext
 from neuprim.tasks.relight import olat
@@ -80,9 +79,9 @@ class LitSolids(PointLit):
         """(H, W, 3) a test view under the nearest of the first 25 training lights, linear light over the exposure."""
         return self._companion(index, "nearest.exr")
 
-    def judge(self, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
+    def _judged(self, index: int, rendered: Tensor, truth: Tensor, structure: bool) -> dict[str, float]:
         """Beside the scores, the errors of each pixel class, and the PSNR again under the name of the view's part of the test split."""
-        result = scores(rendered, truth)
+        result = scores(rendered, truth, structure)
         part = next((p for p in PARTS if self.test.view(index).name.startswith(p)), None)
         if part is not None:
             result[f"psnr_linear_clamped_{part}"] = result["psnr_linear_clamped"]
@@ -95,12 +94,9 @@ class LitSolids(PointLit):
 
     def baselines(self) -> dict[str, dict[str, Any]]:
         """Black; the nearest of 25 training lights at the same camera; perfect shading without cast shadows."""
-        guesses: dict[str, Callable[[int], Tensor]] = {"no_cast_shadows": self.unshadowed}
+        result = super().baselines() | {"no_cast_shadows": self.guessed(lambda i, _: self.unshadowed(i))}
         if _beside(self.test.file(0), "nearest.exr").is_file():  # not where training views are held out
-            guesses[f"nearest_light_of_{NEAR_LIGHTS}"] = self.nearest_light
-        result = super().baselines()
-        for name, guess in guesses.items():
-            result[name] = means([self.judge(i, guess(i), self.test.pixels(i).rgb) for i in range(len(self.test))])
+            result[f"nearest_light_of_{NEAR_LIGHTS}"] = self.guessed(lambda i, _: self.nearest_light(i))
         return result
 
     def clips(self) -> list[Clip]:

@@ -7,7 +7,6 @@ camera ever sees of a volume), the error there counts on its own: a black backgr
 
 from __future__ import annotations
 
-import math
 import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +21,7 @@ import neuprim
 from neuprim.config import RunConfig
 from neuprim.core import images
 from neuprim.core.data import Dataset, View
-from neuprim.core.metrics import psnr, ssim, to_json
+from neuprim.core.metrics import means, psnr, ssim, to_json
 from neuprim.core.primitives import Primitives
 from neuprim.core.render import RenderSettings, choose_backend, render
 
@@ -37,7 +36,8 @@ class ViewMetrics:
         psnr, ssim: in the data set's colour space.
         seconds: of the forward pass alone.
         more: further numbers by name: ``psnr_srgb``, ``ssim_srgb`` of linear images; ``psnr_mask`` and ``mse_mask`` inside the
-            data set's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without anything on it.
+            data set's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without anything on it; what
+            :meth:`~neuprim.core.data.Dataset.judge` adds.
     """
 
     name: str
@@ -82,7 +82,7 @@ def measure(
         seconds = time.perf_counter() - start
         if pixels.mask is not None:
             rendered = torch.where(pixels.mask[..., None], rendered, truth)
-        more = _more(rendered, truth, dataset, dataset.mask(i), pixels.mask)
+        more = _more(rendered, truth, dataset, dataset.mask(i), pixels.mask) | dataset.judge(i, rendered, truth)
         result.append(ViewMetrics(view.name, psnr(rendered, truth, pixels.mask), ssim(rendered, truth), seconds, more))
         if seen is not None:
             seen(i, view, rendered, truth)
@@ -156,21 +156,13 @@ def _entry(view: ViewMetrics) -> dict[str, Any]:
 
 
 def _means(views: Sequence[ViewMetrics]) -> dict[str, Any]:
-    """Means over views of the further numbers, and the PSNR of the mean squared error inside the mask ("pooled")."""
-    result: dict[str, Any] = {}
-    for name in sorted({key for v in views for key in v.more}):
-        values = [v.more[name] for v in views if name in v.more]
-        if name == "mse_mask":
-            error = float(np.mean(values))
-            result |= to_json("psnr_pooled_mask", -10.0 * math.log10(error) if error > 0 else math.inf)
-        else:
-            result |= to_json(name, float(np.mean(values)))
-    return result
+    """Means over views of the further numbers, and PSNRs of mean squared errors ("pooled"); see ``Dataset.judge``."""
+    return means([v.more for v in views])
 
 
 def _per_frame(dataset: Dataset, views: Sequence[ViewMetrics]) -> dict[str, Any]:
     """Means over the clips of each of their frames, for data sets that have clips of one length."""
-    clips = [[views[i] for i in clip.views] for clip in dataset.clips()]
+    clips = [[views[i] for i in clip.views] for clip in dataset.clips() if clip.source is None]
     if not clips or len({len(c) for c in clips}) != 1:
         return {}
     frames = []

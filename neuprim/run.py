@@ -18,7 +18,7 @@ from rich.console import Console
 
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint, images
-from neuprim.core.data import Dataset, View
+from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.errors import CheckpointError, DataError
 from neuprim.core.files import write_json, write_text
 from neuprim.core.primitives import Primitives
@@ -148,16 +148,20 @@ def _finish(trainer: Trainer, config: RunConfig, dataset: Dataset, directory: Pa
     folder = directory / "renders"
     folder.mkdir(exist_ok=True)
 
-    reels = {i: clip for clip in dataset.clips() for i in clip.views}
+    clips = dataset.clips()
+    reels = {i: clip for clip in clips if clip.source is None for i in clip.views}
     pictures: list[torch.Tensor] = []
+
+    def film(clip: Clip, index: int, rendered: torch.Tensor, truth: torch.Tensor) -> None:
+        pictures.append(images.to_uint8(torch.cat([display(x, dataset.color_space) for x in (truth, rendered)], dim=1)))
+        if index == clip.views[-1]:
+            images.write_animation(folder / f"clip_{clip.name}.webp", pictures, clip.fps)
+            pictures.clear()
 
     def keep(index: int, view: View, rendered: torch.Tensor, truth: torch.Tensor) -> None:
         clip = reels.get(index)
         if clip is not None:
-            pictures.append(images.to_uint8(torch.cat([display(x, dataset.color_space) for x in (truth, rendered)], dim=1)))
-            if index == clip.views[-1]:
-                images.write_animation(folder / f"clip_{clip.name}.webp", pictures, clip.fps)
-                pictures.clear()
+            film(clip, index, rendered, truth)
         if index in shown:
             stem = f"test_{index:03d}_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in view.name)
             images.write_png(folder / f"{stem}.png", display(rendered, dataset.color_space))
@@ -165,6 +169,12 @@ def _finish(trainer: Trainer, config: RunConfig, dataset: Dataset, directory: Pa
             images.write_png(folder / f"{stem}_error.png", torch.from_numpy(error_map(rendered, truth)))
 
     views = measure(model, dataset, config.renderer, keep)
+    for clip in clips:
+        if clip.source is None:
+            continue  # drawn above
+        for i in clip.views:
+            truth = clip.source.pixels(i).over(dataset.background)
+            film(clip, i, draw(model, clip.source.view(i), config.renderer, dataset.background), truth)
     size = (directory / "model.safetensors").stat().st_size
     training = {"iterations": trainer.step, "train_seconds": trainer.elapsed}
     write_json(directory / "metrics.json", summary(config, model, dataset, views, size, training))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import subprocess
 import sys
@@ -20,6 +21,8 @@ from torch import Tensor
 import neuprim.run as running
 from neuprim.config import RunConfig, compose
 from neuprim.core import checkpoint
+from neuprim.core.data import Clip
+from neuprim.core.datasets.common import PosedImages
 from neuprim.core.errors import CheckpointError, DataError, NonFiniteError
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.evaluate import evaluate_run, read_metrics, render_run
@@ -126,6 +129,24 @@ def test_curve(whole: Path) -> None:
     assert any("moved" in line.get("change", "") for line in lines)
     assert lines[-1]["eval_psnr"] > lines[0]["psnr"] + 3
     assert lines[-1]["eval_psnr"] == pytest.approx(read_metrics(whole)["psnr"], abs=1e-3)
+
+
+def test_a_data_set_may_judge_views_and_keep_films_beside_them(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def judge(dataset: PosedImages, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
+        return {"index": float(index), "mse_part": 0.1 if index else 0.2, "pixels_part": 3.0 if index == 0 else 1.0}
+
+    monkeypatch.setattr(PosedImages, "judge", judge)
+    monkeypatch.setattr(PosedImages, "clips", lambda dataset: [Clip("round", [2, 0, 1], 10.0, dataset.train)])
+    out = fit(words(scene, tmp_path / "film", 20))
+    metrics = read_metrics(out)
+    count = len(metrics["per_view"])
+    assert metrics["index"] == (count - 1) / 2 and [v["index"] for v in metrics["per_view"]] == list(range(count))
+    pooled = (3 * 0.2 + (count - 1) * 0.1) / (3 + count - 1)
+    assert metrics["psnr_pooled_part"] == pytest.approx(-10 * math.log10(pooled)) and metrics["pixels_part"] == 3 + count - 1
+    assert "per_frame" not in metrics
+    with Image.open(out / "renders" / "clip_round.webp") as film:
+        assert getattr(film, "n_frames", 1) == 3 and film.width == 2 * film.height
+    assert evaluate_run(out)["index"] == metrics["index"]
 
 
 def test_the_configuration_reads_back(whole: Path, scene: Path) -> None:

@@ -94,11 +94,17 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Clip:
-    """Test views that make a film in their order (one camera over time, a light going round)."""
+    """Views that make a film in their order (one camera over time, a light going round).
+
+    Attributes:
+        views: indices into the test split, or into ``source``.
+        source: views beside the test split, which do not count in its means; None: the test split.
+    """
 
     name: str
     views: Sequence[int]
     fps: float = 12.0
+    source: ViewSet | None = None
 
 
 class Dataset(ABC):
@@ -150,12 +156,24 @@ class Dataset(ABC):
         return PointCloud(means, torch.full((count, self.channels), 0.5))
 
     def clips(self) -> list[Clip]:
-        """Films to make of the test views; none by default."""
+        """Films to make of the test views, or of views kept for films; none by default."""
         return []
 
     def mask(self, index: int) -> Tensor | None:
         """(H, W) bool, the part of a test view whose error is worth reporting on its own; None: no such part."""
         return None
+
+    def judge(self, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
+        """Further numbers of one test view, by name, which ``metrics.json`` gives per view and as means over the views that have them.
+
+        Means are plain, but ``mse_NAME`` becomes ``psnr_pooled_NAME``, the PSNR of the mean over views, each of which counts by its
+        ``pixels_NAME`` where it says so; ``pixels_NAME`` becomes a sum.
+
+        Args:
+            index: of the test split.
+            rendered, truth: (H, W, C) in the data set's colour space, over its background.
+        """
+        return {}
 
     def diagnose(self, model: Primitives) -> dict[str, Any]:
         """Further JSON-able numbers for ``metrics.json`` that only this kind of data can tell."""

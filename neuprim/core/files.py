@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-__all__ = ["atomic_path", "cache_directory", "write_json", "write_text"]
+__all__ = ["atomic_path", "cache_directory", "publish_folder", "write_json", "write_text"]
 
 
 def cache_directory() -> Path:
@@ -44,6 +45,36 @@ def atomic_path(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def publish_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
+    """Have ``write`` fill a folder that gets the name ``final`` only when it is done, unless a complete one is there.
+
+    An interrupted run leaves nothing behind. Of several processes at once the first one wins, so all must write the same files.
+
+    Args:
+        write: fills the empty folder that it is given.
+        complete: whether nothing is missing from a folder; what lies at ``final`` and is not complete is deleted.
+
+    Raises:
+        OSError: the folder's place cannot be written.
+    """
+    if complete(final):
+        return
+    final.parent.mkdir(parents=True, exist_ok=True)
+    draft = Path(tempfile.mkdtemp(prefix=f".{final.name}-", dir=final.parent))
+    try:
+        draft.chmod(0o755)  # mkdtemp's 0700 would hide a shared cache from its other users
+        write(draft)
+        if final.exists() and not complete(final):
+            shutil.rmtree(final)  # somebody deleted part of it
+        try:
+            draft.rename(final)
+        except OSError:
+            if not complete(final):
+                raise
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -10,15 +10,17 @@ A render equal to its truth has an infinite PSNR, for which JSON has no number. 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
+import numpy as np
 import torch
 from kornia.metrics import ssim as ssim_map
 from torch import Tensor
 
 from neuprim.core.errors import DataError, NonFiniteError
 
-__all__ = ["SSIM_SIGMA", "SSIM_WINDOW", "from_json", "matched", "psnr", "ssim", "to_json"]
+__all__ = ["SSIM_SIGMA", "SSIM_WINDOW", "from_json", "matched", "means", "psnr", "ssim", "to_json"]
 
 SSIM_WINDOW = 11
 """Taps of the Gaussian window per axis (Wang et al. 2004)."""
@@ -99,6 +101,22 @@ def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
 def to_json(key: str, value: float) -> dict[str, float | bool | None]:
     """The entries that hold ``value`` under ``key`` in a JSON file: infinity becomes ``null`` and ``<key>_infinite: true``."""
     return {key: None, f"{key}_infinite": True} if value == math.inf else {key: value}
+
+
+def means(views: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    """JSON-able means of numbers by name over the views that have them, by the rules of ``Dataset.judge``."""
+    result: dict[str, Any] = {}
+    for name in sorted({key for v in views for key in v}):
+        having = [v for v in views if name in v]
+        values, (kind, _, part) = [v[name] for v in having], name.partition("_")
+        if kind == "mse":
+            error = float(np.average(values, weights=[v.get(f"pixels_{part}", 1.0) for v in having]))
+            result |= to_json(f"psnr_pooled_{part}", -10.0 * math.log10(error) if error > 0 else math.inf)
+        elif kind == "pixels":
+            result[name] = int(sum(values))
+        else:
+            result |= to_json(name, float(np.mean(values)))
+    return result
 
 
 def from_json(entries: Mapping[str, object], key: str) -> float | None:

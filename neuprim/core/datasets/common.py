@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -22,6 +22,8 @@ __all__ = ["IMAGE_SUFFIXES", "PosedImages", "StartingPoints", "every_nth", "find
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG", ".EXR")
 _LISTED = 10
+
+Made = TypeVar("Made", bound="PosedImages")
 
 StartingPoints = Callable[[ViewSet, int, torch.Generator], PointCloud]
 """(training views, count, generator) -> at most ``count`` distinct starting points."""
@@ -73,6 +75,9 @@ def every_nth(frames: Sequence[Frame], n: int) -> tuple[list[Frame], list[Frame]
 class PosedImages(Dataset):
     """Image files with poses, and a rule for starting points."""
 
+    train: ImageViews
+    test: ImageViews
+
     def __init__(
         self,
         name: str,
@@ -116,7 +121,9 @@ def posed_images(
     points: PointCloud | None = None,
     prefix: str = "",
     start: StartingPoints | None = None,
-) -> PosedImages:
+    to_linear: bool = False,
+    kind: type[Made] = PosedImages,  # type: ignore[assignment]
+) -> Made:
     """The data set of two splits.
 
     Args:
@@ -127,6 +134,8 @@ def posed_images(
         prefix: reduction already in the files, e.g. "images_4".
         start: another rule for starting points; None takes ``points``, else the visual hull of the alpha masks, else a box in
             front of the cameras, which suits scenes at rest (:func:`neuprim.core.datasets.initial.initial_points`).
+        to_linear: turn sRGB files into linear light.
+        kind: the class to make.
 
     Raises:
         DataError: an empty split, an image without alpha beside one with, sRGB beside linear files, or damaged images.
@@ -150,15 +159,15 @@ def posed_images(
     if background == "random" and not alpha:
         raise ConfigError(f"scene.background is 'random', but the images in {where} have no alpha; expected auto, white or black")
     factor = settings["downsample"]
-    views = [ImageViews(frames, factor) for frames in (train, test)]
+    views = [ImageViews(frames, factor, to_linear=to_linear) for frames in (train, test)]
     if settings["preload"]:
         for split, images in zip(("training", "test"), views, strict=True):
             images.preload(lambda fraction, split=split: context.progress(f"reading {split} images", fraction))  # type: ignore[misc]
-    return PosedImages(
+    return kind(
         name=name,
         train=views[0],
         test=views[1],
-        linear=both[0].info.linear,
+        linear=to_linear or both[0].info.linear,
         background=torch.full((3,), 0.0 if background == "black" else 1.0),
         random_background=background == "random",
         downsampling=", then ".join(t for t in (prefix, _reduction(both, views[0].view(0).camera, factor)) if t) or "none",

@@ -94,6 +94,21 @@ class Record:
             raise DataError(f"{self.where}: {key}[3] is {rows[3]}; expected 0 0 0 1")
         return torch.tensor([*numbers[:3], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
 
+    def array(self, key: str, shape: tuple[int, ...], expected: str) -> Tensor:
+        """(n,) or (rows, columns) float64 of nested lists of exactly that shape, all finite numbers."""
+
+        def read(value: Any, shape: tuple[int, ...], place: str) -> Any:
+            if not shape:
+                number = _finite(value)
+                if number is None:
+                    raise DataError(f"{self.where}: {key}{place} is {_found(value)}; expected a finite number")
+                return number
+            if not isinstance(value, list) or len(value) != shape[0]:
+                raise self.fail(key, expected)
+            return [read(item, shape[1:], f"{place}[{i}]") for i, item in enumerate(value)]
+
+        return torch.tensor(read(self.values.get(key), shape, ""), dtype=torch.float64)
+
     def objects(self, key: str) -> Iterator[Record]:
         """The records of a non-empty list of objects."""
         value = self.values.get(key)

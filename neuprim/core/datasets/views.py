@@ -18,13 +18,14 @@ from neuprim.core.data import Pixels, View, ViewSet
 from neuprim.core.datasets.distortion import Distortion, resample, source_grid
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.fields import Conditions
-from neuprim.core.images import ImageInfo, read_image, read_mask
+from neuprim.core.images import ImageInfo, read_image, read_mask, srgb_to_linear
 from neuprim.core.render.cpu.compile import exact_kernel
 
 __all__ = ["Frame", "ImageViews", "SomeViews"]
 
 _CACHE_BYTES = 2 * 2**30
 _GRIDS = 4
+_LINEAR = srgb_to_linear(torch.arange(256) / 255.0)
 
 
 @dataclass(frozen=True)
@@ -84,13 +85,19 @@ class ImageViews(ViewSet):
     Args:
         frames: of one split; sizes may differ.
         downsample: whole factor; left-over pixels at the right and bottom edges are cut off first.
+        to_linear: turn sRGB files into linear light, before they are premultiplied or averaged.
+
+    Attributes:
+        scale: multiplies the colours of linear light, and nothing else; 1 at first.
 
     Raises:
         ConfigError: an image is smaller than the factor.
     """
 
-    def __init__(self, frames: Sequence[Frame], downsample: int = 1, cache_bytes: int = _CACHE_BYTES) -> None:
+    def __init__(self, frames: Sequence[Frame], downsample: int = 1, cache_bytes: int = _CACHE_BYTES, to_linear: bool = False) -> None:
         self._frames = list(frames)
+        self._to_linear = to_linear
+        self.scale = 1.0
         self._factor = downsample
         self._cameras = [_reduced(f, downsample) for f in self._frames]
         self._cache_bytes = cache_bytes
@@ -105,6 +112,10 @@ class ImageViews(ViewSet):
     def view(self, index: int) -> View:
         return View(self._frames[index].name, self._cameras[index], self._frames[index].conditions)
 
+    def file(self, index: int) -> Path:
+        """The image file of view ``index``."""
+        return self._frames[index].path
+
     def pixels(self, index: int) -> Pixels:
         """Pixels of view ``index``.
 
@@ -112,6 +123,8 @@ class ImageViews(ViewSet):
             DataError: the file is missing, damaged or changed size since the data set was opened, or its mask leaves nothing.
         """
         stored = self._load(range(len(self))[index])
+        if self._to_linear:
+            return self._linear(stored)
         if stored.data.dtype == torch.uint8 and stored.data.shape[-1] == 4 and not stored.premultiplied:
             return Pixels(*_premultiplied(stored.data), stored.mask)
         data = stored.data.float()
@@ -122,17 +135,30 @@ class ImageViews(ViewSet):
         rgb, alpha = data[..., :3], data[..., 3]
         return Pixels(rgb.contiguous() if stored.premultiplied else rgb * alpha[..., None], alpha.contiguous(), stored.mask)
 
+    def _linear(self, stored: _Stored) -> Pixels:
+        rgb, alpha = stored.data[..., :3], stored.data[..., 3] if stored.data.shape[-1] == 4 else None
+        rgb = _LINEAR[rgb.int()] if rgb.dtype == torch.uint8 else rgb.float()
+        if alpha is not None:
+            alpha = alpha / 255.0 if alpha.dtype == torch.uint8 else alpha.float().contiguous()
+            rgb = rgb if stored.premultiplied else rgb * alpha[..., None]
+        return Pixels((rgb * self.scale).contiguous(), alpha, stored.mask)
+
     def preload(self, progress: Callable[[float], None] = lambda fraction: None) -> None:
         """Decode every image now if all copies fit the cache; otherwise do nothing.
 
         Raises:
             DataError: as :meth:`pixels`, for the first damaged file.
         """
-        if self._used + sum(_stored_bytes(f, c) for f, c in zip(self._frames, self._cameras, strict=True)) > self._cache_bytes:
+        if self._used + sum(self._bytes(f, c) for f, c in zip(self._frames, self._cameras, strict=True)) > self._cache_bytes:
             return
         with ThreadPoolExecutor(4) as pool:
             for done, _ in enumerate(pool.map(self._load, range(len(self)))):
                 progress((done + 1) / len(self))
+
+    def _bytes(self, frame: Frame, camera: Camera) -> int:
+        processed = frame.distortion is not None or self._factor > 1
+        values = frame.info.channels * (2 if frame.info.linear or (self._to_linear and processed) else 1)
+        return camera.width * camera.height * (values + (frame.mask is not None or frame.distortion is not None))
 
     def _load(self, index: int) -> _Stored:
         found = self._stored.get(index)
@@ -168,7 +194,12 @@ class ImageViews(ViewSet):
     def _process(self, frame: Frame, image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """Undistorted and reduced, colours premultiplied, in the file's own number type."""
         eight_bit = image.dtype == torch.uint8
-        values = image.float()
+        if eight_bit and self._to_linear:
+            rgb = _LINEAR[image[..., :3].int()]
+            values = rgb if image.shape[-1] == 3 else torch.cat([rgb * (image[..., 3:] / 255.0), image[..., 3:] / 255.0], dim=-1)
+            eight_bit = False
+        else:
+            values = image.float()
         if eight_bit and values.shape[-1] == 4:
             values = torch.cat([values[..., :3] * (values[..., 3:] / 255.0), values[..., 3:]], dim=-1)
         if frame.distortion is not None:
@@ -223,8 +254,3 @@ def _reduced(frame: Frame, factor: int) -> Camera:
     return replace(
         camera, fx=camera.fx / factor, fy=camera.fy / factor, cx=camera.cx / factor, cy=camera.cy / factor, width=width, height=height
     )
-
-
-def _stored_bytes(frame: Frame, camera: Camera) -> int:
-    values = frame.info.channels * (2 if frame.info.linear else 1)
-    return camera.width * camera.height * (values + (frame.mask is not None or frame.distortion is not None))

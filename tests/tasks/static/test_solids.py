@@ -14,13 +14,14 @@ from PIL import Image
 
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
+from neuprim.core.solids import rays
+from neuprim.core.solids.meshes import ball, chamfered_box, corner_normals, rod
+from neuprim.core.solids.raycast import Scene
+from neuprim.core.solids.shapes import Solid, build, plain, srgb
 from neuprim.core.task import SceneContext
 from neuprim.tasks.static.solids import generate as generator
 from neuprim.tasks.static.solids.generate import SolidsSettings, camera_matrices, generate, load, picture
-from neuprim.tasks.static.solids.meshes import ball, chamfered_box, corner_normals, rod
-from neuprim.tasks.static.solids.raycast import Scene
 from neuprim.tasks.static.solids.shading import DAYLIGHT, encode_srgb, radiance
-from neuprim.tasks.static.solids.shapes import Solid, build, plain, srgb
 
 SMALL = {"size": 32, "train_views": 3, "test_views": 2, "supersampling": 2}
 
@@ -214,7 +215,7 @@ def test_layout_and_alpha(cache: Path) -> None:
 def test_pictures_do_not_depend_on_how_rays_are_batched(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     pose = camera_matrices("train", 3)[1]
     whole = picture(scene, pose, 24, 3)
-    monkeypatch.setattr(generator, "RAYS_AT_ONCE", 700)
+    monkeypatch.setattr(rays, "RAYS_AT_ONCE", 700)
     np.testing.assert_array_equal(picture(scene, pose, 24, 3), whole)
 
 

@@ -12,8 +12,6 @@ import hashlib
 import json
 import math
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields
@@ -28,10 +26,12 @@ from PIL import Image
 from neuprim.core.cameras import look_at
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, DataError, nearest
+from neuprim.core.files import publish_folder
+from neuprim.core.solids.raycast import Scene
+from neuprim.core.solids.rays import bands, pixel_means
+from neuprim.core.solids.shapes import build
 from neuprim.core.task import SceneContext
-from neuprim.tasks.static.solids.raycast import Scene
 from neuprim.tasks.static.solids.shading import encode_srgb, radiance
-from neuprim.tasks.static.solids.shapes import build
 
 __all__ = ["GENERATOR_VERSION", "SolidsSettings", "camera_matrices", "generate", "load", "picture"]
 
@@ -40,7 +40,6 @@ GENERATOR_VERSION = 1
 
 DISTANCE = 4.0
 FIELD_OF_VIEW = math.radians(40.0)
-RAYS_AT_ONCE = 1 << 15  # small enough for the arrays to stay in the processor's cache
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 Progress = Callable[[str, float], None]
@@ -106,17 +105,8 @@ def generate(settings: SolidsSettings, cache_dir: Path, progress: Progress = lam
         DataError: the cache directory cannot be written.
     """
     final = Path(cache_dir) / f"solids-{settings.key()}"
-    if _complete(final, settings):
-        return final
     try:
-        final.parent.mkdir(parents=True, exist_ok=True)
-        draft = Path(tempfile.mkdtemp(prefix=f".{final.name}-", dir=final.parent))
-        try:
-            draft.chmod(0o755)  # mkdtemp's 0700 would hide a shared cache from its other users
-            _write(settings, draft, progress)
-            _publish(draft, final, settings)
-        finally:
-            shutil.rmtree(draft, ignore_errors=True)
+        publish_folder(final, lambda draft: _write(settings, draft, progress), lambda folder: _complete(folder, settings))
     except OSError as error:
         raise DataError(f"scene solids: cannot write the generated images to {final}: {error}") from error
     return final
@@ -141,26 +131,18 @@ def camera_matrices(split: str, count: int) -> list[NDArray[np.float64]]:
 
 def picture(scene: Scene, camera_to_world: NDArray[np.float64], size: int, supersampling: int) -> NDArray[np.uint8]:
     """(size, size, 4) RGBA in sRGB with straight alpha, as Blender stores it: rays are averaged premultiplied and linear, then encoded."""
-    fine = size * supersampling
-    # The middle of each ray's cell, in the image plane at distance 1.
-    plane = ((np.arange(fine) + 0.5) / fine * 2 - 1) * math.tan(FIELD_OF_VIEW / 2)
-    rows = max(1, RAYS_AT_ONCE // (fine * supersampling)) * supersampling
-    bands = [_band(scene, camera_to_world, plane, -plane[top : top + rows], supersampling) for top in range(0, fine, rows)]
-    mean = np.concatenate(bands)
+    bands_of_rays = bands(camera_to_world, FIELD_OF_VIEW, size, supersampling)
+    mean = np.concatenate([pixel_means(_seen(scene, camera_to_world, d), size, supersampling) for d in bands_of_rays])
     alpha = mean[..., 3:]
     straight = (mean[..., :3] / np.maximum(alpha, np.float32(1e-6))).astype(np.float32, copy=False)
     colour = encode_srgb(straight)
     return np.round(np.concatenate([colour, alpha], axis=-1) * 255).astype(np.uint8)
 
 
-def _band(scene: Scene, pose: NDArray[np.float64], across: NDArray[np.float64], up: NDArray[np.float64], s: int) -> NDArray[np.float32]:
-    """(len(up) / s, len(across) / s, 4) premultiplied linear means of s x s rays through the image plane's points."""
-    x, y = np.meshgrid(across, up)
-    local = np.stack([x, y, -np.ones_like(x)], axis=-1).reshape(-1, 3)
-    local /= np.sqrt(np.einsum("nc,nc->n", local, local))[:, None]
-    rgb, hit = radiance(scene, pose[:3, 3], local @ pose[:3, :3].T)
-    samples = np.concatenate([rgb, hit[:, None].astype(np.float32)], axis=1)
-    return samples.reshape(len(up) // s, s, len(across) // s, s * 4).mean(axis=1).reshape(len(up) // s, -1, s, 4).mean(axis=2)
+def _seen(scene: Scene, pose: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float32]:
+    """(N, 4) premultiplied linear RGBA of N rays."""
+    rgb, hit = radiance(scene, pose[:3, 3], directions)
+    return np.concatenate([rgb, hit[:, None].astype(np.float32)], axis=1)
 
 
 def _splits(settings: SolidsSettings) -> Iterator[tuple[str, int]]:
@@ -198,14 +180,3 @@ def _complete(folder: Path, settings: SolidsSettings) -> bool:
     files = [folder / f"transforms_{split}.json" for split, _ in _splits(settings)]
     files += [folder / split / f"r_{i}.png" for split, count in _splits(settings) for i in range(count)]
     return all(file.is_file() for file in files)
-
-
-def _publish(draft: Path, final: Path, settings: SolidsSettings) -> None:
-    """Give the draft its name. Another process may have been faster: its files are the same ones."""
-    if final.exists() and not _complete(final, settings):
-        shutil.rmtree(final)  # somebody deleted part of it
-    try:
-        draft.rename(final)
-    except OSError:
-        if not _complete(final, settings):
-            raise

@@ -15,8 +15,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from neuprim.core.errors import BackendUnavailable
-from neuprim.tasks.static.solids.meshes import corner_normals
-from neuprim.tasks.static.solids.shapes import Solid
+from neuprim.core.solids.meshes import corner_normals
+from neuprim.core.solids.shapes import Solid
 
 __all__ = ["Engine", "Hits", "Scene"]
 
@@ -38,6 +38,7 @@ class Hits:
         face: (M, 3) float32 unit normal of the triangle itself.
         albedo: (M, 3) float32 linear RGB.
         gloss: (M,) float32, 0..1.
+        specular: (M,) float32 strength of the highlight.
         solid: (M,) index into the scene's solids.
     """
 
@@ -48,6 +49,7 @@ class Hits:
     face: NDArray[np.float32]
     albedo: NDArray[np.float32]
     gloss: NDArray[np.float32]
+    specular: NDArray[np.float32]
     solid: NDArray[np.intp]
 
     def lifted(self) -> NDArray[np.float32]:
@@ -78,6 +80,7 @@ class Scene:
         self._corner_normals = np.concatenate([corner_normals(mesh) for mesh in meshes]).astype(np.float32)
         self._owner = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
         self._gloss = np.array([solid.gloss for solid in self.solids], dtype=np.float32)
+        self._specular = np.array([solid.specular for solid in self.solids], dtype=np.float32)
         self.engine, self._search = _open(self._vertices, self._faces, engine)
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
@@ -100,7 +103,7 @@ class Scene:
         for index in np.unique(owner):
             mine = np.flatnonzero(owner == index)
             albedo[mine] = self.solids[index].albedo(position[mine])
-        return Hits(hit, position, distance, normal, self._face_normals[triangle], albedo, self._gloss[owner], owner)
+        return Hits(hit, position, distance, normal, self._face_normals[triangle], albedo, self._gloss[owner], self._specular[owner], owner)
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
         """(N,) whether a surface lies within ``distance`` (in lengths of the direction) of the points (N, 3) along directions (N, 3).
@@ -158,7 +161,7 @@ def _open(vertices: NDArray, faces: NDArray, engine: Engine) -> tuple[Literal["e
         except ImportError as error:
             if engine == "embree":
                 raise BackendUnavailable(f"ray casting with embree needs the package 'embreex' (pip install embreex): {error}") from error
-    from neuprim.tasks.static.solids.bvh import Hierarchy
+    from neuprim.core.solids.bvh import Hierarchy
 
     return "numba", Hierarchy(vertices, faces)
 

@@ -1,4 +1,4 @@
-"""The solids of the built-in scene: a power drill over a chequered plate, and small things that are hard to fit.
+"""The solids of the built-in scenes: a power drill over a chequered plate, and small things that are hard to fit.
 
 Sharp edges (chamfered boxes, a pyramid, a plate), thin parts (drill bit, pins, a wire cube, a trigger guard) and smooth curves (grip, ring,
 banana) in saturated colours, all inside the box [-1, 1]^3 with z up. Nothing here knows about lights or cameras, and nothing is random.
@@ -7,16 +7,16 @@ banana) in saturated colours, all inside the box [-1, 1]^3 with z up. Nothing he
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from neuprim.tasks.static.solids.meshes import arc_tube, ball, chamfered_box, lathe, merged, pyramid, ring, rod
+from neuprim.core.solids.meshes import arc_tube, ball, chamfered_box, lathe, merged, pyramid, ring, rod
 
-__all__ = ["Albedo", "Solid", "build", "srgb"]
+__all__ = ["FLOOR", "Albedo", "Solid", "build", "plain", "srgb", "two_tone"]
 
 Albedo = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 """(M, 3) positions in scene units -> (M, 3) linear RGB reflectance 0..1."""
@@ -33,13 +33,15 @@ class Solid:
         name: for messages and tests.
         mesh: watertight, scene units.
         albedo: diffuse reflectance as a function of position.
-        gloss: 0 (matt) to 1 (polished); see :mod:`neuprim.tasks.static.solids.shading`.
+        gloss: 0 (matt) to 1 (polished); see :mod:`neuprim.core.solids.reflectance`.
+        specular: strength of the highlight of a polished solid.
     """
 
     name: str
     mesh: trimesh.Trimesh
     albedo: Albedo
     gloss: float
+    specular: float = 0.12
 
 
 def srgb(code: str) -> NDArray[np.float32]:
@@ -74,7 +76,7 @@ def _placed(solid: Solid, pose: NDArray[np.float64]) -> Solid:
     mesh = solid.mesh.copy()
     mesh.apply_transform(pose)
     back = np.linalg.inv(pose).astype(np.float32)
-    return Solid(solid.name, mesh, lambda position: solid.albedo(position @ back[:3, :3].T + back[:3, 3]), solid.gloss)
+    return replace(solid, mesh=mesh, albedo=lambda position: solid.albedo(position @ back[:3, :3].T + back[:3, 3]))
 
 
 def _plate() -> Solid:

@@ -1,0 +1,203 @@
+"""The scene ``lit_solids`` as a data set on disk, in the layout of GS³ that any loader of it reads.
+
+    transforms_train.json, transforms_test.json, transforms_circle.json      camera_angle_x, poses with OpenGL axes, pl_pos, pl_intensity
+    train/r_0000.exr                 RGBA, linear radiance over the exposure, premultiplied, half floats
+    train/r_0000_unshadowed.exr      the same as if nothing cast a shadow (attached shadows stay)
+    train/r_0000_classes.png         8-bit grey, index into CLASSES of :mod:`neuprim.tasks.relight.measure`
+    test/new_light_03_nearest.exr    test views only: the camera's view under the nearest of 25 training lights
+
+A pixel is background where fewer than half of its rays hit anything; else it has the class of more than half of those that hit, and is
+"lit" where there is none such. The light's intensity is :data:`INTENSITY` in every image, so images fade with the square of its distance.
+
+Scene, cameras and lights are fixed: equal settings give equal files whatever the seed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from neuprim.core.cameras import look_at
+from neuprim.core.errors import ConfigError, DataError, nearest
+from neuprim.core.files import publish_folder
+from neuprim.core.images import write_exr
+from neuprim.core.solids.raycast import Scene
+from neuprim.core.solids.rays import bands, pixel_means
+from neuprim.tasks.relight.lit.rig import DISTANCE, Shot, splits
+from neuprim.tasks.relight.lit.scene import RADIUS, solids
+from neuprim.tasks.relight.lit.shading import shade
+from neuprim.tasks.relight.measure import CLASSES
+
+__all__ = ["GENERATOR_VERSION", "INTENSITY", "LitSettings", "Picture", "camera_to_world", "generate", "picture"]
+
+GENERATOR_VERSION = 1
+"""Part of the cache's key: to be raised with every change to solids, rig, shading or file layout."""
+
+INTENSITY = 69.2
+"""Radiant intensity of the lights over the exposure: it makes 1 the 99.5th percentile of the training images at the default settings."""
+
+FIELD_OF_VIEW = 2 * float(np.arcsin(RADIUS / DISTANCE[0]))
+"""Radians; holds the whole scene from the nearest camera."""
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class LitSettings:
+    """What changes the images of ``scene=lit_solids``.
+
+    Attributes:
+        size: width and height of the images in pixels.
+        train_views, test_views: images of each split.
+        supersampling: rays per pixel along each axis.
+    """
+
+    size: int = 128
+    train_views: int = 500
+    test_views: int = 100
+    supersampling: int = 2
+
+    def __post_init__(self) -> None:
+        for name, lowest, highest in (("size", 8, 4096), ("train_views", 1, 100000), ("test_views", 1, 10000), ("supersampling", 1, 16)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
+                raise ConfigError(f"scene.{name} is {value!r}; expected a whole number from {lowest} to {highest}")
+
+    @staticmethod
+    def parse(settings: Mapping[str, Any], others: Sequence[str] = ()) -> LitSettings:
+        """Settings from a mapping, of which ``others`` are not read here; :class:`ConfigError` for an unknown name or impossible value."""
+        known = [f.name for f in fields(LitSettings)]
+        for name in settings:
+            if name not in (*known, *others):
+                raise ConfigError(f"scene.{name} is not a setting of this scene{nearest(str(name), [*known, *others])}")
+        return LitSettings(**{name: value for name, value in settings.items() if name in known})
+
+    def key(self) -> str:
+        """A short hash of every setting and the generator's version."""
+        text = json.dumps({"version": GENERATOR_VERSION, **asdict(self)}, sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One image.
+
+    Attributes:
+        rgba: (size, size, 4) float32 linear radiance and coverage, premultiplied.
+        unshadowed: (size, size, 4) the same as if nothing cast a shadow.
+        classes: (size, size) uint8, index into :data:`neuprim.tasks.relight.measure.CLASSES`.
+    """
+
+    rgba: NDArray[np.float32]
+    unshadowed: NDArray[np.float32]
+    classes: NDArray[np.uint8]
+
+
+def generate(settings: LitSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None) -> Path:
+    """Write the data set unless a complete one is there; returns its folder ``cache_dir/lit_solids-KEY``.
+
+    Raises:
+        DataError: the cache directory cannot be written.
+    """
+    final = Path(cache_dir) / f"lit_solids-{settings.key()}"
+    try:
+        publish_folder(final, lambda draft: _write(settings, draft, progress), lambda folder: _complete(folder, settings))
+    except OSError as error:
+        raise DataError(f"scene lit_solids: cannot write the generated images to {final}: {error}") from error
+    return final
+
+
+def camera_to_world(eye: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) camera-to-world matrix, OpenGL axes, of a camera at ``eye`` (3,) that looks at the origin, z up."""
+    view = look_at(torch.from_numpy(np.asarray(eye, dtype=np.float64)), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    return torch.linalg.inv(view).numpy() @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def picture(scene: Scene, pose: NDArray[np.float64], light: NDArray[np.float64], size: int, supersampling: int) -> Picture:
+    """The view of a camera at ``pose`` (camera to world, OpenGL axes) under a light at ``light`` (3,) of :data:`INTENSITY`."""
+    parts = []
+    for directions in bands(pose, FIELD_OF_VIEW, size, supersampling):
+        seen = shade(scene, pose[:3, 3], directions, light, INTENSITY)
+        kinds = seen.classes[:, None] == np.arange(len(CLASSES), dtype=np.uint8)
+        parts.append(pixel_means(np.concatenate([seen.rgb, seen.unshadowed, kinds], axis=1, dtype=np.float32), size, supersampling))
+    mean = np.concatenate(parts)
+    shares = mean[..., 6:]
+    alpha = shares[..., 1:].sum(axis=-1, keepdims=True)
+    classes = np.where(alpha[..., 0] < 0.5, 0, CLASSES.index("lit")).astype(np.uint8)
+    for value in range(2, len(CLASSES)):
+        classes[(classes > 0) & (shares[..., value] > alpha[..., 0] / 2)] = value
+    rgba, unshadowed = (np.concatenate([colour, alpha], axis=-1) for colour in (mean[..., :3], mean[..., 3:6]))
+    return Picture(rgba, unshadowed, classes)
+
+
+def _files(shot: Shot, folder: Path) -> Iterator[Path]:
+    yield folder / f"{shot.name}.exr"
+    yield folder / f"{shot.name}_unshadowed.exr"
+    yield folder / f"{shot.name}_classes.png"
+    if shot.near_light is not None:
+        yield folder / f"{shot.name}_nearest.exr"
+
+
+def _complete(folder: Path, settings: LitSettings) -> bool:
+    shots = splits(settings.train_views, settings.test_views)
+    files = (file for split in shots for shot in shots[split] for file in _files(shot, folder / split))
+    return all((folder / f"transforms_{split}.json").is_file() for split in shots) and all(file.is_file() for file in files)
+
+
+def _write(settings: LitSettings, folder: Path, progress: Progress) -> None:
+    progress("lit_solids: building the scene", 0.0)
+    scene = Scene(solids())
+    text = f"lit_solids: drawing {settings.size}x{settings.size} images"
+    if scene.engine != "embree":
+        text += " (without embreex, which would be faster)"
+    shots = splits(settings.train_views, settings.test_views)
+    for split, mine in shots.items():
+        (folder / split).mkdir()
+        layout = {
+            "camera_angle_x": FIELD_OF_VIEW,
+            "camera_near": DISTANCE[0] - 1.5,
+            "camera_far": DISTANCE[1] + 1.5,
+            "frames": [_frame(split, shot) for shot in mine],
+        }
+        (folder / f"transforms_{split}.json").write_text(json.dumps(layout, indent=1), encoding="utf-8")
+
+    def draw(job: tuple[str, Shot]) -> None:
+        split, shot = job
+        pose = camera_to_world(shot.camera)
+        taken = picture(scene, pose, shot.light, settings.size, settings.supersampling)
+        file, unshadowed, classes, *nearest_light = _files(shot, folder / split)
+        write_exr(file, torch.from_numpy(taken.rgba), half=True)
+        write_exr(unshadowed, torch.from_numpy(taken.unshadowed), half=True)
+        Image.fromarray(taken.classes).save(classes)
+        for path in nearest_light:
+            assert shot.near_light is not None
+            write_exr(path, torch.from_numpy(picture(scene, pose, shot.near_light, settings.size, settings.supersampling).rgba), half=True)
+
+    jobs = [(split, shot) for split, mine in shots.items() for shot in mine]
+    pool = ThreadPoolExecutor(min(4, os.cpu_count() or 1))
+    try:
+        for done, _ in enumerate(pool.map(draw, jobs), start=1):
+            progress(text, done / len(jobs))
+    finally:
+        pool.shutdown(cancel_futures=True)  # on an interrupt, wait for the running images only
+
+
+def _frame(split: str, shot: Shot) -> dict[str, Any]:
+    return {
+        "file_path": f"./{split}/{shot.name}",
+        "file_ext": ".exr",
+        "transform_matrix": camera_to_world(shot.camera).tolist(),
+        "pl_pos": shot.light.tolist(),
+        "pl_intensity": [INTENSITY] * 3,
+    }

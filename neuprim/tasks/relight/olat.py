@@ -1,0 +1,209 @@
+"""One light at a time: the layout of GS³ and NRHints, read as their files say, which is not always what their loaders do.
+
+``transforms_SPLIT.json`` holds, in the file or in a frame, which wins:
+
+* ``camera_intrinsics``: [cx, cy, fx, fy] in pixels, in this order; else ``camera_angle_x``, the horizontal field of view in radians,
+  with square pixels and the principal point in the middle. In one place the intrinsics win.
+* ``pl_intensity``: three numbers or one; default 1. (GS³ does not read it.)
+* ``camera_near``, ``camera_far``: default 3 and 10 as in NRHints. Checked, but nothing depends on them: what lies in front of the
+  camera is drawn.
+
+and per frame:
+
+* ``img_path``: the image with its suffix, absolute or in the data set's folder. Files that GS³ saved on another machine name that
+  machine's folders, so the longest tail of the path that is there counts. Where none is, or none is given:
+* ``file_path`` in the data set's folder, followed by ``file_ext``; without one, as written, else with .png, .jpg, .jpeg or .exr.
+* ``pl_pos``: the point light, world; required.
+* ``transform_matrix``: camera to world, OpenGL axes.
+* ``R_opt`` (3, 3) and ``T_opt`` (3,): an optimised pose that GS³ writes and reads *instead of* ``transform_matrix``: the world-to-camera
+  matrix with OpenCV axes is [R_opt^T | T_opt]. ``pl_pos`` in such a file is the optimised light. ``scene.ignore_corrections=true``
+  takes ``transform_matrix`` all the same.
+
+PNG and JPEG hold sRGB with straight alpha and become linear light; OpenEXR is linear and premultiplied and stays so.
+
+Settings beside the common ones (``background`` is black by default): ``train_split``, ``test_split`` (names in the files' names),
+``hold_out`` (n > 1 makes every n-th training view the test split and leaves the real one unread, for tuning), ``falloff`` ("none" or
+"inverse_square"), ``exposure`` (a number or "auto") and ``ignore_corrections``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera, opengl_to_viewmat
+from neuprim.core.datasets.common import IMAGE_SUFFIXES, every_nth, find_image, missing_files, posed_images, unique_names
+from neuprim.core.datasets.records import Record, read_json
+from neuprim.core.datasets.settings import BACKGROUNDS, Setting, data_folder, flag, read_settings, text
+from neuprim.core.datasets.views import Frame
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.images import ImageInfo, image_info
+from neuprim.core.task import SceneContext
+from neuprim.tasks.relight.data import PointLit, bright
+
+__all__ = ["check", "load", "read", "read_split"]
+
+Made = TypeVar("Made", bound=PointLit)
+
+
+def load(settings: Mapping[str, Any], context: SceneContext) -> PointLit:
+    """The scene in the folder ``settings["path"]``, in linear light over the exposure.
+
+    Raises:
+        ConfigError: unknown or impossible settings.
+        DataError: missing or damaged files, wrong or missing fields, impossible cameras, empty splits, black images with exposure=auto.
+    """
+    return read(settings, context, PointLit)
+
+
+def check(settings: Mapping[str, Any]) -> None:
+    """Raises ConfigError for unknown or impossible settings, before any file is touched."""
+    read_settings(settings, _SETTINGS)
+
+
+def read(settings: Mapping[str, Any], context: SceneContext, kind: type[Made]) -> Made:
+    """As :func:`load`, with the class to make."""
+    values = read_settings(settings, _SETTINGS)
+    folder = data_folder(values["path"])
+    train = read_split(folder, values["train_split"], values["ignore_corrections"])
+    if values["hold_out"]:
+        if len(train) < 2:
+            raise ConfigError(
+                f"scene.hold_out is {values['hold_out']}, but {folder} has only {len(train)} training view; expected at least 2"
+            )
+        train, test = every_nth(train, values["hold_out"])
+    else:
+        test = read_split(folder, values["test_split"], values["ignore_corrections"])
+    up = torch.tensor([0.0, 0.0, 1.0])
+    dataset = posed_images(str(folder), folder.resolve().name, train, test, values, context, up=up, to_linear=True, kind=kind)
+    dataset.falloff = values["falloff"]
+    auto = values["exposure"] == _AUTO
+    dataset.expose(bright(dataset.train, str(folder)) if auto else float(values["exposure"]))
+    return dataset
+
+
+def read_split(folder: Path, split: str, ignore_corrections: bool = False) -> list[Frame]:
+    """The frames of one split, with their lights as conditions.
+
+    Raises:
+        DataError: as :func:`load`.
+    """
+    path = folder / f"transforms_{split}.json"
+    document = read_json(path)
+    near = document.number_or("camera_near", 3.0, "a distance above 0", 0.0)
+    if document.number_or("camera_far", max(10.0, 2.0 * near), f"a distance above camera_near, {near:g}") <= near:
+        raise document.fail("camera_far", f"a distance above camera_near, {near:g}")
+    records = list(document.objects("frames"))
+    texts = [r.text("file_path" if r.has("file_path") or not r.has("img_path") else "img_path") for r in records]
+    files = [_image(folder, r) for r in records]
+    absent = [f"{t}{r.values.get('file_ext') or ''}" for t, r, f in zip(texts, records, files, strict=True) if f is None]
+    if absent:
+        raise missing_files(str(path), absent)
+    frames = []
+    for record, file, name in zip(records, files, unique_names(texts, str(path)), strict=True):
+        assert file is not None  # listed above otherwise
+        info = image_info(file)
+        fx, fy, cx, cy = _intrinsics(record, document, file, info)
+        camera = Camera(_viewmat(record, ignore_corrections), fx, fy, cx, cy, info.width, info.height)
+        light = {"light": record.array("pl_pos", (3,), "the point light's position, 3 numbers").float()}
+        light["light_intensity"] = _intensity(record if record.has("pl_intensity") else document)
+        frames.append(Frame(name, file, camera.validate(record.where), info, conditions=light))
+    return frames
+
+
+def _image(folder: Path, record: Record) -> Path | None:
+    """A frame's file, or None."""
+    if record.has("img_path"):
+        parts = record.text("img_path").replace("\\", "/").split("/")
+        tails = (_file(folder / "/".join(parts[i:])) for i in range(len(parts)))  # a path from the root stays one when joined
+        found = next((file for file in tails if file is not None), None)
+        if found is not None or not record.has("file_path"):
+            return found
+    name = record.text("file_path")
+    if not record.has("file_ext"):
+        return find_image(folder, name)
+    suffix = "." + record.text("file_ext").removeprefix(".")
+    if suffix not in IMAGE_SUFFIXES:
+        raise record.fail("file_ext", "one of .png, .jpg, .jpeg, .exr")
+    return _file(folder / (name.removesuffix(suffix).replace("\\", "/") + suffix))
+
+
+def _file(path: Path) -> Path | None:
+    try:
+        return path if path.is_file() else None
+    except OSError:  # a name longer than the file system can hold
+        return None
+
+
+def _intrinsics(record: Record, document: Record, file: Path, info: ImageInfo) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy in pixels."""
+    width, height = info.width, info.height
+    for source in (record, document):
+        if source.has("camera_intrinsics"):
+            cx, cy, fx, fy = source.array("camera_intrinsics", (4,), "[cx, cy, fx, fy] in pixels").tolist()
+            if not (fx > 0 and fy > 0):
+                raise DataError(
+                    f"{source.where}: camera_intrinsics is {[cx, cy, fx, fy]}; expected [cx, cy, fx, fy], focal lengths above 0"
+                )
+            if not (0 <= cx <= width and 0 <= cy <= height) and fx <= width and fy <= height:
+                raise DataError(
+                    f"{source.where}: camera_intrinsics is {[cx, cy, fx, fy]}, with the principal point outside of {file} "
+                    f"({width}x{height}); expected the order [cx, cy, fx, fy]"
+                )
+            return fx, fy, cx, cy
+        if source.has("camera_angle_x"):
+            angle = source.number("camera_angle_x", "the horizontal field of view in radians, between 0 and pi", 0.0, math.pi)
+            focal = 0.5 * width / math.tan(0.5 * angle)
+            return focal, focal, 0.5 * width, 0.5 * height
+    raise record.fail("camera_intrinsics", "[cx, cy, fx, fy] in pixels, or camera_angle_x in radians, in the frame or in the file")
+
+
+def _viewmat(record: Record, ignore_corrections: bool) -> Tensor:
+    """(4, 4) float64 world-to-camera matrix, OpenCV axes."""
+    corrected = record.has("R_opt") or record.has("T_opt")
+    if not corrected or ignore_corrections:
+        if corrected and not record.has("transform_matrix"):
+            raise record.fail("transform_matrix", "4 rows of 4 numbers, as scene.ignore_corrections=true leaves R_opt and T_opt out")
+        return opengl_to_viewmat(record.matrix("transform_matrix"))
+    view = torch.eye(4, dtype=torch.float64)
+    view[:3, :3] = record.array("R_opt", (3, 3), "3 rows of 3 numbers, the camera's axes beside T_opt").T
+    view[:3, 3] = record.array("T_opt", (3,), "3 numbers beside R_opt")
+    return view
+
+
+def _intensity(source: Record) -> Tensor:
+    """(3,) float32."""
+    expected = "3 numbers of at least 0, or one"
+    if not source.has("pl_intensity"):
+        return torch.ones(3)
+    if isinstance(source.values["pl_intensity"], list):
+        value = source.array("pl_intensity", (3,), expected)
+    else:
+        value = torch.full((3,), source.number("pl_intensity", expected), dtype=torch.float64)
+    if bool((value < 0).any()):
+        raise DataError(f"{source.where}: pl_intensity is {source.values['pl_intensity']}; expected {expected}")
+    return value.float()
+
+
+_AUTO = "auto"
+
+_SETTINGS = {
+    "background": Setting("black", "one of " + ", ".join(BACKGROUNDS), lambda v: isinstance(v, str) and v in BACKGROUNDS),
+    "train_split": text("train", "the name in transforms_NAME.json"),
+    "test_split": text("test", "the name in transforms_NAME.json"),
+    "hold_out": Setting(
+        0, "0, or a whole number of at least 2", lambda v: isinstance(v, int) and not isinstance(v, bool) and (v == 0 or v >= 2)
+    ),
+    "falloff": Setting("none", "none or inverse_square", lambda v: v in ("none", "inverse_square")),
+    "exposure": Setting(
+        1.0,
+        "a number above 0, or auto",
+        lambda v: v == _AUTO or (isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and v > 0),
+    ),
+    "ignore_corrections": flag(False),
+}

@@ -1,0 +1,243 @@
+"""The built-in scene as a data set: files, cache, classes, baselines, and the same pixels through the loader of its layout."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.images import read_image
+from neuprim.core.solids.raycast import Scene
+from neuprim.core.task import SceneContext
+from neuprim.tasks.relight import olat
+from neuprim.tasks.relight.data import bright
+from neuprim.tasks.relight.lit import LitSolids, load
+from neuprim.tasks.relight.lit import generate as generator
+from neuprim.tasks.relight.lit.generate import INTENSITY, LitSettings, camera_to_world, generate, picture
+from neuprim.tasks.relight.lit.rig import PARTS
+from neuprim.tasks.relight.lit.scene import RADIUS, solids
+from neuprim.tasks.relight.measure import CLASSES
+
+SMALL = {"size": 24, "train_views": 4, "test_views": 3, "supersampling": 2}
+FEW_FRAMES = 4
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene(solids())
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(autouse=True)
+def one_scene(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Building the scene takes a second: once is enough; nor does the film need all of its frames."""
+    monkeypatch.setattr(generator, "Scene", lambda solids: scene)
+    monkeypatch.setattr(generator, "solids", list)
+    monkeypatch.setattr("neuprim.tasks.relight.lit.rig.CIRCLE_FRAMES", FEW_FRAMES)
+    yield
+
+
+@pytest.fixture(scope="module")
+def forty(cache: Path, scene: Scene) -> LitSolids:
+    """Enough views to mean something."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(generator, "Scene", lambda solids: scene)
+        patch.setattr("neuprim.tasks.relight.lit.rig.CIRCLE_FRAMES", FEW_FRAMES)
+        return load({"size": 48, "train_views": 40, "test_views": 12}, SceneContext(seed=0, cache_dir=cache))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_everything_is_inside_the_sphere_that_cameras_hold() -> None:
+    every = solids()
+    assert max(np.linalg.norm(s.mesh.vertices, axis=1).max() for s in every) < RADIUS
+    assert len({s.name for s in every}) == len(every) and all(s.mesh.is_watertight and s.mesh.volume > 0 for s in every)
+
+
+def test_same_settings_same_bytes(tmp_path: Path, cache: Path) -> None:
+    first, second = generate(LitSettings(**SMALL), cache), generate(LitSettings(**SMALL), tmp_path)
+    assert contents(first) == contents(second)
+    assert sorted(p.name for p in (first / "train").iterdir())[:3] == ["r_0000.exr", "r_0000_classes.png", "r_0000_unshadowed.exr"]
+
+
+def test_cache_is_reused_and_keyed_by_every_setting(cache: Path) -> None:
+    folder = generate(LitSettings(**SMALL), cache)
+    calls: list[float] = []
+    assert generate(LitSettings(**SMALL), cache, lambda text, fraction: calls.append(fraction)) == folder and not calls
+    keys = {LitSettings(**{**SMALL, name: value + 8}).key() for name, value in SMALL.items()}
+    assert len(keys | {folder.name.removeprefix("lit_solids-")}) == 5
+
+
+def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
+    def stop(text: str, fraction: float) -> None:
+        if fraction > 0.5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        generate(LitSettings(**SMALL), tmp_path, stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_damaged_cache_is_drawn_again(tmp_path: Path) -> None:
+    folder = generate(LitSettings(**SMALL), tmp_path)
+    complete = contents(folder)
+    (folder / "test" / "new_view_00_nearest.exr").unlink()
+    assert generate(LitSettings(**SMALL), tmp_path) == folder
+    assert contents(folder) == complete and [p.name for p in tmp_path.iterdir()] == [folder.name]
+
+
+def test_progress_runs_from_nothing_to_all(tmp_path: Path) -> None:
+    calls: list[tuple[str, float]] = []
+    generate(LitSettings(**SMALL), tmp_path, lambda text, fraction: calls.append((text, fraction)))
+    fractions = [fraction for _, fraction in calls]
+    assert fractions == sorted(fractions) and fractions[0] == 0.0 and fractions[-1] == 1.0 and len(fractions) == 4 + 3 + FEW_FRAMES + 1
+    assert all(text.startswith("lit_solids: ") for text, _ in calls)
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ({"supersample": 2}, "scene.supersample is not a setting.*did you mean 'supersampling'"),
+        ({"size": 0}, "scene.size is 0; expected a whole number from 8"),
+        ({"train_views": True}, "scene.train_views is True"),
+        ({"background": "white"}, "scene.background is 'white'; expected black or random"),
+        ({"hold_out": 1}, "scene.hold_out is 1"),
+    ],
+)
+def test_impossible_settings_are_refused_before_drawing(settings: dict[str, object], text: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=text):
+        load(settings, SceneContext(seed=0, cache_dir=tmp_path))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unwritable_cache_names_the_place(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(DataError, match=r"cannot write the generated images to .*file"):
+        generate(LitSettings(**SMALL), tmp_path / "file")
+
+
+# What it reads as ----------------------------------------------------------------------------------------------------------------------
+
+
+def test_the_loader_of_the_layout_reads_the_same_pixels_and_lights(cache: Path, scene: Scene) -> None:
+    context = SceneContext(seed=3, cache_dir=cache)
+    dataset, folder = load(SMALL, context), generate(LitSettings(**SMALL), cache)
+    plain = olat.load({"path": str(folder), "falloff": "inverse_square"}, context)
+    assert len(dataset.train) == 4 and [dataset.test.view(i).name for i in range(3)] == [f"{part}_00" for part in PARTS]
+    for mine, theirs in ((dataset.train, plain.train), (dataset.test, plain.test)):
+        for i in range(len(mine)):
+            a, b = mine.view(i), theirs.view(i)
+            assert a.name == b.name and torch.equal(a.camera.viewmat, b.camera.viewmat) and a.camera.fx == b.camera.fx
+            assert all(torch.equal(a.conditions[k], b.conditions[k]) for k in ("light", "light_intensity"))
+            assert torch.equal(mine.pixels(i).rgb, theirs.pixels(i).rgb)
+    shot = json.loads((folder / "transforms_train.json").read_text())["frames"][2]
+    pose = np.array(shot["transform_matrix"])
+    fresh = picture(scene, pose, np.array(shot["pl_pos"]), 24, 2)
+    np.testing.assert_array_equal(dataset.train.pixels(2).rgb.numpy(), fresh.rgba[..., :3].astype(np.float16).astype(np.float32))
+    np.testing.assert_array_equal(dataset.classes(2, dataset.train).numpy(), fresh.classes)
+    np.testing.assert_allclose(pose, camera_to_world(pose[:3, 3]), atol=1e-12)
+
+
+def test_the_data_set_says_what_it_is(cache: Path) -> None:
+    dataset = load({**SMALL, "background": "random"}, SceneContext(seed=0, cache_dir=cache))
+    assert (dataset.name, dataset.data_source, dataset.color_space, dataset.falloff) == (
+        "lit_solids",
+        "generated",
+        "linear",
+        "inverse_square",
+    )
+    assert dataset.background.tolist() == [0.0, 0.0, 0.0] and dataset.random_background and dataset.exposure == 1.0
+    assert not load(SMALL, SceneContext(seed=0, cache_dir=cache)).random_background
+    conditions = dataset.train.view(0).conditions
+    assert conditions["light"].shape == (3,) and 4.0 <= float(conditions["light"].norm()) <= 5.0
+    assert conditions["light_intensity"].tolist() == pytest.approx([INTENSITY] * 3)
+    assert all(value.dtype == torch.float32 for value in conditions.values())
+    (clip,) = dataset.clips()
+    assert clip.source is dataset.circle and len(clip.views) == len(dataset.circle) == FEW_FRAMES
+    assert clip.name == "light_round" and dataset.circle.view(1).name == "light_01"
+    views = dataset.orbit(5)
+    assert len({v.conditions["light"].numpy().tobytes() for v in views}) == 5
+    assert all(4.0 <= float(v.conditions["light"].norm()) <= 5.0 and float(v.conditions["light"][2]) > 2.0 for v in views)
+
+
+def test_held_out_training_views_are_judged_too(cache: Path) -> None:
+    dataset = load({**SMALL, "hold_out": 2}, SceneContext(seed=0, cache_dir=cache))
+    assert [dataset.test.view(i).name for i in range(len(dataset.test))] == ["r_0000", "r_0002"] and len(dataset.train) == 2
+    truth = dataset.test.pixels(1).rgb
+    assert dataset.judge(1, truth, truth)["psnr_linear_clamped"] == np.inf
+    assert set(dataset.baselines()) == {"black", "no_cast_shadows"}
+
+
+def test_classes_agree_with_the_images(forty: LitSolids) -> None:
+    brightness: dict[str, list[torch.Tensor]] = {name: [] for name in CLASSES}
+    free_brightness: dict[str, list[torch.Tensor]] = {name: [] for name in CLASSES}
+    for i in range(len(forty.test)):
+        classes, pixels, free = forty.classes(i), forty.test.pixels(i), forty.unshadowed(i)
+        assert pixels.alpha is not None and torch.equal(classes == 0, pixels.alpha < 0.5)
+        assert (pixels.rgb <= free + 1e-3).all()
+        for value, name in enumerate(CLASSES):
+            mine = classes == value
+            brightness[name].append(pixels.rgb[mine].mean(-1))
+            free_brightness[name].append(free[mine].mean(-1))
+    rgb, free_rgb = ({k: torch.cat(v) for k, v in d.items()} for d in (brightness, free_brightness))
+    assert all(len(v) > 3 for v in rgb.values())
+    assert rgb["cast_shadow"].mean() < 0.3 * free_rgb["cast_shadow"].mean()
+    assert rgb["cast_shadow"].quantile(0.7) == 0  # hard shadows: only edges share a pixel with light
+    assert rgb["attached_shadow"].mean() < 0.1 * rgb["lit"].mean() < 0.1 * rgb["highlight"].mean()
+    assert rgb["highlight"].min() > 0.2
+
+
+def test_the_exposure_fits(forty: LitSolids) -> None:
+    assert bright(forty.train, "") == pytest.approx(1.0, abs=0.15)
+
+
+def test_baselines_rank_as_they_should(forty: LitSolids) -> None:
+    numbers = forty.diagnose(None)  # type: ignore[arg-type]  # nothing here depends on the model
+    scores = {name: entry["psnr_linear_clamped"] for name, entry in numbers["baselines"].items()}
+    assert set(scores) == {"black", "no_cast_shadows", "nearest_light_of_25"}
+    assert 8 < scores["black"] < scores["no_cast_shadows"] - 3 < 30 and scores["black"] < scores["nearest_light_of_25"] < 35
+    shares = numbers["class_percent"]
+    assert sum(shares.values()) == pytest.approx(100) and set(shares) == set(CLASSES[1:])
+    free = numbers["baselines"]["no_cast_shadows"]
+    assert free["psnr_pooled_cast_shadow"] < free["psnr_pooled_lit"] - 8
+
+
+def test_the_nearest_light_to_itself_is_perfect(cache: Path) -> None:
+    """Of at most 25 training images all lights are known, so under a seen one the baseline is the truth."""
+    dataset = load(SMALL, SceneContext(seed=0, cache_dir=cache))
+    assert dataset.test.view(0).name == "new_view_00"
+    assert torch.equal(dataset.nearest_light(0), dataset.test.pixels(0).rgb)
+    assert dataset.judge(0, dataset.nearest_light(0), dataset.test.pixels(0).rgb)["psnr_display"] == np.inf
+    assert dataset.baselines()["nearest_light_of_25"]["psnr_display_infinite"] is True
+
+
+def test_judging_names_the_part_and_the_classes(forty: LitSolids) -> None:
+    for index in range(len(forty.test)):
+        name, truth = forty.test.view(index).name, forty.test.pixels(index).rgb
+        found = forty.judge(index, truth * 0.5, truth)
+        assert f"psnr_linear_clamped_{name.rsplit('_', 1)[0]}" in found
+        assert sum(v for k, v in found.items() if k.startswith("pixels_")) == truth.shape[0] * truth.shape[1]
+
+
+def test_damaged_class_map_names_the_file(tmp_path: Path) -> None:
+    dataset = load(SMALL, SceneContext(seed=0, cache_dir=tmp_path))
+    file = dataset.test.file(1).with_name("new_light_00_classes.png")
+    file.write_bytes(b"no png")
+    with pytest.raises(DataError, match=r"new_light_00_classes\.png"):
+        dataset.classes(1)
+
+
+def test_files_hold_half_floats(cache: Path) -> None:
+    folder = generate(LitSettings(**SMALL), cache)
+    assert read_image(folder / "train" / "r_0000.exr").dtype == torch.float16

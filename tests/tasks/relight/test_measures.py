@@ -1,0 +1,115 @@
+"""Measures of relit images, their means, FLIP where it is installed, and the settings' files."""
+
+from __future__ import annotations
+
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+
+from neuprim.core.datasets.settings import read_settings
+from neuprim.core.errors import BackendUnavailable, DataError
+from neuprim.core.flip import flip, flip_available
+from neuprim.core.metrics import means, psnr
+from neuprim.tasks.relight import measure, olat
+from neuprim.tasks.relight.lit import dataset as lit
+from neuprim.tasks.relight.lit.generate import LitSettings
+from neuprim.tasks.relight.measure import CLASSES, class_errors, class_shares, scores
+
+CONF = Path(olat.__file__).parent / "conf" / "scene" / "relight"
+
+
+def images(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand((16, 16, 3), generator=generator), torch.rand((16, 16, 3), generator=generator)
+
+
+def test_what_a_display_cannot_show_does_not_count() -> None:
+    rendered, truth = images()
+    plain = scores(rendered, truth)
+    bright, dark = rendered.clone(), rendered.clone()
+    truth = truth.clone()
+    truth[3, 4], bright[3, 4], dark[3, 4] = 20.0, 5.0, 1.0
+    assert scores(bright, truth) == scores(dark, truth) != plain
+    assert plain["psnr_linear_clamped"] == pytest.approx(psnr(*images()))
+    assert scores(truth, truth)["psnr_display"] == float("inf")
+
+
+def test_classes_pool_by_their_pixels() -> None:
+    rendered, truth = images()
+    first, second = torch.zeros(16, 16, dtype=torch.uint8), torch.full((16, 16), 2, dtype=torch.uint8)
+    first[:4], second[:2] = 2, 0
+    entries = [class_errors(rendered, truth, first), class_errors(rendered + 0.1, truth, second)]
+    assert set(entries[0]) == {"mse_background", "pixels_background", "mse_cast_shadow", "pixels_cast_shadow"}
+    pooled = means(entries)
+    squares = torch.cat(
+        [(rendered - truth).square()[first == 2], ((rendered + 0.1).clamp(0, 1) - truth).square()[second == 2]]
+    )  # one pool over both views
+    assert pooled["psnr_pooled_cast_shadow"] == pytest.approx(-10 * torch.log10(squares.mean()).item(), abs=1e-4)
+    assert pooled["pixels_cast_shadow"] == 64 + 224
+    shares = class_shares([first, second])
+    assert shares == {"lit": 0.0, "cast_shadow": 100.0, "attached_shadow": 0.0, "highlight": 0.0}
+
+
+def test_wrong_class_maps_are_refused() -> None:
+    rendered, truth = images()
+    with pytest.raises(DataError, match="pixel classes"):
+        class_errors(rendered, truth, torch.zeros(8, 16, dtype=torch.uint8))
+    with pytest.raises(DataError, match="values up to 5"):
+        class_errors(rendered, truth, torch.full((16, 16), len(CLASSES), dtype=torch.uint8))
+
+
+def test_means_leave_views_out_that_lack_a_number() -> None:
+    found = means([{"a": 1.0, "psnr_x": float("inf")}, {"a": 3.0}, {"mse_mask": 0.01}, {"mse_mask": 0.03, "pixels_other": 3.0}])
+    assert found == {"a": 2.0, "psnr_x": None, "psnr_x_infinite": True, "psnr_pooled_mask": pytest.approx(16.9897), "pixels_other": 3}
+
+
+def test_without_flip_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    with pytest.raises(BackendUnavailable, match=r"pip install 'neuprim\[flip\]'"):
+        flip(*images())
+
+
+def test_flip_joins_the_scores_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[Any] = []
+
+    def evaluate(reference: Any, test: Any, dynamic_range: str, **options: Any) -> tuple[None, float, dict[str, float]]:
+        calls.append((reference, test, dynamic_range, options))
+        return None, 0.25, {}
+
+    monkeypatch.setitem(sys.modules, "flip_evaluator", types.SimpleNamespace(evaluate=evaluate, __spec__=None))
+    monkeypatch.setattr(measure, "flip_available", lambda: True)
+    rendered, truth = images()
+    assert scores(rendered, truth)["flip"] == 0.25
+    reference, test, dynamic_range, options = calls[0]
+    assert dynamic_range == "LDR" and options["applyMagma"] is False and reference.dtype == test.dtype == "float32"
+    assert abs(reference.mean() - measure.linear_to_srgb(truth).numpy().mean()) < 1e-6
+
+
+@pytest.mark.skipif(not flip_available(), reason="flip-evaluator is not installed")
+def test_flip_of_known_images() -> None:
+    black, white = torch.zeros(32, 32, 3), torch.ones(32, 32, 3)
+    assert flip(white, white) == 0.0 and flip(black, white) > 0.9
+
+
+# Settings' files -----------------------------------------------------------------------------------------------------------------------
+
+
+def settings_of(name: str) -> dict[str, Any]:
+    value = yaml.safe_load((CONF / f"{name}.yaml").read_text())
+    return {k: v for k, v in value.items() if k != "_paths_"}
+
+
+def test_the_files_hold_the_loaders_settings_and_defaults() -> None:
+    found = settings_of("olat")
+    assert found.pop("path") == "???"
+    defaults = read_settings({"path": "x"}, olat._SETTINGS)
+    del defaults["path"]
+    assert found == defaults
+    found = settings_of("lit_solids")
+    assert LitSettings.parse(found, lit._READING) == LitSettings()
+    assert {*LitSettings().__dict__, *lit._READING} == set(found)

@@ -1,5 +1,84 @@
-"""The relighting task: images under one point light each. So far its data: loaders, a built-in scene and measures.
+"""The relighting task: images under one point light each in, a model that takes any light out."""
 
-``olat`` reads the layout of GS³ and NRHints, ``lit`` draws the built-in scene in that layout, ``data`` is the data set both make,
-``measure`` its measures.
-"""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from neuprim.core.choices import choose
+from neuprim.core.cosine import CosineDensity
+from neuprim.core.data import Dataset
+from neuprim.core.errors import ConfigError
+from neuprim.core.fields import ColourField, ConditionSpec, DensityField
+from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
+from neuprim.tasks.relight.colour import FORMS, LightNetwork
+from neuprim.tasks.relight.harmonics import LightHarmonics
+from neuprim.tasks.relight.lights import parse_intensities, parse_lights
+from neuprim.tasks.relight.loss import hdr_loss
+
+__all__ = ["TASK"]
+
+_SETTINGS: dict[str, tuple[Any, ...] | type] = {
+    "form": (*FORMS, "harmonics"),
+    "hidden": int,
+    "visibility": bool,
+    "boost": float,
+    "degree": int,
+}
+
+
+def _colour(model: Mapping[str, Any], channels: int = 3, falloff: bool = False) -> ColourField:
+    chosen = dict(model["colour"])
+    if chosen.get("form") == "harmonics":
+        return LightHarmonics(chosen.get("degree", 5), channels, falloff)
+    chosen.pop("degree", None)
+    return LightNetwork(channels=channels, falloff=falloff, **chosen)
+
+
+def _check(model: Mapping[str, Any]) -> None:
+    choose(model["density"], "model.density", {})
+    choose(model["colour"], "model.colour", _SETTINGS)
+    try:
+        _colour(model)
+    except ValueError as error:
+        raise ConfigError(f"model.colour: {error}") from error
+
+
+def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
+    falloff = getattr(dataset, "falloff", "none") == "inverse_square"
+    return CosineDensity(model["neurons"]), _colour(model, dataset.channels, falloff)
+
+
+# Loaders are imported when used: each pulls in modules of its own.
+
+
+def _lit_solids(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    from neuprim.tasks.relight.lit import load
+
+    return load(settings, context)
+
+
+def _olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    from neuprim.tasks.relight.olat import load
+
+    return load(settings, context)
+
+
+TASK = TaskSpec(
+    api=API_VERSION,
+    name="relight",
+    summary="A scene under any light, from images under one point light each (a colour network per primitive)",
+    config_package="neuprim.tasks.relight.conf",
+    scenes=(
+        SceneSpec("lit_solids", "built in: solids and a glossy ring under moving point lights, with shadows", _lit_solids),
+        SceneSpec("olat", "GS3 / NRHints layout: a light position per image, PNG or EXR: scene.path=DIR", _olat),
+    ),
+    build=_build,
+    loss=hdr_loss,
+    check=_check,
+    conditions=(
+        ConditionSpec("light", (3,), "position, scene units", (-1e6, 1e6), parse_lights),
+        ConditionSpec("light_intensity", (3,), "radiometric", (0.0, 1e6), parse_intensities),
+    ),
+    fields={"CosineDensity": CosineDensity, "LightNetwork": LightNetwork, "LightHarmonics": LightHarmonics},
+)

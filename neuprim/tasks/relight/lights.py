@@ -1,0 +1,60 @@
+"""What a user may write after ``--light`` and ``--light-intensity``."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from neuprim.core.errors import ConfigError
+
+__all__ = ["ORBIT", "parse_intensities", "parse_lights"]
+
+ORBIT = (4.5, 40.0, 60)
+"""Distance in scene units, polar angle in degrees and frames of ``--light orbit``."""
+
+
+def parse_lights(text: str) -> list[Tensor]:
+    """Positions (3,) float32 in scene units: "x,y,z" is one; "orbit", or "orbit:DISTANCE:POLAR:FRAMES", goes round the z axis.
+
+    Raises:
+        ConfigError: another form, or numbers that are not finite.
+    """
+    expected = "expected x,y,z or orbit or orbit:DISTANCE:POLAR_DEGREES:FRAMES"
+    if text.split(":")[0] == "orbit":
+        parts = text.split(":")[1:]
+        try:
+            values = [float(p) for p in parts] + list(ORBIT[len(parts) :])
+            distance, polar, frames = values[0], values[1], int(values[2])
+        except (ValueError, IndexError, OverflowError):
+            raise ConfigError(f"--light {text}: {expected}") from None
+        if len(parts) > 3 or not (0 < distance < 1e6 and 0 <= polar <= 180 and 2 <= frames <= 100_000):
+            raise ConfigError(f"--light {text}: {expected}")
+        across, height = distance * math.sin(math.radians(polar)), distance * math.cos(math.radians(polar))
+        turns = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / frames)
+        return list(torch.stack([across * turns.cos(), across * turns.sin(), torch.full_like(turns, height)], -1).float())
+    return [_numbers(text, "light", expected)]
+
+
+def parse_intensities(text: str) -> list[Tensor]:
+    """(3,) float32 intensity: "r,g,b" or one number for all.
+
+    Raises:
+        ConfigError: another form, or numbers that are negative or not finite.
+    """
+    expected = "expected r,g,b or one number, 0 or more"
+    found = _numbers(f"{text},{text},{text}" if "," not in text else text, "light-intensity", expected)
+    if bool((found < 0).any()):
+        raise ConfigError(f"--light-intensity {text}: {expected}")
+    return [found]
+
+
+def _numbers(text: str, name: str, expected: str) -> Tensor:
+    try:
+        values = [float(p) for p in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 3 or not all(math.isfinite(v) for v in values):
+        raise ConfigError(f"--{name} {text}: {expected}")
+    return torch.tensor(values)

@@ -1,0 +1,202 @@
+"""Colour under a light: equation 14, its variants, shadows, and the spherical-harmonics baseline."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from neuprim.core import sh
+from neuprim.core.cosine import CosineDensity
+from neuprim.core.errors import ConfigError
+from neuprim.core.fields import Cosine, RayNet
+from neuprim.core.geometry import Geometry
+from neuprim.core.primitives import Primitives
+from neuprim.core.render import RenderSettings, render
+from neuprim.core.schema import InitContext
+from neuprim.core.train.population import split
+from neuprim.tasks.relight import TASK
+from neuprim.tasks.relight.colour import FORMS, LightNetwork
+from neuprim.tasks.relight.harmonics import LightHarmonics, real_harmonics
+from neuprim.tasks.relight.lights import parse_intensities, parse_lights
+from neuprim.tasks.relight.visibility import light_visibility
+from tests import scenes
+
+COUNT = 12
+
+
+def light(x: float = 2.0, y: float = -1.0, z: float = 3.0, strength: float = 1.0) -> dict[str, Tensor]:
+    return {"light": torch.tensor([x, y, z]), "light_intensity": torch.full((3,), strength)}
+
+
+def model(colour: LightNetwork | LightHarmonics, dtype: torch.dtype = torch.float64, neurons: int = 3) -> Primitives:
+    generator = torch.Generator().manual_seed(5)
+    t = scenes.tensors(COUNT, neurons, seed=3, dtype=dtype)
+    params = {k: v for k, v in t.items() if k != "colors"}
+    for spec in colour.parameters():
+        params[spec.name] = 0.5 * torch.randn((COUNT, *spec.shape), generator=generator, dtype=dtype)
+    params["c_dc"] = params["c_dc"].abs()
+    return Primitives(CosineDensity(neurons), colour, {k: v.requires_grad_() for k, v in params.items()})
+
+
+def shade(form: RayNet, local: Tensor) -> Tensor:
+    """(N, C) colours at one local point per primitive."""
+    hidden = torch.cos((form.Wx * local[:, None]).sum(-1) + form.bias)
+    return (form.base + (form.Wout * hidden[:, None]).sum(-1)).clamp_min(0)
+
+
+# ---------------------------------------------------------------- what is stored
+
+
+def test_equation_14_has_the_papers_number_of_parameters() -> None:
+    generator = torch.Generator().manual_seed(0)
+    context = InitContext(torch.rand(4, 3), torch.ones(4), torch.rand(4, 3), generator)
+    assert Primitives.initialise(CosineDensity(8), LightNetwork(), context).parameters_per_primitive == 158
+    assert Primitives.initialise(CosineDensity(8), LightHarmonics(5), context).parameters_per_primitive == 159
+    assert Primitives.initialise(CosineDensity(8), LightNetwork(0), context).parameters_per_primitive == 54
+
+
+# ---------------------------------------------------------------- equation 14
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_closed_form_is_the_network(form: str) -> None:
+    field = LightNetwork(4, form=form, visibility=False, boost=2.5, falloff=True)
+    m = model(field)
+    p = {k: v.detach() for k, v in m.of(field).items()}
+    camera, c = scenes.camera(), light(strength=1.7)
+    found = field.lower(p, m.geometry, camera, c)
+    local = 0.3 * torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    means = m.params["means"].detach()
+    d = means - camera.position.double()
+    l = c["light"].double() - means
+    distance = l.norm(dim=1, keepdim=True)
+    d, l = d / d.norm(dim=1, keepdim=True), l / distance
+    inputs = (p["net_x"] * local[:, None]).sum(-1) + (p["net_view"] * d[:, None]).sum(-1) + (p["net_light"] * l[:, None]).sum(-1)
+    hidden = torch.cos(2.5 * (inputs + p["net_phase"]))
+    out = (p["net_out"] * hidden[:, None]).sum(-1)
+    expected = p["c_dc"] + out if form == "additive" else p["c_dc"] * (1 + out)
+    assert torch.allclose(shade(found, local), expected.clamp_min(0) * 1.7 / distance**2, atol=1e-6)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_split_carries_the_colour(form: str) -> None:
+    field = LightNetwork(4, form=form, visibility=False)
+    m = model(field)
+    parents = torch.arange(COUNT)
+    children = split(m, parents, 0.5, 0.6, 0.9)
+    whole = {k: v.detach() for k, v in m.params.items()}
+    for half in (slice(0, COUNT), slice(COUNT, 2 * COUNT)):
+        child = {k: v[half] for k, v in children.items()}
+        geometry = Geometry(child["means"], child["log_scales"], child["quats"])
+        x = geometry.means + 0.4 * geometry.scales
+        names = [s.name for s in field.parameters()]
+        # one place for the directions, so that only the local part differs
+        same = Geometry(whole["means"], geometry.log_scales, geometry.quats)
+        after = field.lower({n: child[n] for n in names}, same, scenes.camera(), light())
+        before = field.lower({n: whole[n] for n in names}, m.geometry, scenes.camera(), light())
+        inside = (x - geometry.means) / geometry.length_scale[:, None]
+        outside = (x - whole["means"]) / m.geometry.length_scale.detach()[:, None]
+        assert torch.allclose(shade(after, inside), shade(before, outside), atol=1e-9)
+
+
+@pytest.mark.parametrize("where", [(0.0, 0.0, 0.0), (1e8, 0.0, 1e8), (0.3, 0.2, -50.0)])
+@pytest.mark.parametrize("visibility", [False, True])
+def test_lights_at_a_centre_at_infinity_and_below_the_ground(where: tuple[float, float, float], visibility: bool) -> None:
+    field = LightNetwork(4, visibility=visibility)
+    m = model(field, torch.float32)
+    c = light(*where)
+    if where == (0.0, 0.0, 0.0):
+        c["light"] = m.params["means"][3].detach().clone()
+    output = render(m, scenes.camera(), c)
+    assert bool(torch.isfinite(output.rgb).all()) and bool(output.rgb.any())
+    output.rgb.sum().backward()
+    assert all(bool(torch.isfinite(v.grad).all()) for v in m.params.values() if v.grad is not None)
+
+
+def test_no_light_is_black() -> None:
+    m = model(LightNetwork(4), torch.float32)
+    assert not bool(render(m, scenes.camera(), light(strength=0.0)).rgb.any())
+
+
+def test_without_hidden_units_the_colour_is_constant() -> None:
+    m = model(LightNetwork(0, visibility=False), torch.float32)
+    a, b = (render(m, scenes.camera(), light(*where)).rgb for where in ((2.0, -1.0, 3.0), (-3.0, 1.0, 0.5)))
+    assert torch.equal(a, b) and bool(a.any())
+
+
+# ---------------------------------------------------------------- shadows
+
+
+def slabs() -> tuple[Geometry, Cosine]:
+    """A small opaque ball above the middle of a row of balls on the ground."""
+    means = torch.tensor([[0.0, 0.0, 1.0], *([x, 0.0, 0.0] for x in (-1.5, -0.75, 0.0, 0.75, 1.5))])
+    count = len(means)
+    geometry = Geometry(means, torch.full((count, 3), math.log(0.3)), torch.tensor([[1.0, 0, 0, 0]] * count))
+    return geometry, Cosine(torch.zeros(count, 0, 3), torch.zeros(count, 0), torch.zeros(count, 0), torch.full((count, 1), 8.0))
+
+
+def test_what_lies_behind_something_is_in_its_shadow() -> None:
+    geometry, density = slabs()
+    straight = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 5.0]), bias=0.35)
+    assert float(straight[3]) < 0.05 and bool((straight[[0, 1, 2, 4, 5]] > 0.8).all())
+    slanted = light_visibility(geometry, density, torch.tensor([4.0, 0.0, 1.0 + 4.0 * (1.0 / 0.75)]), bias=0.35)
+    assert float(slanted[2]) < 0.3 and float(slanted[3]) > 0.8
+
+
+def test_shadows_carry_no_gradient_and_are_bounded() -> None:
+    geometry, density = slabs()
+    wanted = Geometry(geometry.means.requires_grad_(), geometry.log_scales, geometry.quats)
+    found = light_visibility(wanted, density, torch.tensor([0.5, 0.2, 4.0]))
+    assert not found.requires_grad and bool(((found >= 0) & (found <= 1)).all())
+
+
+# ---------------------------------------------------------------- harmonics
+
+
+def test_the_recurrence_agrees_with_the_renderers_harmonics() -> None:
+    d = torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    d = d / d.norm(dim=1, keepdim=True)
+    mine, theirs = real_harmonics(d, 3), sh.basis(d, 3)
+    assert torch.allclose(mine.abs(), theirs.abs(), atol=1e-6)  # signs are a convention
+
+
+def test_harmonics_are_orthonormal() -> None:
+    n = 200_000
+    i = torch.arange(n, dtype=torch.float64) + 0.5
+    z, phi = 1 - 2 * i / n, i * math.pi * (1 + 5**0.5)
+    d = torch.stack([(1 - z * z).sqrt() * phi.cos(), (1 - z * z).sqrt() * phi.sin(), z], -1)
+    y = real_harmonics(d, 5)
+    assert torch.allclose(y.T @ y * (4 * math.pi / n), torch.eye(36, dtype=torch.float64), atol=1e-3)
+
+
+# ---------------------------------------------------------------- words
+
+
+def test_lights_on_the_command_line() -> None:
+    assert parse_lights("1,2,3")[0].tolist() == [1, 2, 3]
+    round_ = parse_lights("orbit:2:90:4")
+    assert len(round_) == 4 and round_[1].tolist() == pytest.approx([0, 2, 0], abs=1e-6)
+    assert len(parse_lights("orbit")) == 60
+    assert parse_intensities("2")[0].tolist() == [2, 2, 2]
+
+
+@pytest.mark.parametrize("text", ["1,2", "a,b,c", "nan,0,0", "orbit:0", "orbit:1:2:1", "orbit:1:2:3:4", "", "1e999,0,0"])
+def test_impossible_lights(text: str) -> None:
+    with pytest.raises(ConfigError, match="expected x,y,z or orbit"):
+        parse_lights(text)
+
+
+def test_the_task_rebuilds_its_fields() -> None:
+    for field in (LightNetwork(3, form="multiplicative", visibility=False), LightHarmonics(4)):
+        again = TASK.fields[type(field).__name__](**field.settings())  # type: ignore[index]
+        assert [(s.name, s.shape) for s in again.parameters()] == [(s.name, s.shape) for s in field.parameters()]
+
+
+def test_gradients_reach_every_parameter() -> None:
+    m = model(LightNetwork(4), torch.float32)
+    render(m, scenes.camera(), light(), RenderSettings(backend="cpu")).rgb.square().sum().backward()
+    for name, value in m.params.items():
+        assert value.grad is not None and bool(value.grad.any()), name

@@ -240,6 +240,8 @@ def damaged(kind: str, tensors: dict[str, Tensor], header: dict[str, Any]) -> No
     elif kind == "parameter nan":
         tensors["params.w2"] = torch.full_like(tensors["params.w2"], float("nan"))
     elif kind == "rows differ":
+    elif kind == "other names":
+        header["names"] = "0" * 16
         tensors["params.w2"] = tensors["params.w2"][:5].contiguous()
     elif kind == "scalar means":
         tensors["params.means"] = torch.tensor(1.0)
@@ -262,8 +264,8 @@ def damaged(kind: str, tensors: dict[str, Tensor], header: dict[str, Any]) -> No
 
 
 DAMAGES = [
-    "no step", "step of text", "step negative", "elapsed nan", "other data", "missing parameter", "parameter shape", "parameter type",
-    "parameter nan", "rows differ", "scalar means", "missing moment", "moment shape", "moment type", "age shape", "order range",
+    "no step", "step of text", "step negative", "elapsed nan", "other data", "other names", "missing parameter", "parameter shape",
+    "parameter type", "parameter nan", "rows differ", "scalar means", "missing moment", "moment shape", "moment type", "age shape", "order range",
     "no generator", "short generator", "population shape",
 ]  # fmt: skip
 

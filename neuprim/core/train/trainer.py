@@ -69,8 +69,8 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
         neighbours = min(3, len(cloud.means) - 1)
         distance = torch.from_numpy(cKDTree(cloud.means.numpy()).query(cloud.means.numpy(), k=neighbours + 1)[0][:, 1:])
         scales = distance.square().mean(dim=1).sqrt().clamp_min(1e-6 * dataset.extent).float()
-    scales = scales * float(settings.init.get("scale", 1.0))
     context = InitContext(cloud.means.float(), scales, cloud.colors.float(), generator, settings.init, cloud.conditions)
+    context.scales = scales * context.number("scale", 1.0, 0)
     return Primitives.initialise(density, colour, context)
 
 

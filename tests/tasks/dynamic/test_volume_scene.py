@@ -181,7 +181,7 @@ def test_the_files_extinction_on_a_lattice(folder: Path, tmp_path: Path) -> None
         ({"look": "smok_fire"}, r"smok_fire.*'smoke_fire'"),
         ({"optics": {"extinktion": 1}}, r"scene\.optics\.extinktion: no such setting.*'extinction'"),
         ({"optics": {"extinction": -1.0}}, r"look: .*negative"),
-        ({"optics": {"extinction": "much"}}, r"scene\.optics\.extinction='much'"),
+        ({"optics": {"extinction": "much"}}, r"scene\.optics\.extinction=much"),
         ({"grids": {"smoke": "density"}}, r"scene\.grids\.smoke: no such meaning"),
         ({"vdb": None}, r"scene\.vdb: required"),
     ],

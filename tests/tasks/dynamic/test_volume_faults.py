@@ -5,12 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from neuprim.core.errors import ConfigError
-from neuprim.core.vdb import write_vdb
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.vdb import Grid, scale_transform, write_vdb
 from neuprim.tasks.dynamic.volume.looks import changed, named_look
-from tests.tasks.dynamic.test_volume_scene import blob
+from neuprim.tasks.dynamic.volume.normalise import Normalisation
+from neuprim.tasks.dynamic.volume.optics import medium_of
+from tests.tasks.dynamic.test_volume_scene import VOXEL, blob, dataset
 
 
 @pytest.fixture
@@ -66,3 +69,54 @@ def test_optics_of_every_form() -> None:
     assert changed(look, {"light": None}).light is None
     with pytest.raises(ConfigError, match=r"scene\.optics\.light\.irradiance: required .* the look has no light"):
         changed(named_look("embergen_fire"), {"light": {"direction": [0, 0, 1]}})
+
+
+# ---------------------------------------------------------------- grids
+
+
+def test_the_box_is_that_of_the_grid_that_the_look_absorbs_by(folder: Path, tmp_path: Path) -> None:
+    hot = blob(10.0, ("temperature",))[0]
+    far = Grid.from_dense("density", np.ones((8, 8, 8), np.float32), transform=scale_transform(VOXEL, (500.0, 0.0, 0.0)))
+    write_vdb(folder / "ball_1.vdb", [hot, far])
+    write_vdb(folder / "ball_2.vdb", [hot])  # has what absorbs, whatever else it lacks
+    data = dataset(folder, tmp_path, look="embergen_fire")
+    assert data.shoot.normalisation.center[0] < 100
+    alphas = [data.test.pixels(i).alpha for i in range(2)]
+    assert all(a is not None and bool(a.any()) for a in alphas)
+    assert dataset(folder, tmp_path, look="dust_tornado").shoot.normalisation.center[0] > 400
+
+
+def test_a_frame_without_the_grid_that_absorbs_takes_no_other(folder: Path, tmp_path: Path) -> None:
+    write_vdb(folder / "ball_2.vdb", blob(12.0, ("temperature", "flames")))
+    data = dataset(folder, tmp_path, look="smoke_fire")
+    assert data.shoot.medium(data.shoot.frames[1]).empty and not data.shoot.medium(data.shoot.frames[0]).empty
+
+
+def test_a_look_whose_grids_are_missing(folder: Path, tmp_path: Path) -> None:
+    for number in (1, 2):
+        write_vdb(folder / f"ball_{number}.vdb", blob(10.0 + number, ("density",)))
+    message = r"files: this look absorbs by temperature, and the files have density \('density'\)"
+    with pytest.raises(DataError, match=message):
+        dataset(folder, tmp_path, look="embergen_fire")
+
+
+def test_a_vector_grid_as_density_names_the_file(folder: Path, tmp_path: Path) -> None:
+    vector = Grid.from_dense("density", np.ones((8, 8, 8, 3), np.float32), transform=scale_transform(VOXEL))
+    write_vdb(folder / "ball_1.vdb", [vector])
+    with pytest.raises(DataError, match=r"ball_1\.vdb: grid 'density' has 3 channels; expected 1"):
+        dataset(folder, tmp_path)
+
+
+def test_grids_far_from_the_worlds_origin_are_still_told_apart() -> None:
+    look = named_look("smoke_fire")
+    index = np.stack(np.meshgrid(*(np.arange(24, dtype=np.float32),) * 3, indexing="ij"), -1)
+    ball = np.clip(1 - np.linalg.norm(index - 12, axis=-1) / 8, 0, None)
+    media = []
+    for offset in (0.0, 1e7):
+        coarse = Grid.from_dense("flames", ball[::2, ::2, ::2], transform=scale_transform(2e-3, (offset, 0, 0)))
+        fine = Grid.from_dense("density", ball, transform=scale_transform(1e-3, (offset, 0, 0)))
+        box = fine.world_bounds()
+        assert box is not None
+        media.append(medium_of({"density": fine, "flames": coarse}, look, Normalisation.from_bounds(box), 1))
+    near, far = (m.values for m in media)
+    assert near.shape == far.shape and np.allclose(near, far, atol=0.02 * float(near.max()))

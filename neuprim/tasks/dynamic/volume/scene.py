@@ -42,7 +42,8 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     folder, name, source = _files(asked, context)
     frames = _frames(folder, asked)
     reader = find_grids(frames, asked.grids)
-    look = _look(asked, AUTO[reader.extinction == "temperature"])
+    look = _look(asked, AUTO["density" not in reader.names])
+    reader = reader.absorbing(look.extinction_grids, folder)
     box, hottest = _survey(frames, reader, context.progress)
     if "flame_range" not in asked.optics and source == "real":
         look = dataclasses.replace(look, flame_range=(0.0, hottest)) if hottest > 0 else look

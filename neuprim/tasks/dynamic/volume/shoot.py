@@ -15,7 +15,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +74,10 @@ class Shoot:
         grids = self.reader.read(frame.path)
         if self.reader.extinction not in grids:
             return Medium.nothing()
-        return medium_of(grids, self.look, self.normalisation)
+        try:
+            return medium_of(grids, replace(self.look, extinction_grids=(self.reader.extinction,)), self.normalisation)
+        except DataError as error:
+            raise DataError(f"{frame.path}: {error}") from error
 
     def image(self, folder: Path, frame: Frame, camera: int) -> Path:
         """File of one image."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.vdb import Grid, scale_transform, write_vdb
@@ -120,3 +121,21 @@ def test_grids_far_from_the_worlds_origin_are_still_told_apart() -> None:
         media.append(medium_of({"density": fine, "flames": coarse}, look, Normalisation.from_bounds(box), 1))
     near, far = (m.values for m in media)
     assert near.shape == far.shape and np.allclose(near, far, atol=0.02 * float(near.max()))
+
+
+# ---------------------------------------------------------------- time and starting points
+
+
+def test_a_gap_in_the_numbers_is_a_gap_in_time(folder: Path, tmp_path: Path) -> None:
+    write_vdb(folder / "ball_5.vdb", blob(16.0))
+    data = dataset(folder, tmp_path)
+    assert [float(t) for t in data.test.times] == [0.0, 0.25, 1.0]
+    assert [float(t) for t in dataset(folder, tmp_path, frames="2:5:3").train.times] == [0.0, 1.0]
+    assert [float(t) for t in dataset(folder, tmp_path, frames="2:4").train.times] == [0.0]
+
+
+def test_more_starting_points_than_were_kept_are_distinct(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neuprim.tasks.dynamic.volume.shoot.POINTS", 64)
+    points = dataset(folder, tmp_path).initial_points(1000, torch.Generator().manual_seed(0))
+    assert len(points.means) == 1000 == len(np.unique(points.means.numpy(), axis=0))
+    assert float(points.means.abs().max()) < 0.7

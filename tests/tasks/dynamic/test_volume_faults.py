@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -139,3 +140,34 @@ def test_more_starting_points_than_were_kept_are_distinct(folder: Path, tmp_path
     points = dataset(folder, tmp_path).initial_points(1000, torch.Generator().manual_seed(0))
     assert len(points.means) == 1000 == len(np.unique(points.means.numpy(), axis=0))
     assert float(points.means.abs().max()) < 0.7
+
+
+# ---------------------------------------------------------------- light that half floats cannot hold
+
+
+def test_light_beyond_half_floats(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"ball_1\.vdb: a radiance of .* does not fit .*scene\.optics\.emission"):
+        dataset(folder, tmp_path, optics={"emission": 1e6})
+    with pytest.raises(DataError, match="every frame is black"):
+        dataset(folder, tmp_path, optics={"extinction": 1e-12, "flame_extinction": 0.0})
+
+
+# ---------------------------------------------------------------- the cache
+
+
+def test_two_runs_that_render_the_same_frame_do_not_disturb_each_other(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = dataset(folder, tmp_path)
+    image = data.shoot.image(data.folder, data.shoot.frames[0], 0)
+    before = os.stat(image).st_ino
+    data.shoot._take_frame(data.folder, data.shoot.frames[0])  # as the slower one of two does
+    assert os.stat(image).st_ino == before
+    assert not list(data.folder.glob(".*"))
+
+
+def test_a_damaged_image_says_what_to_do(folder: Path, tmp_path: Path) -> None:
+    data = dataset(folder, tmp_path)
+    data.shoot.image(data.folder, data.shoot.frames[1], 0).write_bytes(b"")
+    with pytest.raises(DataError, match=r"cam_00\.exr: file is empty.*; delete the folder .*frame_00002 to render the frame again"):
+        data.train.pixels(1)

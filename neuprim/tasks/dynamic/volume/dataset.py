@@ -62,7 +62,11 @@ class FrameViews(ViewSet):
             return self._kept[index]
         c, t = divmod(index, len(self.times))
         camera = self.shoot.cameras[self.cameras[c]]
-        rgba = images.read_image(self.shoot.image(self.folder, self.frames[t], self.cameras[c]), (camera.width, camera.height))
+        path = self.shoot.image(self.folder, self.frames[t], self.cameras[c])
+        try:
+            rgba = images.read_image(path, (camera.width, camera.height))
+        except DataError as error:
+            raise DataError(f"{error}; delete the folder {path.parent} to render the frame again") from error
         self._kept[index] = rgba = rgba.half()
         while len(self._kept) > 1 and len(self._kept) * rgba.numel() * 2 > self.memory:
             self._kept.popitem(last=False)

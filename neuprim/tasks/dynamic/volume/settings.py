@@ -62,8 +62,8 @@ class VolumeSettings:
             value = getattr(made, name)
             if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
                 raise ConfigError(f"scene.{name}={value!r}: expected a whole number from {lowest} to {highest}")
-        if made.timesteps is not None and not (isinstance(made.timesteps, int) and 2 <= made.timesteps <= 10_000):
-            raise ConfigError(f"scene.timesteps={made.timesteps!r}: expected a whole number from 2 to 10000, or null")
+        if made.timesteps is not None and not (isinstance(made.timesteps, int) and 2 <= made.timesteps <= 1000):
+            raise ConfigError(f"scene.timesteps={made.timesteps!r}: expected a whole number from 2 to 1000, or null")
         if made.up not in ("y", "z"):
             raise ConfigError(f"scene.up={made.up!r}: expected y or z")
         for meaning, grid in made.grids.items():

@@ -105,7 +105,8 @@ def changed(look: Look, changes: Mapping[str, Any]) -> Look:
         if key not in known:
             raise ConfigError(f"{where}: no such setting{nearest(key, known)}")
         try:
-            look = dataclasses.replace(look, **{key: _light(look, value, where) if key == "light" else _value(key, value, where)})
+            change: dict[str, Any] = {key: _light(look, value, where) if key == "light" else _value(key, value, where)}
+            look = dataclasses.replace(look, **change)
         except ConfigError as error:
             raise ConfigError(str(error) if str(error).startswith(where) else f"{where}={value}: {error}") from error
     return look

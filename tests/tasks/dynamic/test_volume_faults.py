@@ -142,6 +142,13 @@ def test_more_starting_points_than_were_kept_are_distinct(folder: Path, tmp_path
     assert float(points.means.abs().max()) < 0.7
 
 
+def test_matter_in_frames_that_are_not_learned_from(folder: Path, tmp_path: Path) -> None:
+    empty = [Grid.from_dense("density", np.zeros((8, 8, 8), np.float32), transform=scale_transform(VOXEL))]
+    write_vdb(folder / "ball_1.vdb", empty)
+    with pytest.raises(DataError, match=r"no frame to learn from absorbs light; .*scene\.train_every"):
+        dataset(folder, tmp_path, train_every=2).initial_points(5, torch.Generator().manual_seed(0))
+
+
 # ---------------------------------------------------------------- light that half floats cannot hold
 
 

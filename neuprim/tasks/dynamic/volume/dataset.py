@@ -108,7 +108,9 @@ class VolumeDataset(Dataset):
         total = np.array(self.weights)
         total[[t for t in range(len(total)) if t % self.every]] = 0.0  # nothing is known of frames that are not learned from
         if not total.sum() > 0:
-            raise DataError(f"{self.name}: no frame absorbs light; expected extinction somewhere")
+            raise DataError(
+                f"{self.name}: no frame to learn from absorbs light; expected extinction in one (scene.frames, scene.train_every)"
+            )
         share = torch.multinomial(torch.from_numpy(total), count, replacement=True, generator=generator)
         per_frame = torch.bincount(share, minlength=len(total)).tolist()
         means, colors, times = [], [], []

@@ -7,6 +7,7 @@ neuprim keeps its traceback. Heavy modules are imported by the subcommands that 
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import re
 import sys
@@ -22,6 +23,12 @@ if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
 
 __all__ = ["main"]
+
+DISK = (
+    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO),
+    *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
+)
+"""What a disk or a path may refuse wherever a command reads or writes; a missing file is left out, as it may well be a bug."""
 
 COMMON_KEYS = """\
 commonest keys:
@@ -67,6 +74,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `neuprim tasks | head`; the interpreter's own flush at exit must not fail either
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
+    except OSError as error:
+        if error.errno not in DISK:
+            raise
+        print(f"neuprim: error: {error.filename or 'writing'}: {error.strerror}", file=sys.stderr)
+        return 2
     except SystemExit as stop:  # argparse, after --help and --version
         return stop.code if isinstance(stop.code, int) else 0
 
@@ -302,6 +314,8 @@ def _rows(metrics: Mapping[str, Any], where: str = "") -> list[tuple[str, str]]:
         name = f"{where}{key}"
         if isinstance(value, Mapping):
             rows += _rows(value, name + ".")
+        elif isinstance(value, list) and value and all(isinstance(entry, Mapping) for entry in value):
+            rows.append((name, f"{len(value)} entries, in the run's metrics.json"))
         else:
             rows.append((name, f"{value:.4f}" if isinstance(value, float) else str(value)))
     return rows

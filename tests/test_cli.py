@@ -1,3 +1,4 @@
+import errno
 import subprocess
 import sys
 import types
@@ -7,7 +8,7 @@ from typing import Any
 import pytest
 
 import neuprim
-from neuprim.cli import main
+from neuprim.cli import _print_metrics, main
 from neuprim.config import RunConfig
 from neuprim.core.errors import DataError, NonFiniteError
 from tests.plugins.fakes import install, site, toy
@@ -117,9 +118,10 @@ def test_a_failing_combination_does_not_lose_the_others(
         (["render", ".", "--camera", "no.json"], "no.json: no such file"),
         (["render", ".", "--camera", "orbit", "--size", "640"], "expected WIDTHxHEIGHT"),
         (["render", ".", "--camera", "orbit", "--size", "0x5"], "expected WIDTHxHEIGHT"),
-        (["render", ".", "--camera", "orbit", "--format", "gif"], "gif"),
+        (["render", ".", "--camera", "orbit", "--format", "bmp"], "bmp"),
         (["render", ".", "--camera", "orbit", "--frames", "0"], "expected a positive count"),
         (["render", ".", "--camera", "orbit", "--time", "0"], "config.yaml: missing"),
+        (["vdb", "info", "x" * 300], "File name too long"),
         (["tasks", "more"], "more: no such argument of `neuprim tasks`"),
     ],
 )
@@ -152,7 +154,25 @@ def test_interrupt_is_130_and_a_bug_keeps_its_traceback(calls: list[Any], monkey
         main(["run", "task=toy"])
 
 
+def test_a_disk_that_refuses_is_no_bug(calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(config: RunConfig) -> Path:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(sys.modules["neuprim.run"], "run", full)
+    assert main(["run", "task=toy"]) == 2
+    assert error_line(capsys) == "neuprim: error: writing: No space left on device\n"
+
+
 # ---------------------------------------------------------------- eval, render
+
+
+def test_eval_counts_what_is_too_long_for_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    _print_metrics({"psnr": 30.0, "per_view": [{"psnr": 1.0}, {"psnr": 2.0}], "background": [0.0, 0.0]})
+    assert [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()] == [
+        "psnr 30.0000",
+        "per_view 2 entries, in the run's metrics.json",
+        "background [0.0, 0.0]",
+    ]
 
 
 def test_eval_prints_metrics(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
@@ -166,12 +186,12 @@ def test_render(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     main(["run", "task=toy", "output_dir=r"])
     capsys.readouterr()
     assert main(["render", "r", "--camera", "test"]) == 0
-    assert calls[-1] == (Path("r"), "test", None, "png", None, 60, {})
+    assert calls[-1] == (Path("r"), "test", None, None, None, 60, {}, None)
     assert capsys.readouterr().out == "a.png\nb.png\n"
     Path("cams.json").touch()
-    flags = ["--camera", "cams.json", "--size", "640x480", "--format", "exr", "--out", "o", "--frames", "3"]
+    flags = ["--camera", "cams.json", "--size", "640x480", "--format", "exr", "--out", "o", "--frames", "3", "--fps", "12"]
     assert main(["render", "r", *flags, "--time", "0:1", "--light-pos=-1,0,2"]) == 0
-    assert calls[-1] == (Path("r"), "cams.json", (640, 480), "exr", Path("o"), 3, {"time": "0:1", "light_pos": "-1,0,2"})
+    assert calls[-1] == (Path("r"), "cams.json", (640, 480), "exr", Path("o"), 3, {"time": "0:1", "light_pos": "-1,0,2"}, 12.0)
 
 
 def test_render_knows_the_conditions_of_the_runs_task(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:

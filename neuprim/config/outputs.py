@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -35,9 +36,19 @@ def output_directory(asked: str | None, name: str, resume: bool, check: bool = T
             raise ConfigError(f"output_dir={path}: is a file; expected a directory")
         if not resume and path.is_dir() and any(path.iterdir()):
             raise ConfigError(f"output_dir={path}: exists and is not empty; choose another, or continue its run with resume=true")
+        _check_place(path)
     except (OSError, ValueError) as error:
         raise ConfigError(f"output_dir={path}: {error}") from error
     return path
+
+
+def _check_place(path: Path) -> None:
+    """Refuses a directory that cannot be made or written, before a run has prepared its data for it."""
+    there = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
+    if not there.is_dir():
+        raise ConfigError(f"output_dir={path}: {there} is a file; expected a directory")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ConfigError(f"output_dir={path}: {there} cannot be written to")
 
 
 def _numbers(name: str) -> list[int]:

@@ -9,6 +9,8 @@ from neuprim.core.errors import ConfigError, nearest
 
 __all__ = ["choose"]
 
+_KINDS = {str: "text", int: "a whole number", float: "a number", bool: "true or false"}
+
 
 def choose(found: Mapping[str, Any], where: str, offered: Mapping[str, tuple[Any, ...] | type]) -> None:
     """Refuse unknown keys, and values that are none of those offered (or not of the type offered).
@@ -27,5 +29,5 @@ def choose(found: Mapping[str, Any], where: str, offered: Mapping[str, tuple[Any
         if isinstance(options, tuple):
             if value not in options:
                 raise ConfigError(f"{where}.{key}={value!r}: expected {' or '.join(map(str, options))}")
-        elif not isinstance(value, options) or (isinstance(value, bool) and options is not bool):
-            raise ConfigError(f"{where}.{key}={value!r}: expected a {options.__name__}")
+        elif not isinstance(value, (int, float) if options is float else options) or (isinstance(value, bool) and options is not bool):
+            raise ConfigError(f"{where}.{key}={value!r}: expected {_KINDS.get(options, options.__name__)}")

@@ -60,8 +60,7 @@ class CosineDensity(DensityField):
 
 
 def _initial_offset(ctx: InitContext, amplitude: float) -> Tensor:
-    mode = ctx.settings.get("mode", "opaque")
-    alpha = float(ctx.settings.get("alpha", 0.8))  # type: ignore[arg-type]
+    mode, alpha = ctx.choice("mode", "opaque", "paper"), ctx.number("alpha", 0.8, 0, 1)
     opaque = -math.log1p(-alpha) / 2.0  # a central chord of a sphere has optical depth 2 b2
     if mode == "paper" and amplitude:
         return ctx.uniform(1, bound=amplitude)

@@ -55,7 +55,7 @@ class GaussianDensity(DensityField):
         return [ParameterSpec("log_amplitude", (1,), 1e-1, self._initial, "exp")]
 
     def _initial(self, ctx: InitContext) -> Tensor:
-        alpha = 0.1 if ctx.settings.get("mode", "opaque") == "paper" else float(ctx.settings.get("alpha", 0.8))  # type: ignore[arg-type]
+        alpha = 0.1 if ctx.choice("mode", "opaque", "paper") == "paper" else ctx.number("alpha", 0.8, 0, 1)
         central = math.sqrt(2 * math.pi) / self.deviations * math.erf(self.deviations / math.sqrt(2))  # a sphere's depth at kappa = 1
         return torch.full((ctx.count, 1), math.log(-math.log1p(-alpha) / central))
 

@@ -6,12 +6,15 @@ no second list of tensors anywhere.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
 from torch import Tensor
+
+from neuprim.core.errors import ConfigError
 
 __all__ = ["InitContext", "ParameterSpec", "Params"]
 
@@ -49,6 +52,29 @@ class InitContext:
         """U(-bound, bound) of shape (N, *shape), float32."""
         u = torch.rand((self.count, *shape), generator=self.generator, dtype=torch.float32)
         return (2.0 * u - 1.0) * bound
+
+    def number(self, name: str, default: float, low: float = -math.inf, high: float = math.inf) -> float:
+        """``settings[name]`` as a number strictly between ``low`` and ``high``.
+
+        Raises:
+            ConfigError: it is something else.
+        """
+        value = self.settings.get(name, default)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not (math.isfinite(value) and low < value < high):
+            limits = f" above {low:g}" * math.isfinite(low) + " and" * math.isfinite(low + high) + f" below {high:g}" * math.isfinite(high)
+            raise ConfigError(f"model.init.{name}={value}: expected a number{limits}")
+        return float(value)
+
+    def choice(self, name: str, *offered: str) -> str:
+        """``settings[name]``, one of those offered; the first by default.
+
+        Raises:
+            ConfigError: it is something else.
+        """
+        value = self.settings.get(name, offered[0])
+        if value not in offered:
+            raise ConfigError(f"model.init.{name}={value}: expected {' or '.join(offered)}")
+        return str(value)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neuprim.core import checkpoint
 from neuprim.core.data import Dataset, Pixels
-from neuprim.core.errors import CheckpointError, DataError, NonFiniteError
+from neuprim.core.errors import CheckpointError, ConfigError, DataError, NonFiniteError
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer, initial_model
 from tests.core import tiny
@@ -219,6 +219,15 @@ def test_few_points_still_make_a_model(plain: Dataset, count: int) -> None:
     assert bool(torch.isfinite(model.geometry.scales).all()) and model.geometry.scales.min() > 0
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [("alpha", 1.0, "above 0 and below 1"), ("alpha", "much", "a number"), ("scale", 0, "above 0"), ("mode", "papr", "opaque or paper")],
+)
+def test_impossible_starting_values_name_their_key(plain: Dataset, key: str, value: object, expected: str) -> None:
+    with pytest.raises(ConfigError, match=rf"model\.init\.{key}={value}: expected .*{expected}"):
+        initial_model(tiny.CosineDensity(2), tiny.SphericalHarmonics(0), plain, ModelSettings(primitives=5, init={key: value}), 0)
+
+
 def damaged(kind: str, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
     """Spoil a trainer's state in place."""
     if kind == "no step":
@@ -231,6 +240,8 @@ def damaged(kind: str, tensors: dict[str, Tensor], header: dict[str, Any]) -> No
         header["elapsed"] = float("nan")
     elif kind == "other data":
         header["views"] = 7
+    elif kind == "other names":
+        header["names"] = "0" * 16
     elif kind == "missing parameter":
         del tensors["params.w2"]
     elif kind == "parameter shape":
@@ -262,8 +273,8 @@ def damaged(kind: str, tensors: dict[str, Tensor], header: dict[str, Any]) -> No
 
 
 DAMAGES = [
-    "no step", "step of text", "step negative", "elapsed nan", "other data", "missing parameter", "parameter shape", "parameter type",
-    "parameter nan", "rows differ", "scalar means", "missing moment", "moment shape", "moment type", "age shape", "order range",
+    "no step", "step of text", "step negative", "elapsed nan", "other data", "other names", "missing parameter", "parameter shape",
+    "parameter type", "parameter nan", "rows differ", "scalar means", "missing moment", "moment shape", "moment type", "age shape", "order range",
     "no generator", "short generator", "population shape",
 ]  # fmt: skip
 

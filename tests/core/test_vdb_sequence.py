@@ -51,10 +51,12 @@ def test_what_changes_from_frame_to_frame(tmp_path: Path) -> None:
 
 def test_folders_that_are_no_sequence(tmp_path: Path) -> None:
     refused(lambda: sequence(tmp_path / "gone"), "gone", "no such folder")
+    refused(lambda: sequence(tmp_path / ("x" * 300)), "cannot be read", "expected a folder")
     refused(lambda: sequence(tmp_path), "no .vdb file")
     frame(tmp_path / "a_1.vdb", 1)
     frame(tmp_path / "b_1.vdb", 1)
     refused(lambda: sequence(tmp_path), "'a_', 'b_'", "prefix")
+    refused(lambda: sequence(tmp_path / "a_1.vdb"), "a_1.vdb", "is a file")
     assert sequence(tmp_path, "b_").frames[0].path.name == "b_1.vdb"
     refused(lambda: sequence(tmp_path, "c_"), "c_NUMBER.vdb")
     frame(tmp_path / "b_01.vdb", 1)

@@ -6,6 +6,7 @@ the next step is in :meth:`Trainer.state`, so that 2N steps equal N steps, a kil
 
 from __future__ import annotations
 
+import hashlib
 import math
 import time
 from collections.abc import Iterator
@@ -68,8 +69,8 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
         neighbours = min(3, len(cloud.means) - 1)
         distance = torch.from_numpy(cKDTree(cloud.means.numpy()).query(cloud.means.numpy(), k=neighbours + 1)[0][:, 1:])
         scales = distance.square().mean(dim=1).sqrt().clamp_min(1e-6 * dataset.extent).float()
-    scales = scales * float(settings.init.get("scale", 1.0))
     context = InitContext(cloud.means.float(), scales, cloud.colors.float(), generator, settings.init, cloud.conditions)
+    context.scales = scales * context.number("scale", 1.0, 0)
     return Primitives.initialise(density, colour, context)
 
 
@@ -206,7 +207,13 @@ class Trainer:
         tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
         tensors |= {f"population.{k}": v for k, v in self.population.state().items()}
         tensors |= {"generator": self.generator.get_state(), "order": self.order}
-        return tensors, {"step": self.step, "elapsed": self.elapsed, "views": len(self.dataset.train)}
+        return tensors, {"step": self.step, "elapsed": self.elapsed, "views": len(self.dataset.train), "names": self._names()}
+
+    def _names(self) -> str:
+        """A short hash of the training views' names: other frames or images of the same number are other data."""
+        views = self.dataset.train
+        text = "\n".join(views.view(i).name for i in range(len(views)))
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def load_state(self, tensors: dict[str, Tensor], header: dict[str, Any], where: str) -> None:
         """Continue from :meth:`state`.
@@ -223,6 +230,8 @@ class Trainer:
             raise CheckpointError(f"{where}: step {step!r}, elapsed {elapsed!r}; expected numbers")
         if views != len(self.dataset.train):
             raise CheckpointError(f"{where}: trained on {views} views, the data set now has {len(self.dataset.train)}")
+        if header.get("names", self._names()) != self._names():  # earlier checkpoints have none
+            raise CheckpointError(f"{where}: trained on {views} views with other names than those of the data set now")
         try:
             model = Primitives(self.model.density, self.model.colour, part("params."))
             optimizer = RowAdam(model.specs, model.params, self.settings.adam_beta2)

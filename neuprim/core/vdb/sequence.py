@@ -160,11 +160,15 @@ def sequence(folder: Path, prefix: str | None = None) -> Sequence:
         DataError: no folder, no .vdb file, a name without a number, several prefixes, or one number twice.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise DataError(f"{folder}: no such folder; expected one with .vdb files")
+    try:
+        if not folder.is_dir():
+            raise DataError(f"{folder}: {'is a file' if folder.exists() else 'no such folder'}; expected a folder with .vdb files")
+        paths = sorted(p for p in folder.iterdir() if p.suffix.lower() == ".vdb" and p.is_file())
+    except OSError as error:  # no permission, a name that is too long
+        raise DataError(f"{folder}: cannot be read ({error.strerror or error}); expected a folder with .vdb files") from error
     found: dict[str, list[Frame]] = {}
     odd: list[str] = []
-    for path in sorted(p for p in folder.iterdir() if p.suffix.lower() == ".vdb" and p.is_file()):
+    for path in paths:
         match = re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", path.stem, re.DOTALL)
         if match is None or len(match[2]) > 18:
             odd.append(path.name)
@@ -178,7 +182,7 @@ def sequence(folder: Path, prefix: str | None = None) -> Sequence:
         raise DataError(f"{folder / odd[0]}: no frame number in the name; expected names like fire_12.vdb")
     if len(found) > 1:
         names = ", ".join(repr(name) for name in sorted(found))
-        raise DataError(f"{folder}: files of several sequences: {names}; expected one (choose it by its prefix)")
+        raise DataError(f"{folder}: files of several sequences: {names}; expected one prefix per folder")
     frames = sorted(next(iter(found.values())), key=lambda frame: frame.number)
     gaps: list[tuple[int, int]] = []
     for before, after in itertools.pairwise(frames):

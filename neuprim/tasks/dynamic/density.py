@@ -70,12 +70,12 @@ class TimeDensity(DensityField):
         K = self.static.neurons
         specs = self.static.parameters()
         if "phase" in self.parts:
-            specs.append(ParameterSpec("W_t", (K,), 3e-3, lambda c: c.uniform(K, bound=_number(c, "rate", 0.1))))
+            specs.append(ParameterSpec("W_t", (K,), 3e-3, lambda c: c.uniform(K, bound=c.number("rate", 0.1))))
         if "offset" in self.parts:
             specs += [ParameterSpec(name, (OFFSET_TERMS,), 3e-3, _zeros(OFFSET_TERMS)) for name in ("offset_cos", "offset_sin")]
         if "window" in self.parts:
             specs.append(ParameterSpec("window_center", (1,), 3e-3, _initial_center))
-            specs.append(ParameterSpec("log_window", (1,), 1e-2, lambda c: torch.full((c.count, 1), math.log(_number(c, "window", 0.2)))))
+            specs.append(ParameterSpec("log_window", (1,), 1e-2, lambda c: torch.full((c.count, 1), math.log(c.number("window", 0.2, 0)))))
         if "motion" in self.parts:
             specs += [ParameterSpec(name, (3,), 1e-2, _zeros(3), lr_unit="extent") for name in ("velocity", "acceleration")]
         return specs
@@ -160,10 +160,6 @@ def _advance(b1: Tensor, W_t: Tensor, xi: Tensor) -> Tensor:
 
 def _zeros(width: int) -> Any:
     return lambda ctx: torch.zeros(ctx.count, width)
-
-
-def _number(ctx: InitContext, name: str, default: float) -> float:
-    return float(ctx.settings.get(name, default))  # type: ignore[arg-type]
 
 
 def _initial_center(ctx: InitContext) -> Tensor:

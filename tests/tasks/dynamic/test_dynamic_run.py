@@ -13,7 +13,7 @@ from rich.console import Console
 
 from neuprim.cli import main
 from neuprim.config import compose
-from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.vdb import write_vdb
 from neuprim.evaluate import evaluate_run, load_run, render_run
 from neuprim.run import run
@@ -171,12 +171,29 @@ def test_a_simulated_scene_says_so(tmp_path: Path) -> None:
         ("model.density.time=windows", r"model\.density\.time: 'windows': expected none or some of phase, offset, window, motion"),
         ("model.density.tme=phase", r"model\.density\.tme: no such setting; did you mean 'time'"),
         ("model.colour.frequencies=odd", r"model\.colour\.frequencies='odd': expected turns or printed"),
+        ("model.density.divide_above=long", r"model\.density\.divide_above='long': expected a number"),
+        ("model.colour.powers=1.5", r"model\.colour\.powers=1\.5: expected a whole number"),
         ("model.colour.waves=99", r"model\.colour: .*expected 0\.\.16"),
     ],
 )
 def test_wrong_choices_are_found_before_anything_is_simulated(word: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         compose(["task=dynamic", word])
+
+
+def test_a_whole_number_is_a_number() -> None:
+    assert compose(["task=dynamic", "model.density.divide_above=1"]).model.density["divide_above"] == 1
+
+
+def test_windows_that_never_open(files: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"model\.init\.window=0: expected a number above 0"):
+        fit(files, tmp_path / "run", "model.init.window=0")
+
+
+def test_resuming_with_other_frames(files: Path, tmp_path: Path) -> None:
+    fit(files, tmp_path / "run", "train.iterations=2", "scene.frames=1:2")
+    with pytest.raises(CheckpointError, match="views with other names"):
+        fit(files, tmp_path / "run", "train.iterations=4", "scene.frames=3:4", "resume=true")
 
 
 def test_a_missing_folder(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The model's extinction beside that of the files it was fitted to (which it never saw: it learns from images)."""
+"""The model's extinction beside that of the files. It learns from images; only its starting points were drawn from the files."""
 
 from __future__ import annotations
 

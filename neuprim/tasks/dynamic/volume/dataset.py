@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from neuprim.core import images
@@ -39,9 +40,9 @@ class FrameViews(ViewSet):
     def __init__(self, shoot: Shoot, folder: Path, cameras: Sequence[int], exposure: float, every: int = 1, memory: int = MEMORY) -> None:
         self.shoot, self.folder, self.cameras, self.exposure, self.memory = shoot, folder, list(cameras), exposure, memory
         self._kept: OrderedDict[int, Tensor] = OrderedDict()
-        count = len(shoot.frames)
         self.frames = shoot.frames[::every]
-        self.times = [torch.tensor(t / max(count - 1, 1)) for t in range(0, count, every)]
+        first, last = shoot.frames[0].number, shoot.frames[-1].number  # numbers are time: a gap in them is one in time
+        self.times = [torch.tensor((frame.number - first) / max(last - first, 1)) for frame in self.frames]
 
     def __len__(self) -> int:
         return len(self.cameras) * len(self.times)
@@ -61,7 +62,11 @@ class FrameViews(ViewSet):
             return self._kept[index]
         c, t = divmod(index, len(self.times))
         camera = self.shoot.cameras[self.cameras[c]]
-        rgba = images.read_image(self.shoot.image(self.folder, self.frames[t], self.cameras[c]), (camera.width, camera.height))
+        path = self.shoot.image(self.folder, self.frames[t], self.cameras[c])
+        try:
+            rgba = images.read_image(path, (camera.width, camera.height))
+        except DataError as error:
+            raise DataError(f"{error}; delete the folder {path.parent} to render the frame again") from error
         self._kept[index] = rgba = rgba.half()
         while len(self._kept) > 1 and len(self._kept) * rgba.numel() * 2 > self.memory:
             self._kept.popitem(last=False)
@@ -103,7 +108,9 @@ class VolumeDataset(Dataset):
         total = np.array(self.weights)
         total[[t for t in range(len(total)) if t % self.every]] = 0.0  # nothing is known of frames that are not learned from
         if not total.sum() > 0:
-            raise DataError(f"{self.name}: no frame absorbs light; expected extinction somewhere")
+            raise DataError(
+                f"{self.name}: no frame to learn from absorbs light; expected extinction in one (scene.frames, scene.train_every)"
+            )
         share = torch.multinomial(torch.from_numpy(total), count, replacement=True, generator=generator)
         per_frame = torch.bincount(share, minlength=len(total)).tolist()
         means, colors, times = [], [], []
@@ -112,9 +119,12 @@ class VolumeDataset(Dataset):
                 continue
             stored = _stored(self.shoot.points(self.folder, self.shoot.frames[t]))
             points = torch.from_numpy(stored["means"])
-            rows = torch.randint(len(points), (wanted,), generator=generator) if wanted > len(points) else None
-            rows = torch.randperm(len(points), generator=generator)[:wanted] if rows is None else rows
-            means.append(points[rows])
+            rows = torch.randperm(len(points), generator=generator)[torch.arange(wanted) % len(points)]
+            place = points[rows]
+            if wanted > len(points):  # points used again stand beside themselves, or they would start with no size
+                apart = torch.from_numpy(cKDTree(stored["means"]).query(stored["means"], k=2)[0][:, 1]).float()
+                place[len(points) :] += (apart[rows, None] * (torch.rand((wanted, 3), generator=generator) - 0.5))[len(points) :]
+            means.append(place)
             colors.append(torch.from_numpy(stored["colors"])[rows] / self.exposure)
             times.append(torch.full((wanted,), float(self.test.times[t])))
         return PointCloud(torch.cat(means), torch.cat(colors), {"time": torch.cat(times)})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from neuprim.core.errors import DataError, nearest
@@ -22,14 +22,25 @@ USUAL = {
 
 @dataclass(frozen=True)
 class GridReader:
-    """Meaning ("density", "temperature", "flames", "color") -> name in the files."""
+    """Meaning ("density", "temperature", "flames", "color") -> name in the files, and the meaning of the grid that absorbs."""
 
     names: Mapping[str, str]
+    extinction: str = "density"
 
-    @property
-    def extinction(self) -> str:
-        """The meaning of the grid that absorbs: "density", or "temperature" in sequences without one."""
-        return "density" if "density" in self.names else "temperature"
+    def absorbing(self, wanted: Sequence[str], folder: Path) -> GridReader:
+        """The same with the first of a look's ``extinction_grids`` that the sequence has as the one that absorbs.
+
+        Raises:
+            DataError: it has none of them.
+        """
+        found = [meaning for meaning in wanted if meaning in self.names]
+        if not found:
+            there = ", ".join(f"{meaning} ({name!r})" for meaning, name in self.names.items())
+            raise DataError(
+                f"{folder}: this look absorbs by {' or '.join(wanted)}, and the files have {there}; "
+                f"choose another scene.look, or name the grid: scene.grids.{wanted[0]}=NAME"
+            )
+        return replace(self, extinction=found[0])
 
     def read(self, path: Path) -> dict[str, Grid]:
         """The grids of one file by meaning; those that the file lacks are left out (an exporter drops empty ones)."""

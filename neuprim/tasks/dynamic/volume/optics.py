@@ -125,7 +125,7 @@ def medium_of(grids: Mapping[str, Grid], look: Look, normalisation: Normalisatio
         raise DataError(f"no grid {wanted} to take the extinction from{nearest(look.extinction_grids[0], grids)}")
     flames = grids.get(look.flame_grid) if look.emission > 0.0 or look.flame_extinction > 0.0 else None
     box = base.bounds
-    if flames is not None and look.flame_extinction > 0.0 and np.allclose(flames.transform, base.transform):
+    if flames is not None and look.flame_extinction > 0.0 and _aligned(flames.transform, base.transform):
         box = _union(box, flames.bounds)
     if box is None:
         return Medium.nothing()
@@ -156,12 +156,19 @@ def _union(a: Bounds | None, b: Bounds | None) -> Bounds | None:
     return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
 
+def _aligned(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two index-to-world maps have the same voxels, to a millionth of one; the offset from the world's origin may be large."""
+    return np.allclose(a[:3, :3], b[:3, :3], rtol=0, atol=1e-9 * float(np.abs(b[:3, :3]).max())) and np.allclose(
+        np.linalg.inv(b) @ a[:, 3], [0, 0, 0, 1], rtol=0, atol=1e-6
+    )
+
+
 def _sampled(grid: Grid, transform: np.ndarray, box: Bounds, channels: int) -> tuple[np.ndarray, int]:
     """The grid at the voxel centres of ``box`` under ``transform``, and how many of its own voxels were not finite."""
     if grid.channels != channels:
         raise DataError(f"grid {grid.name!r} has {grid.channels} channels; expected {channels}")
     limit = DENSE_LIMIT // 4  # the medium has four numbers per voxel
-    if np.allclose(grid.transform, transform, rtol=1e-9, atol=1e-9 * float(np.abs(transform).max())):
+    if _aligned(grid.transform, transform):
         return _repaired(grid.to_dense(box, limit * channels))
     if grid.bounds is None:
         return np.zeros((*(h - l for l, h in zip(*box, strict=True)), *((3,) * (channels == 3))), np.float32), 0

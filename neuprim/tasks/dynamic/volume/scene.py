@@ -12,15 +12,15 @@ import numpy as np
 import torch
 
 from neuprim.core.data import Dataset, DataSource
-from neuprim.core.errors import ConfigError, DataError, nearest
+from neuprim.core.errors import DataError
 from neuprim.core.task import SceneContext
 from neuprim.core.vdb import Frame, sequence
 from neuprim.tasks.dynamic.simulation import simulate
 from neuprim.tasks.dynamic.volume.dataset import VolumeDataset
 from neuprim.tasks.dynamic.volume.grids import GridReader, find_grids
-from neuprim.tasks.dynamic.volume.looks import named_look
+from neuprim.tasks.dynamic.volume.looks import changed, named_look
 from neuprim.tasks.dynamic.volume.normalise import Normalisation
-from neuprim.tasks.dynamic.volume.optics import Light, Look
+from neuprim.tasks.dynamic.volume.optics import Look
 from neuprim.tasks.dynamic.volume.rig import AXES, rig
 from neuprim.tasks.dynamic.volume.settings import VolumeSettings, choose_frames
 from neuprim.tasks.dynamic.volume.shoot import Shoot
@@ -42,7 +42,8 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     folder, name, source = _files(asked, context)
     frames = _frames(folder, asked)
     reader = find_grids(frames, asked.grids)
-    look = _look(asked, AUTO[reader.extinction == "temperature"])
+    look = _look(asked, AUTO["density" not in reader.names])
+    reader = reader.absorbing(look.extinction_grids, folder)
     box, hottest = _survey(frames, reader, context.progress)
     if "flame_range" not in asked.optics and source == "real":
         look = dataclasses.replace(look, flame_range=(0.0, hottest)) if hottest > 0 else look
@@ -79,21 +80,7 @@ def _look(asked: VolumeSettings, automatic: str) -> Look:
     Raises:
         ConfigError: no such look or setting, or an impossible value.
     """
-    look = named_look(automatic if asked.look == "auto" else asked.look, asked.up)
-    known = {f.name: f for f in dataclasses.fields(Look)}
-    changes: dict[str, Any] = {}
-    for key, value in asked.optics.items():
-        if key not in known:
-            raise ConfigError(f"scene.optics.{key}: no such setting{nearest(key, known)}")
-        try:
-            if key == "light" and value is not None:
-                changes[key] = Light(tuple(value["direction"]), tuple(value["irradiance"]))
-            else:
-                changes[key] = tuple(tuple(v) if isinstance(v, list) else v for v in value) if isinstance(value, list) else value
-            look = dataclasses.replace(look, **changes)
-        except (TypeError, KeyError, ValueError) as error:
-            raise ConfigError(f"scene.optics.{key}={value!r}: {error}") from error
-    return look
+    return changed(named_look(automatic if asked.look == "auto" else asked.look, asked.up), asked.optics)
 
 
 def _survey(frames: list[Frame], reader: GridReader, progress: Progress) -> tuple[np.ndarray, float]:

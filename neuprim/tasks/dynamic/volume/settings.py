@@ -64,10 +64,10 @@ class VolumeSettings:
             value = getattr(made, name)
             if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
                 raise ConfigError(f"scene.{name}={value!r}: expected a whole number from {lowest} to {highest}")
-        if made.timesteps is not None and not (isinstance(made.timesteps, int) and 2 <= made.timesteps <= 10_000):
-            raise ConfigError(f"scene.timesteps={made.timesteps!r}: expected a whole number from 2 to 10000, or null")
         if isinstance(made.field_of_view, bool) or not isinstance(made.field_of_view, int | float) or not 1 <= made.field_of_view <= 120:
             raise ConfigError(f"scene.field_of_view={made.field_of_view!r}: expected degrees from 1 to 120")
+        if made.timesteps is not None and not (isinstance(made.timesteps, int) and 2 <= made.timesteps <= 1000):
+            raise ConfigError(f"scene.timesteps={made.timesteps!r}: expected a whole number from 2 to 1000, or null")
         if made.up not in ("y", "z"):
             raise ConfigError(f"scene.up={made.up!r}: expected y or z")
         for meaning, grid in made.grids.items():

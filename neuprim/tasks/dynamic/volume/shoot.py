@@ -15,7 +15,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +74,10 @@ class Shoot:
         grids = self.reader.read(frame.path)
         if self.reader.extinction not in grids:
             return Medium.nothing()
-        return medium_of(grids, self.look, self.normalisation)
+        try:
+            return medium_of(grids, replace(self.look, extinction_grids=(self.reader.extinction,)), self.normalisation)
+        except DataError as error:
+            raise DataError(f"{frame.path}: {error}") from error
 
     def image(self, folder: Path, frame: Frame, camera: int) -> Path:
         """File of one image."""
@@ -125,14 +128,29 @@ class Shoot:
             brightest = 0.0
             for c, camera in enumerate(self.cameras):
                 rgba = integrate(medium, camera, samples=self.samples)
-                brightest = max(brightest, float(rgba[..., :3].max()))
+                peak = float(rgba[..., :3].max().half())  # as it is stored: what half floats round to 0 is no light
+                if not np.isfinite(peak):
+                    raise DataError(
+                        f"{frame.path}: a radiance of {float(rgba[..., :3].max()):.3g} does not fit the images' half floats; "
+                        "expected at most 65504 (scene.optics.emission, ambient and light set it)"
+                    )
+                brightest = max(brightest, peak)
                 images.write_exr(draft / f"cam_{c:02d}.exr", rgba, half=True)
             np.savez(draft / "points.npz", brightest=np.float32(brightest), **_points(medium, frame.number))
-            if final.exists():  # of a run that was cut short while publishing
-                shutil.rmtree(final)
-            os.replace(draft, final)
+            self._publish(draft, final, frame)
         finally:
             shutil.rmtree(draft, ignore_errors=True)
+
+    def _publish(self, draft: Path, final: Path, frame: Frame) -> None:
+        """Give the draft its name, unless another run was faster: its images are the same, and it may be reading them."""
+        done = self.points(final.parent, frame)
+        if final.exists() and not done.is_file():  # somebody deleted part of it
+            shutil.rmtree(final)
+        try:
+            os.replace(draft, final)
+        except OSError:
+            if not done.is_file():
+                raise
 
 
 def _points(medium: Medium, seed: int) -> dict[str, Any]:

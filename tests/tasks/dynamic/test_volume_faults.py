@@ -1,0 +1,180 @@
+"""What users and disks do to volume scenes: wrong optics, unusual grids, damaged and shared caches."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.vdb import Grid, scale_transform, write_vdb
+from neuprim.tasks.dynamic.volume.looks import changed, named_look
+from neuprim.tasks.dynamic.volume.normalise import Normalisation
+from neuprim.tasks.dynamic.volume.optics import medium_of
+from tests.tasks.dynamic.test_volume_scene import VOXEL, blob, dataset
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two frames with density, temperature and flames."""
+    made = tmp_path / "files"
+    made.mkdir()
+    for number in (1, 2):
+        write_vdb(made / f"ball_{number}.vdb", blob(10.0 + number, ("density", "temperature", "flames")))
+    return made
+
+
+# ---------------------------------------------------------------- optics
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("albedo", 0.5, r"scene\.optics\.albedo=0\.5: expected three numbers"),
+        ("albedo", [1, 2], r"scene\.optics\.albedo=\[1, 2\]: expected three numbers"),
+        ("albedo", [1, 2, True], r"expected three numbers"),
+        ("kelvin", [1000, 2000, 3000], r"scene\.optics\.kelvin=.*: expected two numbers"),
+        ("kelvin", [2000, 1000], r"scene\.optics\.kelvin=.*rising"),
+        ("flame_range", [0], r"scene\.optics\.flame_range=\[0\]: expected two numbers"),
+        ("extinction", None, r"scene\.optics\.extinction=None: expected a number"),
+        ("extinction", float("nan"), r"expected a number"),
+        ("gradient", [], r"scene\.optics\.gradient=\[\]: expected colours"),
+        ("gradient", [1, 2], r"scene\.optics\.gradient=1: expected three numbers"),
+        ("light", "sun", r"scene\.optics\.light=sun: expected scene\.optics\.light\.direction"),
+        ("light", {"colour": [1, 1, 1]}, r"expected scene\.optics\.light\.direction"),
+        ("light", {"direction": [0, 0, 0]}, r"scene\.optics\.light\.direction=\[0, 0, 0\]: expected numbers that are not all 0"),
+        ("light", {"direction": [0, 1]}, r"scene\.optics\.light\.direction=\[0, 1\]: expected three numbers"),
+        ("light", {"irradiance": [-1, 0, 0]}, r"scene\.optics\.light=.*negative"),
+        ("flame_grid", "fire", r"scene\.optics\.flame_grid=fire: expected density or temperature or flames or color"),
+        ("extinction_grids", "density", r"scene\.optics\.extinction_grids=density: expected a list"),
+        ("up", "x", r"scene\.optics\.up=x: expected y or z"),
+    ],
+)
+def test_wrong_optics_name_key_found_and_expected(key: str, value: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        changed(named_look("smoke_fire"), {key: value})
+
+
+def test_optics_of_every_form() -> None:
+    look = changed(
+        named_look("smoke_fire"),
+        {"extinction": 3, "albedo": [1, 0.5, 0], "gradient": [[1, 0, 0], [0, 0, 1]], "light": {"irradiance": [1, 2, 3]}},
+    )
+    assert look.extinction == 3 and look.albedo == (1.0, 0.5, 0.0) and look.gradient == ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    assert look.light is not None and look.light.irradiance == (1.0, 2.0, 3.0)
+    original = named_look("smoke_fire").light
+    assert original is not None and look.light.direction == original.direction
+    assert changed(look, {"light": None}).light is None
+    with pytest.raises(ConfigError, match=r"scene\.optics\.light\.irradiance: required .* the look has no light"):
+        changed(named_look("embergen_fire"), {"light": {"direction": [0, 0, 1]}})
+
+
+# ---------------------------------------------------------------- grids
+
+
+def test_the_box_is_that_of_the_grid_that_the_look_absorbs_by(folder: Path, tmp_path: Path) -> None:
+    hot = blob(10.0, ("temperature",))[0]
+    far = Grid.from_dense("density", np.ones((8, 8, 8), np.float32), transform=scale_transform(VOXEL, (500.0, 0.0, 0.0)))
+    write_vdb(folder / "ball_1.vdb", [hot, far])
+    write_vdb(folder / "ball_2.vdb", [hot])  # has what absorbs, whatever else it lacks
+    data = dataset(folder, tmp_path, look="embergen_fire")
+    assert data.shoot.normalisation.center[0] < 100
+    alphas = [data.test.pixels(i).alpha for i in range(2)]
+    assert all(a is not None and bool(a.any()) for a in alphas)
+    assert dataset(folder, tmp_path, look="dust_tornado").shoot.normalisation.center[0] > 400
+
+
+def test_a_frame_without_the_grid_that_absorbs_takes_no_other(folder: Path, tmp_path: Path) -> None:
+    write_vdb(folder / "ball_2.vdb", blob(12.0, ("temperature", "flames")))
+    data = dataset(folder, tmp_path, look="smoke_fire")
+    assert data.shoot.medium(data.shoot.frames[1]).empty and not data.shoot.medium(data.shoot.frames[0]).empty
+
+
+def test_a_look_whose_grids_are_missing(folder: Path, tmp_path: Path) -> None:
+    for number in (1, 2):
+        write_vdb(folder / f"ball_{number}.vdb", blob(10.0 + number, ("density",)))
+    message = r"files: this look absorbs by temperature, and the files have density \('density'\)"
+    with pytest.raises(DataError, match=message):
+        dataset(folder, tmp_path, look="embergen_fire")
+
+
+def test_a_vector_grid_as_density_names_the_file(folder: Path, tmp_path: Path) -> None:
+    vector = Grid.from_dense("density", np.ones((8, 8, 8, 3), np.float32), transform=scale_transform(VOXEL))
+    write_vdb(folder / "ball_1.vdb", [vector])
+    with pytest.raises(DataError, match=r"ball_1\.vdb: grid 'density' has 3 channels; expected 1"):
+        dataset(folder, tmp_path)
+
+
+def test_grids_far_from_the_worlds_origin_are_still_told_apart() -> None:
+    look = named_look("smoke_fire")
+    index = np.stack(np.meshgrid(*(np.arange(24, dtype=np.float32),) * 3, indexing="ij"), -1)
+    ball = np.clip(1 - np.linalg.norm(index - 12, axis=-1) / 8, 0, None)
+    media = []
+    for offset in (0.0, 1e7):
+        coarse = Grid.from_dense("flames", ball[::2, ::2, ::2], transform=scale_transform(2e-3, (offset, 0, 0)))
+        fine = Grid.from_dense("density", ball, transform=scale_transform(1e-3, (offset, 0, 0)))
+        box = fine.world_bounds()
+        assert box is not None
+        media.append(medium_of({"density": fine, "flames": coarse}, look, Normalisation.from_bounds(box), 1))
+    near, far = (m.values for m in media)
+    assert near.shape == far.shape and np.allclose(near, far, atol=0.02 * float(near.max()))
+
+
+# ---------------------------------------------------------------- time and starting points
+
+
+def test_a_gap_in_the_numbers_is_a_gap_in_time(folder: Path, tmp_path: Path) -> None:
+    write_vdb(folder / "ball_5.vdb", blob(16.0))
+    data = dataset(folder, tmp_path)
+    assert [float(t) for t in data.test.times] == [0.0, 0.25, 1.0]
+    assert [float(t) for t in dataset(folder, tmp_path, frames="2:5:3").train.times] == [0.0, 1.0]
+    assert [float(t) for t in dataset(folder, tmp_path, frames="2:4").train.times] == [0.0]
+
+
+def test_more_starting_points_than_were_kept_are_distinct(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neuprim.tasks.dynamic.volume.shoot.POINTS", 64)
+    points = dataset(folder, tmp_path).initial_points(1000, torch.Generator().manual_seed(0))
+    assert len(points.means) == 1000 == len(np.unique(points.means.numpy(), axis=0))
+    assert float(points.means.abs().max()) < 0.7
+
+
+def test_matter_in_frames_that_are_not_learned_from(folder: Path, tmp_path: Path) -> None:
+    empty = [Grid.from_dense("density", np.zeros((8, 8, 8), np.float32), transform=scale_transform(VOXEL))]
+    write_vdb(folder / "ball_1.vdb", empty)
+    with pytest.raises(DataError, match=r"no frame to learn from absorbs light; .*scene\.train_every"):
+        dataset(folder, tmp_path, train_every=2).initial_points(5, torch.Generator().manual_seed(0))
+
+
+# ---------------------------------------------------------------- light that half floats cannot hold
+
+
+def test_light_beyond_half_floats(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"ball_1\.vdb: a radiance of .* does not fit .*scene\.optics\.emission"):
+        dataset(folder, tmp_path, optics={"emission": 1e6})
+    with pytest.raises(DataError, match="every frame is black"):
+        dataset(folder, tmp_path, optics={"extinction": 1e-12, "flame_extinction": 0.0})
+
+
+# ---------------------------------------------------------------- the cache
+
+
+def test_two_runs_that_render_the_same_frame_do_not_disturb_each_other(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = dataset(folder, tmp_path)
+    image = data.shoot.image(data.folder, data.shoot.frames[0], 0)
+    before = os.stat(image).st_ino
+    data.shoot._take_frame(data.folder, data.shoot.frames[0])  # as the slower one of two does
+    assert os.stat(image).st_ino == before
+    assert not list(data.folder.glob(".*"))
+
+
+def test_a_damaged_image_says_what_to_do(folder: Path, tmp_path: Path) -> None:
+    data = dataset(folder, tmp_path)
+    data.shoot.image(data.folder, data.shoot.frames[1], 0).write_bytes(b"")
+    with pytest.raises(DataError, match=r"cam_00\.exr: file is empty.*; delete the folder .*frame_00002 to render the frame again"):
+        data.train.pixels(1)

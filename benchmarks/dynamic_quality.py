@@ -99,7 +99,8 @@ def between_frames(trainer: Trainer) -> dict[str, float]:
             images = [draw(trainer.model, type(view)("", view.camera, {"time": s}), trainer.renderer, data.background) for s in steps]
             whole = (images[4] - images[0]).abs().mean().item()
             worst = max(worst, *((b - a).abs().mean().item() / max(whole, 1e-9) for a, b in itertools.pairwise(images)))
-    return {"learned": statistics.mean(errors[True]), "between": statistics.mean(errors[False]) if errors[False] else math.nan, "largest_step": worst}  # fmt: skip
+    found = {"learned": statistics.mean(errors[True]), "largest_step": worst}
+    return found | ({"between": statistics.mean(errors[False])} if errors[False] else {})
 
 
 def repeat_neighbour(trainer: Trainer) -> float:

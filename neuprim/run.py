@@ -22,6 +22,7 @@ from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.errors import CheckpointError, DataError
 from neuprim.core.files import write_json, write_text
 from neuprim.core.primitives import Primitives
+from neuprim.core.render import choose_backend
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer, initial_model
 from neuprim.evaluate import load_dataset
@@ -29,10 +30,11 @@ from neuprim.measure import display, draw, measure, summary
 from neuprim.plugins.registry import load_task
 from neuprim.progress import RunProgress
 from neuprim.report import error_map, write_report
-from neuprim.warm import compiling
+from neuprim.warm import compiled, compiling, mark_compiled
 
 __all__ = ["make_trainer", "run", "warm_up"]
 
+_COMPILING = "compiling kernels, once per installation (about a minute)"
 _CURVE_VIEWS = 5  # held-out views behind the curve's eval_psnr
 _SHOWN_VIEWS = 8  # held-out views in renders/ and the report
 _ORBIT_FRAMES = 36
@@ -68,7 +70,7 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
         directory.mkdir(parents=True, exist_ok=True)
         write_text(directory / "config.yaml", config.to_yaml())
         if kernels.running:
-            progress.preparing("compiling kernels, once per installation (about a minute)", 0.0)
+            progress.preparing(_COMPILING, 0.0)
             kernels.wait()
         interrupted = _train(trainer, config, dataset, progress)
         progress.finishing("measuring held-out views")
@@ -97,7 +99,15 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset) -> Trainer
 def _train(trainer: Trainer, config: RunConfig, dataset: Dataset, progress: RunProgress) -> bool:
     """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
     directory = config.output_dir
+    view = trainer.dataset.train.view(0)
+    lowered = trainer.model.lower(view.camera, view.conditions)
+    form = type(lowered.colour).__name__
+    on_cpu = choose_backend(lowered, trainer.renderer, view.camera) == "cpu"
+    if on_cpu and not compiled(form):
+        progress.preparing(_COMPILING, 0.0)
     warm_up(trainer)
+    if on_cpu:
+        mark_compiled(form)
     curve = _open_curve(directory / "metrics.jsonl", trainer.step)
     last_saved, next_eval = time.monotonic(), _next_evaluation(trainer)
     interrupted = False

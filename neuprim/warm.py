@@ -10,19 +10,33 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import torch
 
 from neuprim.core.render.cpu.compile import cache_directory
 
-__all__ = ["Compiling", "compiled", "compiling", "main"]
+__all__ = ["Compiling", "compiled", "compiling", "main", "mark_compiled"]
 
 _LIMIT = 600.0  # seconds after which the run goes on alone
 
 
-def compiled() -> bool:
-    """Whether the slowest kernel to compile is already on disk."""
-    return any(cache_directory().rglob("*backward_tiles*.nbc"))
+def compiled(form: str = "Constant") -> bool:
+    """Whether the kernels that draw this form of colour (the name of its class) are on disk."""
+    return _marker(form).exists()
+
+
+def mark_compiled(form: str) -> None:
+    """Say so for the next run; a folder that cannot be written only costs that run a message."""
+    try:
+        _marker(form).parent.mkdir(parents=True, exist_ok=True)
+        _marker(form).touch()
+    except OSError:
+        pass
+
+
+def _marker(form: str) -> Path:
+    return cache_directory() / f"{form}.compiled"
 
 
 class Compiling:
@@ -94,6 +108,7 @@ def main() -> None:
     loss, _ = photometric({"ssim_weight": 0.2})(output.rgb, torch.zeros_like(output.rgb))
     loss.backward()
     RowAdam(specs, params).step(params, {spec.name: 1e-3 for spec in specs})
+    mark_compiled("Constant")
 
 
 if __name__ == "__main__":

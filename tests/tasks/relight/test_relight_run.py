@@ -1,0 +1,81 @@
+"""A whole run of the relighting task, small: images under lights in; a report, new lights and an orbit of the light out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from neuprim.cli import main
+from neuprim.config import compose
+from neuprim.core.errors import ConfigError
+from neuprim.evaluate import render_run
+from neuprim.run import run
+
+SCENE = ["task=relight", "scene=lit_solids", "scene.size=32", "scene.train_views=24", "scene.test_views=6", "scene.supersampling=1"]
+SMALL = ["model.primitives=150", "model.neurons=2", "model.colour.hidden=3", "train.max_seconds=null"]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    target = tmp_path_factory.mktemp("relight") / "run"
+    return run(compose([*SCENE, *SMALL, "train.iterations=600", f"output_dir='{target}'"]), Console(quiet=True))
+
+
+def test_a_run_learns(finished: Path) -> None:
+    m = json.loads((finished / "metrics.json").read_text())
+    assert m["psnr_linear_clamped"] > m["baselines"]["black"]["psnr_linear_clamped"] + 2
+    assert m["backend"] == "cpu" and m["data_source"] == "generated"
+    assert "Held-out films" in (finished / "report.html").read_text()
+
+
+def test_a_new_light_changes_the_picture(finished: Path, tmp_path: Path) -> None:
+    one, other = (
+        render_run(finished, "orbit", None, "exr", tmp_path / name, 1, {"light": where})[0]
+        for name, where in (("a", "3,0,3"), ("b", "-3,1,2"))
+    )
+    assert one.read_bytes() != other.read_bytes()
+
+
+def test_the_light_goes_round(finished: Path, tmp_path: Path) -> None:
+    target = tmp_path / "film.webp"
+    words = ["render", str(finished), "--camera", "orbit", "--frames", "1", "--light", "orbit:4:40:5", "--out", str(target)]
+    assert main(words) == 0
+    with Image.open(target) as film:
+        assert getattr(film, "n_frames", 1) == 5
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["model.colour.form=multiplicative"],
+        ["model.colour.form=harmonics", "model.colour.degree=3"],
+        ["model.colour.visibility=false", "task.options.loss=compressed"],
+        ["model.colour.hidden=0", "task.options.loss=relative"],
+        ["preset=paper", "train.population.every=5"],
+    ],
+)
+def test_every_variant_runs(tmp_path: Path, words: list[str]) -> None:
+    small = [w for w in SMALL if not (w.startswith("model.colour") and "harmonics" in str(words))]
+    assert run(compose([*SCENE, *small, *words, "train.iterations=8", f"output_dir='{tmp_path / 'run'}'"]), Console(quiet=True))
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("model.colour.form=add", r"model\.colour\.form='add': expected additive or multiplicative or harmonics"),
+        ("model.colour.hidden=99", r"model\.colour: .*expected 0\.\.16"),
+        ("model.density.time=phase", r"model\.density\.time: no such setting"),
+    ],
+)
+def test_wrong_choices(word: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        compose(["task=relight", word])
+
+
+def test_a_wrong_loss(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"task\.options\.loss=l2: no such loss"):
+        run(compose([*SCENE, *SMALL, "task.options.loss=l2", f"output_dir='{tmp_path / 'run'}'"]), Console(quiet=True))

@@ -36,12 +36,7 @@ def density_grid(
         ConfigError: the density is not a cosine network.
     """
     with torch.no_grad():
-        density = model.density
-        rows = density.alive(model.of(density), conditions)
-        params = {n: v.detach() if rows is None else v.detach()[rows] for n, v in model.params.items()}
-        own = {s.name: params[s.name] for s in density.parameters()}
-        geometry = density.move(own, type(model.geometry)(params["means"], params["log_scales"], params["quats"]), conditions)
-        form = density.lower(own, geometry, conditions)
+        geometry, form = model.lower_density(conditions)
         if not isinstance(form, Cosine):
             raise ConfigError(f"a {type(form).__name__} density cannot be put on a grid; expected Cosine")
         wide = [x.detach().double().numpy() for x in (geometry.means, geometry.scales, geometry.rotations, form.W1, form.b1, form.w2)]

@@ -80,14 +80,22 @@ class Primitives:
 
     def lower(self, camera: AnyCamera, conditions: Conditions) -> Lowered:
         """Fold a frame's conditions into closed forms; differentiable. Primitives that are not alive in it are left out."""
+        params, geometry, density, rows = self._lower_density(conditions)
+        conditions = self.colour.derive(geometry, density, conditions)
+        tint = {s.name: params[s.name] for s in self.colour.parameters()}
+        return Lowered(geometry, density, self.colour.lower(tint, geometry, camera, conditions), rows)
+
+    def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:
+        """Where the primitives that live in a frame are, and their density; no camera needed."""
+        _, geometry, density, _ = self._lower_density(conditions)
+        return geometry, density
+
+    def _lower_density(self, conditions: Conditions) -> tuple[dict[str, Tensor], Geometry, LoweredDensity, Tensor | None]:
         rows = self.density.alive(self.of(self.density), conditions)
         params = self.params if rows is None else {name: value.index_select(0, rows) for name, value in self.params.items()}
-        own, tint = ({s.name: params[s.name] for s in field.parameters()} for field in (self.density, self.colour))
-        geometry = Geometry(params["means"], params["log_scales"], params["quats"])
-        geometry = self.density.move(own, geometry, conditions)
-        density = self.density.lower(own, geometry, conditions)
-        conditions = self.colour.derive(geometry, density, conditions)
-        return Lowered(geometry, density, self.colour.lower(tint, geometry, camera, conditions), rows)
+        own = {s.name: params[s.name] for s in self.density.parameters()}
+        geometry = self.density.move(own, Geometry(params["means"], params["log_scales"], params["quats"]), conditions)
+        return params, geometry, self.density.lower(own, geometry, conditions), rows
 
     def rows(self, index: Tensor) -> dict[str, Tensor]:
         """Detached copies of some rows of every parameter."""

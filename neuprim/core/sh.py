@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["C0", "basis", "coefficient_count"]
+__all__ = ["C0", "basis", "coefficient_count", "colors", "initial_dc"]
 
 C0 = 0.5 / math.sqrt(math.pi)
 """Y_00: a colour c of every direction has the coefficient (c - 0.5)/C0."""
@@ -62,3 +62,34 @@ def basis(directions: Tensor, degree: int) -> Tensor:
             _C3[6] * x * (xx - 3 * yy),
         ]
     return torch.stack(rows, -1)
+
+
+def colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degree: int) -> Tensor:
+    """(N, C) max(0, SH(direction origin -> mean) + 1/2); fused on float32 CPU tensors.
+
+    Args:
+        means: (N, 3) scene units. origin: (3,) the camera's position.
+        dc: (N, C) zero-order coefficients.
+        rest: (N, at least (degree + 1)^2 - 1, C) of the higher bands; None only at degree 0.
+        degree: bands in use, 0..3.
+    """
+    if degree == 0:
+        return (dc * C0 + 0.5).clamp_min(0.0)
+    assert rest is not None, "bands above the first need their coefficients"
+    if dc.device.type == "cpu" and dc.dtype == means.dtype == torch.float32:
+        from neuprim.core.sh_cpu import fused_colors  # numba, loaded when first needed
+
+        return fused_colors(means, dc, rest, origin, degree)
+    offset = means - origin.to(means)
+    direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-30)
+    bands = basis(direction, degree)[:, 1:]
+    return (dc * C0 + 0.5 + (bands[:, :, None] * rest[:, : bands.shape[1]]).sum(1)).clamp_min(0.0)
+
+
+_DARKEST = 1e-3
+"""Initial colours start at least this far above zero: at zero and below, max(0, .) passes no gradient and black stays black."""
+
+
+def initial_dc(color: Tensor) -> Tensor:
+    """(N, C) float32 zero-order coefficients of a colour (N, C) that is the same from everywhere."""
+    return ((color.clamp_min(_DARKEST) - 0.5) / C0).float()

@@ -6,13 +6,12 @@ import math
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from neuprim.core import sh
 from neuprim.core.fields import ColourField, Conditions, Constant
 from neuprim.core.geometry import Geometry
 from neuprim.core.ray_cameras import AnyCamera
-from neuprim.core.schema import InitContext, ParameterSpec, Params
+from neuprim.core.schema import ParameterSpec, Params
 from neuprim.tasks.dynamic.density import time_of
 
 __all__ = ["TimeHarmonics"]
@@ -59,7 +58,7 @@ class TimeHarmonics(ColourField):
 
     def parameters(self) -> list[ParameterSpec]:
         C, rest = self.channels, sh.coefficient_count(self.degree) - 1
-        specs = [ParameterSpec("sh_dc", (C,), 1e-2, _initial_dc, group="colour")]
+        specs = [ParameterSpec("sh_dc", (C,), 1e-2, lambda c: sh.initial_dc(c.colors), group="colour")]
         for name, terms in (("time_poly", self.powers), ("time_cos", self.waves), ("time_sin", self.waves)):
             if terms:
                 specs.append(ParameterSpec(name, (terms, C), 5e-3, _zeros(terms, C), group="colour"))
@@ -75,21 +74,7 @@ class TimeHarmonics(ColourField):
         for name, basis in (("time_poly", powers), ("time_cos", waves.cos()), ("time_sin", waves.sin())):
             if name in params:
                 dc = dc + (params[name] * basis.to(dc)[:, None]).sum(1)
-        color = dc * sh.C0 + 0.5
-        if self.active:
-            offset = geometry.means - camera.position.to(geometry.means)
-            direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-30)
-            bands = sh.basis(direction, self.active)[:, 1:]
-            color = color + (bands[:, :, None] * params["sh_rest"][:, : bands.shape[1]]).sum(1)
-        return Constant(color.clamp_min(0.0))
-
-
-_DARKEST = 1e-3
-"""Initial colours start at least this far above zero: at zero and below, max(0, .) passes no gradient and black stays black."""
-
-
-def _initial_dc(ctx: InitContext) -> Tensor:
-    return ((ctx.colors.clamp_min(_DARKEST) - 0.5) / sh.C0).float()
+        return Constant(sh.colors(geometry.means, dc, params.get("sh_rest"), camera.position, self.active))
 
 
 def _zeros(terms: int, channels: int) -> Any:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from neuprim.core.cosine import OMEGA0
 from neuprim.core.fields import Cosine
+from neuprim.core.geometry import Geometry
 from neuprim.core.primitives import Primitives
 
 __all__ = ["dead_fraction"]
@@ -24,13 +24,13 @@ def dead_fraction(model: Primitives, times: Sequence[Tensor]) -> float:
     """
     brightest = torch.zeros(model.count, dtype=torch.float64)
     density, own = model.density, {k: v.detach() for k, v in model.of(model.density).items()}
-    geometry = type(model.geometry)(*(model.params[n].detach() for n in ("means", "log_scales", "quats")))
+    geometry = Geometry(*(model.params[n].detach() for n in ("means", "log_scales", "quats")))
     reach = geometry.scales.double() / geometry.length_scale.double()[:, None]
     axes = geometry.rotations.double() * reach[:, None, :]  # (N, 3, 3), columns r_j s_j/m
     for time in times:
         form = density.lower(own, geometry, {"time": time})
         assert isinstance(form, Cosine)
-        rate = OMEGA0 / torch.pi * (form.W1.double() @ axes)  # (N, K, 3)
+        rate = form.omega0 / torch.pi * (form.W1.double() @ axes)  # (N, K, 3)
         waves = (form.w2.double() * torch.cos(form.omega0 * form.b1.double()))[:, :, None] * torch.sinc(rate)
         depth = 2.0 * reach * (form.b2.double().reshape(-1, 1) + waves.sum(1))
         brightest = torch.maximum(brightest, 1.0 - torch.exp(-depth.clamp_min(0.0).amax(1)))

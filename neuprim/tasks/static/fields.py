@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from neuprim.core import sh
 from neuprim.core.fields import ColourField, Conditions, Constant
 from neuprim.core.geometry import Geometry
 from neuprim.core.ray_cameras import AnyCamera
-from neuprim.core.schema import InitContext, ParameterSpec, Params
+from neuprim.core.schema import ParameterSpec, Params
 
 __all__ = ["SphericalHarmonics"]
 
@@ -38,29 +37,10 @@ class SphericalHarmonics(ColourField):
 
     def parameters(self) -> list[ParameterSpec]:
         C, rest = self.channels, sh.coefficient_count(self.degree) - 1
-        specs = [ParameterSpec("sh_dc", (C,), 2e-2, _initial_dc, group="colour")]
+        specs = [ParameterSpec("sh_dc", (C,), 2e-2, lambda c: sh.initial_dc(c.colors), group="colour")]
         if rest:
             specs.append(ParameterSpec("sh_rest", (rest, C), 2e-3, lambda c: torch.zeros(c.count, rest, C), group="colour"))
         return specs
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
-        dc = params["sh_dc"]
-        if self.active and dc.device.type == "cpu" and dc.dtype == geometry.means.dtype == torch.float32:
-            from neuprim.core.sh_cpu import fused_colors  # numba, loaded when first needed
-
-            return Constant(fused_colors(geometry.means, dc, params["sh_rest"], camera.position, self.active))
-        color = dc * sh.C0 + 0.5
-        if self.active:
-            offset = geometry.means - camera.position.to(geometry.means)
-            direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-30)
-            bands = sh.basis(direction, self.active)[:, 1:]
-            color = color + (bands[:, :, None] * params["sh_rest"][:, : bands.shape[1]]).sum(1)
-        return Constant(color.clamp_min(0.0))
-
-
-_DARKEST = 1e-3
-"""Initial colours start at least this far above zero: at zero and below, max(0, .) passes no gradient and black stays black."""
-
-
-def _initial_dc(ctx: InitContext) -> Tensor:
-    return ((ctx.colors.clamp_min(_DARKEST) - 0.5) / sh.C0).float()
+        return Constant(sh.colors(geometry.means, params["sh_dc"], params.get("sh_rest"), camera.position, self.active))

@@ -14,12 +14,11 @@ Scene, cameras and lights are fixed: equal settings give equal files whatever th
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +28,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from neuprim.core.cameras import look_at
-from neuprim.core.errors import ConfigError, DataError, nearest
+from neuprim.core.errors import DataError
 from neuprim.core.files import publish_folder
 from neuprim.core.images import write_exr
 from neuprim.core.solids.raycast import Scene
 from neuprim.core.solids.rays import bands, pixel_means
+from neuprim.core.solids.settings import check_names, check_whole, settings_key
 from neuprim.tasks.relight.lit.rig import DISTANCE, Shot, splits
 from neuprim.tasks.relight.lit.scene import RADIUS, solids
 from neuprim.tasks.relight.lit.shading import shade
@@ -69,24 +69,18 @@ class LitSettings:
     supersampling: int = 2
 
     def __post_init__(self) -> None:
-        for name, lowest, highest in (("size", 8, 4096), ("train_views", 1, 100000), ("test_views", 1, 10000), ("supersampling", 1, 16)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
-                raise ConfigError(f"scene.{name} is {value!r}; expected a whole number from {lowest} to {highest}")
+        check_whole(self, {"size": (8, 4096), "train_views": (1, 100000), "test_views": (1, 10000), "supersampling": (1, 16)})
 
     @staticmethod
     def parse(settings: Mapping[str, Any], others: Sequence[str] = ()) -> LitSettings:
         """Settings from a mapping, of which ``others`` are not read here; :class:`ConfigError` for an unknown name or impossible value."""
         known = [f.name for f in fields(LitSettings)]
-        for name in settings:
-            if name not in (*known, *others):
-                raise ConfigError(f"scene.{name} is not a setting of this scene{nearest(str(name), [*known, *others])}")
+        check_names(settings, [*known, *others])
         return LitSettings(**{name: value for name, value in settings.items() if name in known})
 
     def key(self) -> str:
         """A short hash of every setting and the generator's version."""
-        text = json.dumps({"version": GENERATOR_VERSION, **asdict(self)}, sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        return settings_key(self, GENERATOR_VERSION)
 
 
 @dataclass(frozen=True)

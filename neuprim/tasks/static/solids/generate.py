@@ -8,13 +8,12 @@ The scene, its cameras and its light are fixed: equal settings give equal files 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +24,11 @@ from PIL import Image
 
 from neuprim.core.cameras import look_at
 from neuprim.core.data import Dataset
-from neuprim.core.errors import ConfigError, DataError, nearest
+from neuprim.core.errors import DataError
 from neuprim.core.files import publish_folder
 from neuprim.core.solids.raycast import Scene
 from neuprim.core.solids.rays import bands, pixel_means
+from neuprim.core.solids.settings import check_names, check_whole, settings_key
 from neuprim.core.solids.shapes import build
 from neuprim.core.task import SceneContext
 from neuprim.tasks.static.solids.shading import encode_srgb, radiance
@@ -61,24 +61,17 @@ class SolidsSettings:
     supersampling: int = 3
 
     def __post_init__(self) -> None:
-        for name, lowest, highest in (("size", 8, 4096), ("train_views", 1, 10000), ("test_views", 1, 10000), ("supersampling", 1, 16)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
-                raise ConfigError(f"scene.{name} is {value!r}; expected a whole number from {lowest} to {highest}")
+        check_whole(self, {"size": (8, 4096), "train_views": (1, 10000), "test_views": (1, 10000), "supersampling": (1, 16)})
 
     @staticmethod
     def parse(settings: Mapping[str, Any]) -> SolidsSettings:
         """Settings from a mapping; :class:`ConfigError` for an unknown name or impossible value."""
-        known = [f.name for f in fields(SolidsSettings)]
-        for name in settings:
-            if name not in known:
-                raise ConfigError(f"scene.{name} is not a setting of this scene{nearest(str(name), known)}")
+        check_names(settings, [f.name for f in fields(SolidsSettings)])
         return SolidsSettings(**settings)
 
     def key(self) -> str:
         """A short hash of every setting and the generator's version."""
-        text = json.dumps({"version": GENERATOR_VERSION, **asdict(self)}, sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        return settings_key(self, GENERATOR_VERSION)
 
 
 def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:

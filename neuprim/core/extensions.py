@@ -1,0 +1,133 @@
+"""What a plugin can add beside whole tasks: scenes and losses of a task, file formats to export to, ways of looking into a density.
+
+Each is registered under an entry-point group of its own, found and loaded by :mod:`neuprim.plugins.registry`; the built-in ones come
+through the same groups as anybody's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from neuprim.core.data import Dataset
+from neuprim.core.primitives import Primitives
+from neuprim.core.render.settings import RenderSettings
+from neuprim.core.task import Loss, SceneSpec, TaskSpec
+
+__all__ = ["Exporter", "ExportJob", "ExportReport", "Inspector", "LossExtension", "SceneExtension", "TrainedModel"]
+
+
+@dataclass(frozen=True)
+class TrainedModel:
+    """A run's model with what is known about it.
+
+    Attributes:
+        directory: of the run.
+        header: of ``model.safetensors``: background, colour space, data source, iterations, ...
+        scene: settings of the scene it was fitted to.
+        settings: how the run renders.
+        dataset: loads the scene again; raises :class:`~neuprim.core.errors.DataError` where its files are gone.
+    """
+
+    directory: Path
+    task: TaskSpec
+    model: Primitives
+    header: Mapping[str, Any]
+    scene: Mapping[str, Any]
+    settings: RenderSettings
+    dataset: Callable[[], Dataset]
+
+
+@dataclass(frozen=True)
+class ExportJob:
+    """One call of ``neuprim export``.
+
+    Attributes:
+        out: file or folder the user named, or None for the exporter's default name inside the run directory.
+        options: ``KEY=VALUE`` words of the user, parsed as YAML scalars; an exporter refuses those it does not know.
+        progress: called with (text, fraction 0..1).
+    """
+
+    run: TrainedModel
+    out: Path | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+    progress: Callable[[str, float], None] = lambda text, fraction: None
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """What was written, and what it lost.
+
+    Attributes:
+        files: in order.
+        lossless: whether importing restores the model exactly.
+        errors: named numbers of the export against the model, e.g. ``{"psnr": 31.2}``; empty where none is defined.
+        notes: one line each, for the user (conventions, frames, what is left out).
+    """
+
+    files: tuple[Path, ...]
+    lossless: bool
+    errors: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Exporter:
+    """A format of ``neuprim export --format NAME``; group ``neuprim.exporters``.
+
+    Attributes:
+        options: option name -> (default, one line of help).
+        write: does it, atomically; raises a :class:`~neuprim.core.errors.NeuprimError` for what the format cannot hold.
+    """
+
+    api: int
+    name: str
+    summary: str
+    write: Callable[[ExportJob], ExportReport]
+    options: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Inspector:
+    """A way of showing a density in ``neuprim inspect --show NAME``; group ``neuprim.inspectors``.
+
+    Attributes:
+        add: (pyvista plotter, :class:`~neuprim.plugins.inspect.field.FieldFrame`) draws one frame into the plotter; called again with
+            the next frame after the plotter's actors of the last one were removed.
+    """
+
+    api: int
+    name: str
+    summary: str
+    add: Callable[[Any, Any], None]
+
+
+@dataclass(frozen=True)
+class SceneExtension:
+    """A scene for a task of another package; group ``neuprim.scenes``.
+
+    Attributes:
+        task: name of the task.
+        config_package: importable package that holds ``scene/TASK/NAME.yaml``.
+    """
+
+    api: int
+    task: str
+    scene: SceneSpec
+    config_package: str
+
+
+@dataclass(frozen=True)
+class LossExtension:
+    """A training loss for any task, chosen by ``train.loss=NAME``; group ``neuprim.losses``.
+
+    Attributes:
+        make: (``task.options`` and other loss settings) -> the loss.
+    """
+
+    api: int
+    name: str
+    summary: str
+    make: Callable[[Mapping[str, Any]], Loss]

@@ -30,6 +30,7 @@ __all__ = [
     "Opaque",
     "OpaqueColour",
     "RayNet",
+    "Shade",
 ]
 
 Conditions = Mapping[str, Tensor]
@@ -143,6 +144,9 @@ class RayNet:
 
 LoweredColour = Constant | RayNet | OpaqueColour
 
+Shade = Callable[[Tensor], Tensor]
+"""(M, 3) float64 scene points that pixels show -> (M,) factors on the light that they send to the camera, without gradient."""
+
 
 # ---------------------------------------------------------------- fields
 
@@ -239,3 +243,9 @@ class ColourField(Field):
     @abstractmethod
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> LoweredColour:
         """The frame's closed form."""
+
+    def shade(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions) -> Shade | None:
+        """A factor that varies faster than primitives do, such as a shadow's edge: the renderer asks for it once per pixel, at the
+        mean depth of what the pixel shows (deferred shading). None: 1 everywhere, and no depth image is drawn for it.
+        """
+        return None

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.fields import ColourField, Conditions, DensityField, LoweredColour, LoweredDensity
+from neuprim.core.fields import ColourField, Conditions, DensityField, LoweredColour, LoweredDensity, Shade
 from neuprim.core.geometry import GEOMETRY_SPECS, Geometry
 from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import InitContext, ParameterSpec
@@ -21,13 +21,15 @@ __all__ = ["Lowered", "Primitives"]
 class Lowered:
     """What one frame hands to the renderer, whatever the task.
 
-    ``rows`` (M,) int64 says which primitives these are where a field left some out; None for all.
+    ``rows`` (M,) int64 says which primitives these are where a field left some out; None for all. ``shade``, if any, is a factor on
+    each pixel (see :meth:`~neuprim.core.fields.ColourField.shade`).
     """
 
     geometry: Geometry
     density: LoweredDensity
     colour: LoweredColour
     rows: Tensor | None = None
+    shade: Shade | None = None
 
 
 class Primitives:
@@ -83,7 +85,8 @@ class Primitives:
         params, geometry, density, rows = self._lower_density(conditions)
         conditions = self.colour.derive(geometry, density, conditions)
         tint = {s.name: params[s.name] for s in self.colour.parameters()}
-        return Lowered(geometry, density, self.colour.lower(tint, geometry, camera, conditions), rows)
+        colour = self.colour.lower(tint, geometry, camera, conditions)
+        return Lowered(geometry, density, colour, rows, self.colour.shade(geometry, density, conditions))
 
     def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:
         """Where the primitives that live in a frame are, and their density; no camera needed."""

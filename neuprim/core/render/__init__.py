@@ -16,6 +16,7 @@ from neuprim.core.render.output import RenderOutput, RenderStats
 from neuprim.core.render.refusals import refuse_non_finite
 from neuprim.core.render.samples import render_samples
 from neuprim.core.render.settings import RenderSettings
+from neuprim.core.render.shading import with_shade
 
 __all__ = ["BACKENDS", "RenderOutput", "RenderSettings", "RenderStats", "choose_backend", "probe", "render", "render_lowered"]
 
@@ -76,6 +77,8 @@ def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings
         from neuprim.core.render.reference import render as draw
 
         refuse_non_finite(lowered)
+    if lowered.shade is not None:
+        draw = with_shade(draw)
     if settings.samples > 1:
         if isinstance(camera, RayCamera):
             raise ConfigError(f"renderer.samples={settings.samples}: only pinhole cameras are sampled; give a RayCamera more directions")

@@ -11,7 +11,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
-from neuprim.tasks.relight.colour import FORMS, LightNetwork
+from neuprim.tasks.relight.colour import FORMS, VISIBILITY, LightNetwork
 from neuprim.tasks.relight.harmonics import LightHarmonics
 from neuprim.tasks.relight.lights import parse_intensities, parse_lights
 from neuprim.tasks.relight.loss import hdr_loss
@@ -21,7 +21,7 @@ __all__ = ["TASK"]
 _SETTINGS: dict[str, tuple[Any, ...] | type] = {
     "form": (*FORMS, "harmonics"),
     "hidden": int,
-    "visibility": bool,
+    "visibility": VISIBILITY,
     "boost": float,
     "degree": int,
 }

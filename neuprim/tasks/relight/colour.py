@@ -17,7 +17,7 @@ from typing import Any
 
 from torch import Tensor
 
-from neuprim.core.fields import ColourField, Conditions, LoweredDensity, RayNet
+from neuprim.core.fields import ColourField, Conditions, LoweredDensity, RayNet, Shade
 from neuprim.core.geometry import Geometry
 from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import InitContext, ParameterSpec, Params
@@ -27,6 +27,8 @@ __all__ = ["FORMS", "LightNetwork"]
 
 FORMS = ("additive", "multiplicative")
 
+VISIBILITY = ("none", "primitive", "pixel")
+
 
 class LightNetwork(ColourField):
     """See the module. H = 0 is the constant colour c_dc (times V and E).
@@ -34,7 +36,8 @@ class LightNetwork(ColourField):
     Args:
         hidden: H, 0..16.
         form: one of :data:`FORMS`.
-        visibility: whether shadows come from a depth image out of the light.
+        visibility: where a depth image out of the light is asked whether light arrives: nowhere ("none": equation 14 as printed), at
+            the centres of primitives ("primitive"), or at the point that each pixel shows ("pixel").
         boost: beta. 1 starts flat in the light's direction, 30 overfits (method: relighting).
         falloff: whether the light's intensity is divided by the squared distance, in scene units.
     """
@@ -42,7 +45,13 @@ class LightNetwork(ColourField):
     init_settings = ("output",)
 
     def __init__(
-        self, hidden: int = 8, channels: int = 3, form: str = "additive", visibility: bool = True, boost: float = 3.0, falloff: bool = False
+        self,
+        hidden: int = 8,
+        channels: int = 3,
+        form: str = "additive",
+        visibility: str = "pixel",
+        boost: float = 3.0,
+        falloff: bool = False,
     ) -> None:
         if not isinstance(hidden, int) or not 0 <= hidden <= 16:
             raise ValueError(f"{hidden!r} hidden units; expected 0..16")
@@ -50,10 +59,12 @@ class LightNetwork(ColourField):
             raise ValueError(f"{channels!r} colour channels; expected at least 1")
         if form not in FORMS:
             raise ValueError(f"form {form!r}; expected {' or '.join(FORMS)}")
+        if visibility not in VISIBILITY:
+            raise ValueError(f"visibility {visibility!r}; expected {', '.join(VISIBILITY[:-1])} or {VISIBILITY[-1]}")
         if not 0 < boost <= 100:
             raise ValueError(f"boost {boost!r}; expected a number in (0, 100]")
         self.hidden, self.channels, self.form = hidden, channels, form
-        self.visibility, self.boost, self.falloff = bool(visibility), float(boost), bool(falloff)
+        self.visibility, self.boost, self.falloff = visibility, float(boost), bool(falloff)
 
     def settings(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in ("hidden", "channels", "form", "visibility", "boost", "falloff")}
@@ -71,9 +82,12 @@ class LightNetwork(ColourField):
         ]
 
     def derive(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions) -> Conditions:
-        if not self.visibility:
+        if self.visibility != "primitive":
             return conditions
-        return {**conditions, "visibility": light_visibility(geometry, density, conditions["light"])}
+        return {**conditions, "visibility": light_visibility(geometry, density, conditions["light"])(geometry.means)}
+
+    def shade(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions) -> Shade | None:
+        return light_visibility(geometry, density, conditions["light"]) if self.visibility == "pixel" else None
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> RayNet:
         means = geometry.means

@@ -1,7 +1,8 @@
-"""Which primitives the light reaches: a depth image out of the light, by the renderer that draws everything else.
+"""How far a point light reaches: a depth image out of the light, by the renderer that draws everything else (a shadow map).
 
-V_i = mean over 3 x 3 pixels around the projected centre of sigmoid((depth - z_i + bias)/softness): 1 where nothing lies between
-the light and the primitive, 0 deep in a shadow. It carries no gradient: a shadow moves only as what casts it moves.
+At a point x,  V(x) = sigmoid((depth(x) - z(x) + bias)/softness):  1 where nothing lies between light and point, 0 deep in a shadow. The
+depth image is read as inverse depth, bilinearly: that is exact on planes, so that a lit floor does not shadow itself at grazing light.
+V carries no gradient: a shadow moves only as what casts it moves.
 """
 
 from __future__ import annotations
@@ -13,36 +14,37 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.fields import Constant, LoweredDensity
+from neuprim.core.fields import Constant, LoweredDensity, Shade
 from neuprim.core.geometry import Geometry
 from neuprim.core.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
 
-__all__ = ["light_visibility"]
+__all__ = ["BIAS", "SIZE", "SOFTNESS", "light_visibility"]
 
-BIAS, SOFTNESS = 0.06, 0.02
+SIZE = 192
+"""Pixels of the depth image, square."""
+
+BIAS, SOFTNESS = 0.05, 0.015
 """In units of a quarter of the scene's diameter as the light sees it: how far behind the depth image a lit surface may lie, and over
-what distance light fades. The study's numbers, for a scene about four units across."""
+what distance light fades."""
 
 
 def light_visibility(
-    geometry: Geometry, density: LoweredDensity, light: Tensor, size: int = 96, bias: float = BIAS, softness: float = SOFTNESS
-) -> Tensor:
-    """(N,) float32 visibility 0..1 of a point light (3,) from each primitive's centre.
+    geometry: Geometry, density: LoweredDensity, light: Tensor, size: int = SIZE, bias: float = BIAS, softness: float = SOFTNESS
+) -> Shade:
+    """The function (M, 3) scene points -> (M,) visibility 0..1, float32, of a point light (3,).
 
     The light's camera looks at the middle of all centres and sees all of them; a light among them looks the way most of them lie,
-    and those behind it count as lit.
+    and points behind it count as lit.
     """
     with torch.no_grad():
         means = geometry.means.detach().double()
         light = light.detach().double()
-        low, high = means.amin(0), means.amax(0)
-        center = (low + high) / 2
+        center = (means.amin(0) + means.amax(0)) / 2
         radius = float((means - center).norm(dim=-1).max()) + float(geometry.scales.detach().max())
         distance = float((light - center).norm())
-        unit = 0.5 * radius
         if distance < 1e-9 * max(radius, 1e-30):
-            return torch.ones(geometry.count)
+            return lambda points: torch.ones(len(points))
         half = math.asin(min(radius / distance, 0.94))
         focal = 0.5 * size / math.tan(half)
         up = torch.tensor([0.0, 0.0, 1.0] if abs(float(light[2] - center[2])) < 0.9 * distance else [0.0, 1.0, 0.0], dtype=torch.float64)
@@ -55,15 +57,17 @@ def light_visibility(
         )
         output = render_lowered(flat, camera, RenderSettings(depth=True, near=near))
         assert output.depth is not None
-        depth = torch.where(output.alpha > 0.5, output.depth.double(), torch.inf)
-        x, y, z = (means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).unbind(-1)
-        front = z > near
-        u, v = (focal * w / z.clamp_min(1e-12) + size / 2 for w in (x, y))
-        column, row = (w.clamp(-1, size).floor().long() + 1 for w in (u, v))
-        padded = F.pad(depth, (2, 2, 2, 2), value=math.inf)
-        total = torch.zeros_like(z)
-        for dy in range(3):
-            for dx in range(3):
-                seen = padded[row + dy, column + dx]
-                total += torch.sigmoid((seen - z + bias * unit) / (softness * unit))
-        return torch.where(front, total / 9, 1.0).float()
+        nearness = torch.where(output.alpha > 0.5, 1.0 / output.depth.double().clamp_min(near), 0.0)
+        unit = 0.5 * radius
+
+    def visibility(points: Tensor) -> Tensor:
+        with torch.no_grad():
+            x, y, z = (points.detach().double() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).unbind(-1)
+            front = z > near
+            spread = focal / (0.5 * size) / z.clamp_min(near)
+            where = torch.stack([x * spread, y * spread], -1).clamp(-2.0, 2.0)
+            found = F.grid_sample(nearness[None, None], where[None, None], align_corners=False)[0, 0, 0]
+            behind = z - 1.0 / found.clamp_min(1e-12)
+            return torch.where(front, torch.sigmoid((bias * unit - behind) / (softness * unit)), 1.0).float()
+
+    return visibility

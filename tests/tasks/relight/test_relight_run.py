@@ -53,7 +53,7 @@ def test_the_light_goes_round(finished: Path, tmp_path: Path) -> None:
     [
         ["model.colour.form=multiplicative"],
         ["model.colour.form=harmonics", "model.colour.degree=3"],
-        ["model.colour.visibility=false", "task.options.loss=compressed"],
+        ["model.colour.visibility=none", "task.options.loss=compressed"],
         ["model.colour.hidden=0", "task.options.loss=relative"],
         ["preset=paper", "train.population.every=5"],
     ],

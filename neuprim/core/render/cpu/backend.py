@@ -192,14 +192,19 @@ class _Rasterize(torch.autograd.Function):
         ctx.dtypes = [x.dtype for x in (means, log_scales, quats, W1, b1, w2, b2, colors)]
         ctx.net_dtypes = [x.dtype for x in net]
         ctx.view_dtype, ctx.background_dtype = viewmat.dtype, background.dtype
+        ctx.set_materialize_grads(False)  # a depth image that nothing is asked of costs the backward pass nothing
         return torch.from_numpy(rgb), torch.from_numpy(T), torch.from_numpy(z)
 
     @staticmethod
-    def backward(ctx: Any, g_rgb: Tensor, g_T: Tensor, g_z: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+    def backward(ctx: Any, g_rgb: Tensor | None, g_T: Tensor | None, g_z: Tensor | None) -> tuple[Any, ...]:  # type: ignore[override]
         frame: _Frame = ctx.frame
         s, t = frame.settings, ctx.tensors
         count = t["W1"].shape[0]
-        h, w, C = g_rgb.shape
+        (h, w), C = ctx.T.shape, ctx.palette.shape[1]
+        with_depth = s.depth and g_z is not None
+        g_rgb = torch.zeros(h, w, C) if g_rgb is None else g_rgb
+        g_T = torch.zeros(h, w) if g_T is None else g_T
+        g_z = g_z if with_depth and g_z is not None else torch.zeros(1, 1)
         grad_rgb = np.ascontiguousarray(g_rgb.numpy(), np.float32)
         gT = np.ascontiguousarray((g_T + g_rgb @ torch.from_numpy(frame.background)).numpy(), np.float32)
         gz = np.ascontiguousarray(g_z.numpy(), np.float32)
@@ -210,7 +215,7 @@ class _Rasterize(torch.autograd.Function):
         tiles = backward_tiles_by_entry if s.sort == "entry" else backward_tiles
         lanes = parallel_for(
             tiles, frame.tiles, frame.chunk, s.threads, frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
-            frame.lists.starts, frame.lists.ids, ctx.palette, frame.norms, frame.limits, s.depth, frame.neurons,
+            frame.lists.starts, frame.lists.ids, ctx.palette, frame.norms, frame.limits, with_depth, frame.neurons,
             ctx.T, ctx.last, grad_rgb, gT, gz, error, pair_rows, frame.net,
         )  # fmt: skip
         frame.stats.extra["backward_lanes"] = sum(lanes)

@@ -1,0 +1,49 @@
+"""Deferred shading: a factor per pixel, found at the point in space that the pixel shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from neuprim.core.primitives import Lowered
+from neuprim.core.ray_cameras import AnyCamera, RayCamera
+from neuprim.core.render.output import RenderOutput
+from neuprim.core.render.settings import RenderSettings
+
+__all__ = ["points_seen", "with_shade"]
+
+Draw = Callable[[Lowered, AnyCamera, Tensor | None, RenderSettings], RenderOutput]
+
+
+def points_seen(depth: Tensor, camera: AnyCamera) -> Tensor:
+    """(H, W, 3) float64 scene points at a depth image (H, W): camera-z, or distance for a ``RayCamera``; no gradient."""
+    view = camera.viewmat.detach().double()
+    depth = depth.detach().double()
+    if isinstance(camera, RayCamera):
+        local = camera.directions.detach().double() * depth[..., None]
+    else:
+        x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
+        y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
+        local = torch.stack([x[None, :] * depth, y[:, None] * depth, depth], -1)
+    return (local - view[:3, 3]) @ view[:3, :3]
+
+
+def with_shade(draw: Draw) -> Draw:
+    """The same, with the frame's matter, not its background, times ``lowered.shade`` at each pixel's mean depth."""
+
+    def shaded(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
+        assert lowered.shade is not None
+        output = draw(lowered, camera, background, replace(settings, depth=True))
+        assert output.depth is not None
+        hit = output.alpha.detach() > 0
+        factor = torch.ones_like(output.alpha, requires_grad=False)
+        factor[hit] = lowered.shade(points_seen(output.depth, camera)[hit]).to(factor)
+        rgb = output.rgb * factor[..., None]
+        if background is not None:
+            rgb = rgb + ((1 - factor) * (1 - output.alpha))[..., None] * background.to(rgb)
+        return replace(output, rgb=rgb, depth=output.depth if settings.depth else None)
+
+    return shaded

@@ -16,7 +16,7 @@ from neuprim.core.render.output import RenderOutput, RenderStats
 from neuprim.core.render.refusals import refuse_non_finite
 from neuprim.core.render.samples import render_samples
 from neuprim.core.render.settings import RenderSettings
-from neuprim.core.render.shading import with_shade
+from neuprim.core.render.shading import Draw, with_shade
 
 __all__ = ["BACKENDS", "RenderOutput", "RenderSettings", "RenderStats", "choose_backend", "probe", "render", "render_lowered"]
 
@@ -77,14 +77,13 @@ def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings
         from neuprim.core.render.reference import render as draw
 
         refuse_non_finite(lowered)
-    if lowered.shade is not None:
-        draw = with_shade(draw)
+    paint: Draw = draw if lowered.shade is None else with_shade(draw)
     if settings.samples > 1:
         if isinstance(camera, RayCamera):
             raise ConfigError(f"renderer.samples={settings.samples}: only pinhole cameras are sampled; give a RayCamera more directions")
-        output = render_samples(draw, lowered, camera, background, settings)
+        output = render_samples(paint, lowered, camera, background, settings)
     else:
-        output = draw(lowered, camera, background, settings)  # type: ignore[arg-type]
+        output = paint(lowered, camera, background, settings)
     output.stats.rows = lowered.rows
     return output
 

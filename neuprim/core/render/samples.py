@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 from torch import Tensor
@@ -11,10 +10,9 @@ from neuprim.core.cameras import Camera
 from neuprim.core.primitives import Lowered
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.render.settings import RenderSettings
+from neuprim.core.render.shading import Draw
 
 __all__ = ["SampledStats", "render_samples"]
-
-Draw = Callable[[Lowered, Camera, Tensor | None, RenderSettings], RenderOutput]
 
 
 class SampledStats(RenderStats):

@@ -13,9 +13,10 @@ from neuprim.core.ray_cameras import AnyCamera, RayCamera
 from neuprim.core.render.output import RenderOutput
 from neuprim.core.render.settings import RenderSettings
 
-__all__ = ["points_seen", "with_shade"]
+__all__ = ["Draw", "points_seen", "with_shade"]
 
-Draw = Callable[[Lowered, AnyCamera, Tensor | None, RenderSettings], RenderOutput]
+Draw = Callable[..., RenderOutput]
+"""A backend's ``render(lowered, camera, background, settings)``; which cameras it takes differs."""
 
 
 def points_seen(depth: Tensor, camera: AnyCamera) -> Tensor:

@@ -24,7 +24,7 @@ __all__ = ["BIAS", "SIZE", "SOFTNESS", "light_visibility"]
 SIZE = 192
 """Pixels of the depth image, square."""
 
-BIAS, SOFTNESS = 0.05, 0.015
+BIAS, SOFTNESS = 0.2, 0.08
 """In units of a quarter of the scene's diameter as the light sees it: how far behind the depth image a lit surface may lie, and over
 what distance light fades."""
 

@@ -150,9 +150,7 @@ def _hydra_compose(spec: TaskSpec, package: str, groups: Sequence[str]) -> Any:
         raise ConfigError(f"task {spec.name!r}: its YAML files do not compose ({' '.join(str(error).split())})") from error
 
 
-def _base(
-    spec: TaskSpec, scene: str, preset: str, options: dict[str, Any], files: Files, package: str
-) -> tuple[dict[str, Any], list[str]]:
+def _base(spec: TaskSpec, scene: str, preset: str, options: dict[str, Any], files: Files, package: str) -> tuple[dict[str, Any], list[str]]:
     """Everything but the user's words, unresolved, and the names of the scene's settings that are paths."""
     from omegaconf import OmegaConf
 

@@ -41,9 +41,7 @@ def check_conditions(t: Subject) -> None:
         ends = [torch.full(spec.shape, float(end)) for end in (low, high)]
         for value in (*ends, sample(spec, generator)):
             view = t.views()[0]
-            out = render(model, view.camera, {**view.conditions, spec.name: value}, t.settings.renderer)
-            fine = bool(torch.isfinite(out.rgb).all())
-            t.require(fine, f"{where} = {value.tolist()}", "NaN or infinity in the image", "finite colours")
+            t.image(f"{where} = {value.tolist()}", model, replace(view, conditions={**view.conditions, spec.name: value}))
 
 
 def _parses(t: Subject, spec: ConditionSpec, where: str) -> None:
@@ -88,10 +86,9 @@ def check_extremes(t: Subject) -> None:
         change(model)
         view = place(t.views()[0], model)
         params = watched(model)
-        out = render(model, view.camera, view.conditions, t.settings.renderer)
-        t.require(bool(torch.isfinite(out.rgb).all()), f"colours of {name}", "NaN or infinity", "finite numbers")
-        if out.rgb.requires_grad:
-            out.rgb.sum().backward()
+        rgb = t.image(name, model, view)
+        if rgb.requires_grad:
+            rgb.sum().backward()
         for parameter, value in params.items():
             bad = value.grad is not None and not bool(torch.isfinite(value.grad).all())
             t.require(not bad, f"gradient of {parameter}, {name}", "NaN or infinity", "finite numbers")

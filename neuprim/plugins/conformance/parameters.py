@@ -93,11 +93,10 @@ def check_parameter_specs(t: Subject) -> None:
 
 def check_initialisers(t: Subject) -> None:
     """Start values have the spec's shape, are finite, and depend on nothing but the context and its generator, so that seeds mean something."""
-    first = t.fresh()
 
     def drawn(seed: int) -> InitContext:
         generator = torch.Generator().manual_seed(seed)
-        cloud = t.dataset.initial_points(first.count, generator)
+        cloud = t.dataset.initial_points(t.settings.model.primitives, generator)
         scales = torch.full((len(cloud.means),), 0.1)
         return InitContext(cloud.means.float(), scales, cloud.colors.float(), generator, t.settings.model.init, cloud.conditions)
 
@@ -118,6 +117,6 @@ def check_initialisers(t: Subject) -> None:
         )
         same = all(torch.equal(a, b) for a, b in zip(kept, (context.means, context.scales, context.colors), strict=True))
         t.require(same, f"{where}: initialiser", "the context's means, scales or colors changed in place", "a context left alone")
-    other = t.fresh()
+    first, other = t.fresh(), t.fresh()
     equal = all(torch.equal(first.params[n], other.params[n]) for n in first.params)
     t.require(equal, "two models of one seed", "different start values", "equal ones")

@@ -13,11 +13,12 @@ from torch import Tensor
 
 from neuprim.config import RunSettings, preset_settings, task_choices
 from neuprim.core.data import Dataset, View
+from neuprim.core.errors import NonFiniteError
 from neuprim.core.fields import ColourField, Conditions, DensityField, LoweredDensity
 from neuprim.core.geometry import Geometry
 from neuprim.core.primitives import Primitives
 from neuprim.core.ray_cameras import AnyCamera
-from neuprim.core.render import RenderSettings
+from neuprim.core.render import RenderSettings, render
 from neuprim.core.schema import ParameterSpec, Params
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.settings import PopulationSettings, TrainSettings
@@ -59,6 +60,16 @@ class Subject:
         """Raise :class:`ConformanceError` unless ``ok``."""
         if not ok:
             raise ConformanceError(f"task {self.task.name!r}: {self.check}: {where}: found {found}; expected {expected}")
+
+    def image(self, where: str, model: Primitives, view: View) -> Tensor:
+        """(H, W, C) colours of a view, which must be finite."""
+        try:
+            rgb = render(model, view.camera, view.conditions, self.settings.renderer).rgb
+        except NonFiniteError as error:
+            self.require(False, where, str(error), "finite numbers")
+            raise
+        self.require(bool(torch.isfinite(rgb).all()), where, "NaN or infinity in the image", "finite colours")
+        return rgb
 
     # ------------------------------------------------------------ what the task builds
 

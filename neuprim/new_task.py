@@ -40,6 +40,7 @@ def new_task(name: str, out: Path | None = None) -> list[str]:
         "version": __version__,
     }
     folder = Path(words["distribution"]) if out is None else out
+    place = folder if folder.is_absolute() else f"./{folder}"  # pip takes a bare name for a package of the index
     if folder.exists() or folder.is_symlink():
         raise ConfigError(f"{folder}: exists; expected a folder to make (--out DIR)")
 
@@ -50,7 +51,7 @@ def new_task(name: str, out: Path | None = None) -> list[str]:
     return [
         f"wrote {folder}: a task {name!r} that works; change {words['package']}/fields.py and scene.py into yours",
         "next:",
-        f"  pip install -e '{folder}[test]'",
+        f"  pip install -e '{place}[test]'",
         f"  neuprim run task={name}",
         f"  pytest {folder}",
         "guide: docs/plugins.md",

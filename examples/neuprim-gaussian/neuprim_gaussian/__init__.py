@@ -11,7 +11,6 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.fields import ColourField, DensityField
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.losses import photometric
-
 from neuprim_gaussian.colour import ViewDependentColour
 from neuprim_gaussian.density import BellDensity
 from neuprim_gaussian.scenes import SCENES

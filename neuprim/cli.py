@@ -20,7 +20,6 @@ from neuprim.core.errors import ConfigError, NeuprimError, nearest
 
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
-    from neuprim.core.task import TaskSpec
 
 __all__ = ["main"]
 
@@ -141,7 +140,12 @@ def _parsers(with_tasks: bool) -> tuple[Parser, dict[str, argparse.ArgumentParse
     vdb.add_argument("path", type=Path, metavar="FILE|DIR", help="a .vdb file, or a folder of frames")
     vdb.add_argument("--json", action="store_true", help="print JSON")
 
-    command("tasks", _tasks, "list tasks, scenes and presets, and the packages they come from")
+    command("tasks", _tasks, "list tasks, scenes, presets and other plugins, and the packages they come from")
+
+    new = command("new-task", _new_task, "write a small working package with a task of your own: see docs/plugins.md")
+    new.add_argument("name", metavar="NAME", help="what users will type after task=: lower-case letters, digits and _")
+    new.add_argument("--out", type=Path, metavar="DIR", help="a folder that does not exist yet (default: neuprim-NAME)")
+
     command("doctor", _doctor, "show versions, devices and which renderer backends work here")
     return parser, dict(sub.choices)
 
@@ -207,32 +211,17 @@ def _vdb(args: argparse.Namespace) -> int:
 
 
 def _tasks(args: argparse.Namespace) -> int:
-    from neuprim.plugins.registry import survey
+    from neuprim.listing import list_plugins
 
-    for report in survey():
-        try:
-            if report.spec is None:
-                raise ConfigError(report.error or "cannot be loaded")
-            lines = _describe(report.spec)
-            print(f"{report.info.name}  ({report.info.origin})  {report.spec.summary}")
-        except ConfigError as broken:
-            lines = [str(broken)]
-            print(f"{report.info.name}  ({report.info.origin})  BROKEN")
-        print(*(f"  {line}" for line in lines), sep="\n", end="\n\n")
+    print(*list_plugins(), sep="\n")
     return 0
 
 
-def _describe(spec: TaskSpec) -> list[str]:
-    from neuprim.config import check_groups, presets, task_choices
+def _new_task(args: argparse.Namespace) -> int:
+    from neuprim.new_task import new_task
 
-    check_groups(spec)
-    default = task_choices(spec)
-    width = max(len(scene.name) for scene in spec.scenes)
-    rows = [("scenes", f"{s.name:{width}}  {s.summary}{' (default)' if s.name == default.scene else ''}") for s in spec.scenes]
-    rows.append(("presets", ", ".join(name + " (default)" * (name == default.preset) for name in presets(spec))))
-    if spec.conditions:
-        rows.append(("conditions", ", ".join(f"{c.name} [{c.unit}]" for c in spec.conditions)))
-    return [f"{title if i == 0 or title != rows[i - 1][0] else '':10}  {text}" for i, (title, text) in enumerate(rows)]
+    print(*new_task(args.name, args.out), sep="\n")
+    return 0
 
 
 def _doctor(args: argparse.Namespace) -> int:

@@ -22,7 +22,7 @@ from neuprim.core.film import write_film
 from neuprim.core.primitives import Primitives
 from neuprim.core.task import SceneContext, TaskSpec
 from neuprim.measure import display, draw, measure, summary
-from neuprim.plugins.registry import load_task
+from neuprim.plugins.registry import find_scene, load_task
 
 __all__ = ["FORMATS", "evaluate_run", "load_dataset", "load_run", "read_metrics", "render_run"]
 
@@ -34,7 +34,7 @@ FORMATS = ("png", "exr", *ANIMATIONS)
 def load_dataset(config: RunConfig, task: TaskSpec, progress: Callable[[str, float], None] = lambda text, fraction: None) -> Dataset:
     """The data set of a run's configuration."""
     context = SceneContext(config.seed, cache_directory() / "scenes", progress)
-    return task.scene(config.scene_name).load(config.scene, context)
+    return find_scene(task, config.scene_name).spec.load(config.scene, context)
 
 
 def load_run(run_dir: Path) -> tuple[RunConfig, TaskSpec, Primitives, dict[str, Any]]:

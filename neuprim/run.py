@@ -27,7 +27,7 @@ from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer, initial_model
 from neuprim.evaluate import load_dataset
 from neuprim.measure import display, draw, measure, summary
-from neuprim.plugins.registry import load_task
+from neuprim.plugins.registry import load_loss, load_task
 from neuprim.progress import RunProgress
 from neuprim.report import error_map, write_report
 from neuprim.warm import compiled, compiling, mark_compiled
@@ -84,7 +84,7 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset) -> Trainer
     """A fresh model of a run's configuration and what fits it.
 
     Raises:
-        ConfigError: a rate or starting value for something the model does not have.
+        ConfigError: a rate or starting value for something the model does not have, or a loss that does not exist.
         DataError: the data set offers no starting point.
     """
     density, colour = task.build({**vars(config.model), "options": config.options}, dataset)
@@ -92,7 +92,8 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset) -> Trainer
     # A preset has rates for every density and colour of its task; the trainer refuses names that the model does not have.
     others = task.parameter_names() - model.params.keys()
     settings = replace(config.train, rates={k: v for k, v in config.train.rates.items() if k not in others})
-    loss = task.loss({**vars(config.train), "options": config.options})
+    factory = task.loss if config.train.loss is None else load_loss(config.train.loss).make
+    loss = factory({**vars(config.train), "options": config.options})
     return Trainer(model, dataset, loss, settings, config.renderer, config.seed)
 
 

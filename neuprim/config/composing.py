@@ -12,18 +12,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuprim.config.groups import check_groups, presets, task_choices
+from neuprim.config.groups import check_groups, check_scene, presets, task_choices
 from neuprim.config.outputs import output_directory
 from neuprim.config.overrides import Assignment, expand_sweep, parse, sweep_names, swept_keys
 from neuprim.config.record import RunConfig, RunSettings
 from neuprim.config.schema import REQUIRED, build, defaults, is_free, like, setting_names
 from neuprim.core.errors import ConfigError, nearest
-from neuprim.plugins.registry import load_task
+from neuprim.plugins.registry import find_scene, load_loss, load_task
 
 if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
 
-__all__ = ["compose", "compose_all"]
+__all__ = ["compose", "compose_all", "preset_settings"]
 
 DEFAULT_TASK = "static"
 CHOICES = ("task", "scene", "preset")
@@ -57,15 +57,19 @@ def _compose(overrides: Sequence[str], check_output: bool, files: Files) -> RunC
     own = task_choices(spec)
     scene_name = chosen["scene"] or own.scene
     preset = chosen["preset"] or own.preset
-    _check_name("scene", scene_name, [s.name for s in spec.scenes], spec)
-    _check_name("preset", preset, presets(spec), spec)
+    package = find_scene(spec, scene_name).config_package
+    check_scene(spec, scene_name, package)
+    if preset not in presets(spec):
+        raise ConfigError(f"preset={preset}: task {spec.name!r} has no such preset{nearest(preset, presets(spec))}")
 
-    base, declared_paths = _base(spec, scene_name, preset, own.options, files)
+    base, declared_paths = _base(spec, scene_name, preset, own.options, files, package)
     for assignment in values:
         _check_key(assignment, base, scene_name)
     plain, full = _merge(base, values)
     settings = _settings(full)
     spec.check(vars(settings.model))
+    if settings.train.loss is not None:
+        load_loss(settings.train.loss)
     scene = _scene(full["scene"], base["scene"], declared_paths)
     directory = output_directory(settings.output_dir, f"{spec.name}-{scene_name}", settings.resume, check_output)
     full["scene"] = scene
@@ -120,22 +124,18 @@ def _choice(assignments: Sequence[Assignment], key: str) -> str | None:
     return str(value)
 
 
-def _check_name(kind: str, name: str, names: Sequence[str], spec: TaskSpec) -> None:
-    if name not in names:
-        raise ConfigError(f"{kind}={name}: task {spec.name!r} has no such {kind}{nearest(name, names)}")
-
-
 # ---------------------------------------------------------------- Hydra
 
 
-def _hydra(spec: TaskSpec, groups: tuple[str, ...], files: Files) -> Any:
-    key = (spec.config_package, *groups)
+def _hydra(spec: TaskSpec, package: str, groups: tuple[str, ...], files: Files) -> Any:
+    key = (spec.config_package, package, *groups)
     if key not in files:
-        files[key] = _hydra_compose(spec, groups)
+        files[key] = _hydra_compose(spec, package, groups)
     return files[key]
 
 
-def _hydra_compose(spec: TaskSpec, groups: Sequence[str]) -> Any:
+def _hydra_compose(spec: TaskSpec, package: str, groups: Sequence[str]) -> Any:
+    """``package`` holds the scene's file; the task's own files come first, so that a scene cannot replace a preset."""
     from hydra import compose as hydra_compose
     from hydra import initialize_config_module
     from hydra.errors import HydraException
@@ -144,16 +144,17 @@ def _hydra_compose(spec: TaskSpec, groups: Sequence[str]) -> Any:
 
     try:
         with initialize_config_module("neuprim.conf", version_base="1.3"):
-            return hydra_compose("config", [f"hydra.searchpath=[pkg://{spec.config_package}]", *groups])
+            places = ",".join(f"pkg://{p}" for p in dict.fromkeys([spec.config_package, package]))
+            return hydra_compose("config", [f"hydra.searchpath=[{places}]", *groups])
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise ConfigError(f"task {spec.name!r}: its YAML files do not compose ({' '.join(str(error).split())})") from error
 
 
-def _base(spec: TaskSpec, scene: str, preset: str, options: dict[str, Any], files: Files) -> tuple[dict[str, Any], list[str]]:
+def _base(spec: TaskSpec, scene: str, preset: str, options: dict[str, Any], files: Files, package: str) -> tuple[dict[str, Any], list[str]]:
     """Everything but the user's words, unresolved, and the names of the scene's settings that are paths."""
     from omegaconf import OmegaConf
 
-    composed = _hydra(spec, (f"+scene/{spec.name}@from_scene={scene}", f"+preset/{spec.name}@from_preset={preset}"), files)
+    composed = _hydra(spec, package, (f"+scene/{spec.name}@from_scene={scene}", f"+preset/{spec.name}@from_preset={preset}"), files)
     place, scene_place = f"preset/{spec.name}/{preset}.yaml", f"scene/{spec.name}/{scene}.yaml"
     scene_node = _plain(composed.get("from_scene"), resolve=False, place=scene_place)
     preset_node = _plain(composed.get("from_preset"), resolve=False, place=place)
@@ -171,6 +172,17 @@ def _base(spec: TaskSpec, scene: str, preset: str, options: dict[str, Any], file
     except ConfigError as error:
         raise ConfigError(f"{place}: {error}") from error
     return base, declared
+
+
+def preset_settings(spec: TaskSpec, preset: str, scene: str) -> RunSettings:
+    """Settings of a preset and a scene of a task, with nothing typed; the task need not be registered.
+
+    Raises:
+        ConfigError: its files lack something, do not compose, or hold an impossible value.
+    """
+    check_groups(spec)
+    base, _ = _base(spec, scene, preset, {}, {}, spec.config_package)
+    return _settings(_merge(base, [])[0])
 
 
 def _merge(base: Mapping[str, Any], values: Sequence[Assignment]) -> tuple[dict[str, Any], dict[str, Any]]:

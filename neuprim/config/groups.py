@@ -16,7 +16,7 @@ from neuprim.core.errors import ConfigError, nearest
 if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
 
-__all__ = ["TaskChoices", "check_groups", "presets", "task_choices"]
+__all__ = ["TaskChoices", "check_groups", "check_scene", "presets", "task_choices"]
 
 DEFAULT_PRESET = "quick"
 
@@ -81,14 +81,25 @@ def check_groups(spec: TaskSpec) -> None:
         raise ConfigError(f"task {spec.name!r}: {spec.config_package} has no preset/{spec.name}/*.yaml")
 
 
+def check_scene(spec: TaskSpec, scene: str, package: str) -> None:
+    """Raises ConfigError when the package that adds ``scene`` to a task has no YAML file for it."""
+    who = f"scene {scene!r} of task {spec.name!r}"
+    if not (_package(package, who) / "scene" / spec.name / f"{scene}.yaml").is_file():
+        raise ConfigError(f"{who}: {package} has no scene/{spec.name}/{scene}.yaml")
+
+
 def _root(spec: TaskSpec) -> Traversable:
+    return _package(spec.config_package, f"task {spec.name!r}")
+
+
+def _package(name: str, who: str) -> Traversable:
     try:
-        root = resources.files(spec.config_package)
-    except Exception as error:  # importing a package can fail in any way
+        root = resources.files(name)
+    except (Exception, SystemExit) as error:  # importing a package can fail in any way
         text = " ".join(str(error).split())
-        raise ConfigError(f"task {spec.name!r}: cannot open its config_package {spec.config_package!r} ({text})") from error
+        raise ConfigError(f"{who}: cannot open its config_package {name!r} ({text})") from error
     if not (root / "__init__.py").is_file():
-        raise ConfigError(f"task {spec.name!r}: config_package {spec.config_package!r} needs an __init__.py (Hydra looks for it)")
+        raise ConfigError(f"{who}: config_package {name!r} needs an __init__.py (Hydra looks for it)")
     return root
 
 

@@ -106,7 +106,7 @@ class Inspector:
 
 @dataclass(frozen=True)
 class SceneExtension:
-    """A scene for a task of another package; group ``neuprim.scenes``.
+    """A scene for a task of another package; group ``neuprim.scenes``, under the entry-point name ``TASK.SCENE``.
 
     Attributes:
         task: name of the task.
@@ -124,7 +124,7 @@ class LossExtension:
     """A training loss for any task, chosen by ``train.loss=NAME``; group ``neuprim.losses``.
 
     Attributes:
-        make: (``task.options`` and other loss settings) -> the loss.
+        make: what a task's own ``loss`` gets (the settings under ``train``, and ``task.options`` as "options") -> the loss.
     """
 
     api: int

@@ -190,7 +190,14 @@ class Field(ABC):
 
 
 class DensityField(Field):
-    """How much light a point absorbs."""
+    """How much light a point absorbs.
+
+    ``exact_split`` says that children continue their parent's sigma inside their own support (see :meth:`on_split`). A family of
+    densities that is too small for that, such as Gaussians, sets it to False; its children must then hold their parent's mass, the
+    integral of sigma over space.
+    """
+
+    exact_split: bool = True
 
     @abstractmethod
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> LoweredDensity:

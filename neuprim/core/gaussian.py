@@ -42,6 +42,7 @@ class GaussianDensity(DensityField):
     """
 
     init_settings = ("mode", "alpha")
+    exact_split = False
 
     def __init__(self, deviations: float = 3.0) -> None:
         if isinstance(deviations, bool) or not isinstance(deviations, (int, float)) or not 0.5 <= deviations <= 10:

@@ -77,6 +77,9 @@ class TaskSpec:
     check: Callable[[Mapping[str, Any]], None] = lambda model: None
     fields: Mapping[str, type[Field]] | None = None
     """Class name -> field class, so that a saved model can be rebuilt from its header."""
+    example: Callable[[], Dataset] | None = None
+    """A tiny data set, made in memory, that the checks of :mod:`neuprim.plugins.conformance` use in place of their own: for tasks
+    whose fields ask for something beside posed images and conditions within their ranges. Images of about 10 x 10 pixels will do."""
 
     def parameter_names(self) -> set[str]:
         """Names of the parameters that the task's fields have at any settings.

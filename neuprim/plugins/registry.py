@@ -1,63 +1,68 @@
-"""Tasks by name, from the entry-point group ``neuprim.tasks``.
+"""Plugins by name, from entry points: tasks, and scenes, losses, exporters and inspectors for the tasks of others.
 
-The built-in tasks come through the same group as anybody's. Listing reads package metadata only; a task is imported when
-it is asked for, so a broken plugin stops nothing but itself.
+The built-in ones come through the same groups as anybody's. Listing reads package metadata only; a plugin is imported when
+it is asked for, so a broken one stops nothing but itself. See :mod:`neuprim.plugins.mechanism`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import metadata
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from neuprim.core.errors import ConfigError, NeuprimError, nearest
+from neuprim.core.errors import ConfigError, nearest
+from neuprim.plugins.mechanism import Group, PluginError, PluginInfo, PluginReport
 
 if TYPE_CHECKING:  # importing the interfaces imports torch, which listing does not need
-    from neuprim.core.task import TaskSpec
+    from neuprim.core.extensions import Exporter, Inspector, LossExtension, SceneExtension
+    from neuprim.core.task import SceneSpec, TaskSpec
 
-__all__ = ["GROUP", "PluginError", "TaskInfo", "TaskReport", "list_tasks", "load_task", "survey"]
+__all__ = [
+    "ALL",
+    "EXPORTERS",
+    "GROUP",
+    "INSPECTORS",
+    "LOSSES",
+    "SCENES",
+    "TASKS",
+    "FoundScene",
+    "Group",
+    "PluginError",
+    "PluginInfo",
+    "PluginReport",
+    "TaskInfo",
+    "TaskReport",
+    "find_scene",
+    "list_exporters",
+    "list_inspectors",
+    "list_losses",
+    "list_scenes",
+    "list_tasks",
+    "load_exporter",
+    "load_inspector",
+    "load_loss",
+    "load_task",
+    "scene_names",
+    "survey",
+]
 
-GROUP = "neuprim.tasks"
+TASKS: Group[TaskSpec] = Group("neuprim.tasks", "task", "task={}", "neuprim.core.task:TaskSpec")
+SCENES: Group[SceneExtension] = Group(
+    "neuprim.scenes", "scene", "scene {}", "neuprim.core.extensions:SceneExtension", lambda s: f"{s.task}.{s.scene.name}"
+)
+"""Entry points here are called ``TASK.SCENE``, so that metadata alone says what there is for a task."""
+LOSSES: Group[LossExtension] = Group("neuprim.losses", "loss", "train.loss={}", "neuprim.core.extensions:LossExtension")
+EXPORTERS: Group[Exporter] = Group("neuprim.exporters", "exporter", "--format {}", "neuprim.core.extensions:Exporter")
+INSPECTORS: Group[Inspector] = Group("neuprim.inspectors", "inspector", "--show {}", "neuprim.core.extensions:Inspector")
+
+GROUP = TASKS.entry_points
+TaskInfo, TaskReport = PluginInfo, PluginReport
+
+# ---------------------------------------------------------------- tasks
 
 
-class PluginError(NeuprimError):
-    """A plugin is installed but cannot be used; the message names plugin, distribution and reason."""
-
-
-@dataclass(frozen=True)
-class TaskInfo:
-    """What package metadata says about a task.
-
-    Attributes:
-        name: what the user types after ``task=``.
-        distribution, version: the installed package that registers it.
-        target: ``module:attribute`` of its :class:`~neuprim.core.task.TaskSpec`.
-    """
-
-    name: str
-    distribution: str
-    version: str
-    target: str
-
-    @property
-    def origin(self) -> str:
-        """For example ``"neuprim 0.1.0"``."""
-        return f"{self.distribution} {self.version}".strip()
-
-
-@dataclass(frozen=True)
-class TaskReport:
-    """One registered task, loaded, or the reason it could not be."""
-
-    info: TaskInfo
-    spec: TaskSpec | None = None
-    error: str | None = None
-
-
-def list_tasks() -> list[TaskInfo]:
+def list_tasks() -> list[PluginInfo]:
     """All registered tasks by name, without importing any; a name claimed twice is listed twice."""
-    return sorted((info for info, _ in _registered()), key=lambda i: (i.name, i.distribution))
+    return TASKS.listed()
 
 
 def load_task(name: str) -> TaskSpec:
@@ -67,62 +72,92 @@ def load_task(name: str) -> TaskSpec:
         ConfigError: no such task.
         PluginError: the name is claimed twice, or its plugin is broken or was written for another version.
     """
-    found = [(info, entry) for info, entry in _registered() if info.name == name]
-    if not found:
-        names = {info.name for info, _ in _registered()}
-        hint = nearest(name, names) or "; no task is installed (reinstall neuprim)"
-        raise ConfigError(f"task={name}: no such task{hint}")
-    if len(found) > 1:
-        raise PluginError(_clash(name, [info for info, _ in found]))
-    return _load(*found[0])
+    return TASKS.load(name)
 
 
-def survey() -> list[TaskReport]:
+def survey() -> list[PluginReport[TaskSpec]]:
     """Every registered task, loaded one by one; the broken ones come with their error."""
-    reports = []
-    registered = sorted(_registered(), key=lambda pair: (pair[0].name, pair[0].distribution))
-    for info, entry in registered:
-        same = [other for other, _ in registered if other.name == info.name]
-        if len(same) > 1:
-            reports.append(TaskReport(info, error=_clash(info.name, same)))
-            continue
-        try:
-            reports.append(TaskReport(info, spec=_load(info, entry)))
-        except PluginError as error:
-            reports.append(TaskReport(info, error=str(error)))
-    return reports
+    return TASKS.survey()
 
 
-def _registered() -> list[tuple[TaskInfo, metadata.EntryPoint]]:
-    result = []
-    for entry in metadata.entry_points(group=GROUP):
-        dist = entry.dist
-        name = dist.metadata["Name"] if dist is not None else "unknown distribution"
-        version = dist.version if dist is not None else ""
-        result.append((TaskInfo(entry.name, name or "unnamed distribution", version or "", entry.value), entry))
-    return result
+# ---------------------------------------------------------------- scenes
 
 
-def _load(info: TaskInfo, entry: metadata.EntryPoint) -> TaskSpec:
-    from neuprim.core.task import API_VERSION, TaskSpec
+@dataclass(frozen=True)
+class FoundScene:
+    """A scene of a task, from the task's own package or another.
 
-    who = f"task {info.name!r} of {info.origin}"
-    try:
-        spec = entry.load()
-    except (Exception, SystemExit) as error:  # whatever a plugin does when imported is its own fault, and must be named
-        text = " ".join(str(error).split())
-        raise PluginError(f"{who}: cannot import {info.target}: {type(error).__name__}: {text}") from error
-    if not isinstance(spec, TaskSpec):
-        raise PluginError(f"{who}: {info.target} is of type {type(spec).__name__}; expected a neuprim.core.task.TaskSpec")
-    if spec.api != API_VERSION:
-        older = isinstance(spec.api, int) and spec.api < API_VERSION
-        todo = f"upgrade {info.distribution}" if older else "upgrade neuprim"
-        raise PluginError(f"{who}: written for plugin API {spec.api}, this neuprim has {API_VERSION}; {todo}")
-    if spec.name != info.name:
-        raise PluginError(f"{who}: its TaskSpec is named {spec.name!r}; the entry point and the TaskSpec must agree")
-    return spec
+    Attributes:
+        config_package: the package that holds its ``scene/TASK/NAME.yaml``.
+    """
+
+    spec: SceneSpec
+    config_package: str
 
 
-def _clash(name: str, claims: Sequence[TaskInfo]) -> str:
-    origins = " and ".join(sorted(f"{info.origin} ({info.target})" for info in claims))
-    return f"task {name!r} is registered by {origins}; uninstall one of them"
+def list_scenes(task: str | None = None) -> list[PluginInfo]:
+    """Scenes that packages add to tasks of others (to ``task`` only, if given), without importing any; named ``TASK.SCENE``."""
+    return [info for info in SCENES.listed() if task is None or info.name.startswith(f"{task}.")]
+
+
+def scene_names(task: TaskSpec) -> list[str]:
+    """Names of all scenes of a task: its own ones, then those that other packages add."""
+    own = [scene.name for scene in task.scenes]
+    return [*own, *dict.fromkeys(n for n in (i.name.removeprefix(f"{task.name}.") for i in list_scenes(task.name)) if n not in own)]
+
+
+def find_scene(task: TaskSpec, name: str) -> FoundScene:
+    """The scene of that name, the task's own or one that another package adds; imports no other.
+
+    Raises:
+        ConfigError: there is none.
+        PluginError: two packages claim the name, or the one that adds it is broken.
+    """
+    own = [scene for scene in task.scenes if scene.name == name]
+    key = f"{task.name}.{name}"
+    added = [info for info in list_scenes(task.name) if info.name == key]
+    if own and added:
+        claims = [*(info for info in list_tasks() if info.name == task.name), *added]
+        raise PluginError(SCENES.clash(key, claims))
+    if own:
+        return FoundScene(own[0], task.config_package)
+    if not added:
+        raise ConfigError(f"scene={name}: task {task.name!r} has no such scene{nearest(name, scene_names(task))}")
+    extension = SCENES.load(key)
+    return FoundScene(extension.scene, extension.config_package)
+
+
+# ---------------------------------------------------------------- losses, exporters, inspectors
+
+
+def list_losses() -> list[PluginInfo]:
+    """Losses for any task, without importing any."""
+    return LOSSES.listed()
+
+
+def load_loss(name: str) -> LossExtension:
+    """The loss of that name; raises as :func:`load_task`."""
+    return LOSSES.load(name)
+
+
+def list_exporters() -> list[PluginInfo]:
+    """Export formats, without importing any."""
+    return EXPORTERS.listed()
+
+
+def load_exporter(name: str) -> Exporter:
+    """The export format of that name; raises as :func:`load_task`."""
+    return EXPORTERS.load(name)
+
+
+def list_inspectors() -> list[PluginInfo]:
+    """Ways of showing a density, without importing any."""
+    return INSPECTORS.listed()
+
+
+def load_inspector(name: str) -> Inspector:
+    """The way of showing a density of that name; raises as :func:`load_task`."""
+    return INSPECTORS.load(name)
+
+
+ALL: tuple[Group[Any], ...] = (TASKS, SCENES, LOSSES, EXPORTERS, INSPECTORS)

@@ -37,13 +37,20 @@ TOY_FILES = {
 }
 
 
-def install(root: Path, distribution: str, tasks: Mapping[str, str], files: Mapping[str, str], version: str = "0.3") -> None:
-    """Puts a distribution with entry points ``tasks`` and source ``files`` under ``root``."""
+def install(
+    root: Path,
+    distribution: str,
+    tasks: Mapping[str, str],
+    files: Mapping[str, str],
+    version: str = "0.3",
+    group: str = registry.GROUP,
+) -> None:
+    """Puts a distribution with entry points ``tasks`` of a group and source ``files`` under ``root``."""
     info = root / f"{distribution.replace('-', '_')}-{version}.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n")
     lines = "\n".join(f"{name} = {target}" for name, target in tasks.items())
-    (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\n{lines}\n")
+    (info / "entry_points.txt").write_text(f"[{group}]\n{lines}\n")
     for name, text in files.items():
         path = root / name
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -81,6 +81,7 @@ class TrainSettings:
         final_rate: the rates decay exponentially to this fraction of themselves at the end of the budget; 1 is constant.
         adam_beta2: decay of Adam's second moment per step, in [0, 1).
         warmup_steps: steps over which the rates rise linearly from zero.
+        loss: name of a loss that a package provides (``neuprim tasks`` lists them), or null for the task's own.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
         anisotropy_weight, anisotropy_from: weight of mean(std over axes of s / min s), and the step it starts at.
         background: "white", "black", "random" or "auto" (the data set's own choice).
@@ -95,6 +96,7 @@ class TrainSettings:
     final_rate: float = 0.05
     adam_beta2: float = 0.999
     warmup_steps: int = 0
+    loss: str | None = None
     ssim_weight: float = 0.2
     anisotropy_weight: float = 0.0
     anisotropy_from: int = 100

@@ -1,0 +1,1 @@
+"""Hydra groups of the task; a package because Hydra looks for one."""

@@ -1,0 +1,84 @@
+"""``neuprim tasks``: every plugin with the package it comes from, and whether it works."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from neuprim.config import check_groups, check_scene, presets, task_choices
+from neuprim.core.errors import ConfigError, NeuprimError
+from neuprim.plugins.registry import EXPORTERS, INSPECTORS, LOSSES, SCENES, Group, PluginReport, list_tasks, survey
+
+if TYPE_CHECKING:
+    from neuprim.core.extensions import SceneExtension
+    from neuprim.core.task import TaskSpec
+
+__all__ = ["list_plugins"]
+
+_OTHERS: tuple[tuple[str, Group[Any]], ...] = (
+    ("losses (train.loss=NAME)", LOSSES),
+    ("exporters (neuprim export --format NAME)", EXPORTERS),
+    ("inspectors (neuprim inspect --show NAME)", INSPECTORS),
+)
+
+
+def list_plugins() -> list[str]:
+    """The lines of ``neuprim tasks``; a broken plugin is one of them, with its error, and stops no other."""
+    lines: list[str] = []
+    added = SCENES.survey()
+    for report in survey():
+        title = f"{report.info.name}  ({report.info.origin})"
+        try:
+            if report.spec is None:
+                raise ConfigError(report.error or "cannot be loaded")
+            body = _task(report.spec, added)
+            lines.append(f"{title}  {report.spec.summary}")
+        except NeuprimError as broken:
+            body = [str(broken)]
+            lines.append(f"{title}  BROKEN")
+        lines += [*(f"  {line}" for line in body), ""]
+    tasks = {info.name for info in list_tasks()}
+    homeless = [r for r in added if r.info.name.partition(".")[0] not in tasks]
+    if homeless:
+        lines += ["scenes of tasks that are not installed", *(f"  {_line(r, r.info.name)}" for r in homeless), ""]
+    for heading, group in _OTHERS:
+        reports = group.survey()
+        if reports:
+            width = max(len(r.info.name) for r in reports)
+            lines += [heading, *(f"  {_line(r, f'{r.info.name:{width}}')}" for r in reports), ""]
+    return lines
+
+
+def _line(report: PluginReport[Any], name: str) -> str:
+    if report.spec is None:
+        return f"{name}  BROKEN  ({report.info.origin})  {report.error}"
+    return f"{name}  ({report.info.origin})  {getattr(report.spec, 'summary', '')}".rstrip()
+
+
+def _task(spec: TaskSpec, added: list[PluginReport[SceneExtension]]) -> list[str]:
+    check_groups(spec)
+    default = task_choices(spec)
+    rows = [(s.name, f"{s.summary}{' (default)' if s.name == default.scene else ''}") for s in spec.scenes]
+    rows += [_scene(spec, report) for report in added if report.info.name.startswith(f"{spec.name}.")]
+    width = max(len(name) for name, _ in rows)
+    found = [("scenes", f"{name:{width}}  {text}") for name, text in rows]
+    found.append(("presets", ", ".join(name + " (default)" * (name == default.preset) for name in presets(spec))))
+    if spec.conditions:
+        found.append(("conditions", ", ".join(f"{c.name} [{c.unit}]" for c in spec.conditions)))
+    return [f"{title if i == 0 or title != found[i - 1][0] else '':10}  {text}" for i, (title, text) in enumerate(found)]
+
+
+def _scene(spec: TaskSpec, report: PluginReport[SceneExtension]) -> tuple[str, str]:
+    """(name, summary or error) of a scene that another package adds to a task."""
+    name = report.info.name.removeprefix(f"{spec.name}.")
+    problem = report.error
+    if report.spec is not None:
+        if any(scene.name == name for scene in spec.scenes):
+            claims = [*(info for info in list_tasks() if info.name == spec.name), report.info]
+            problem = SCENES.clash(report.info.name, claims)
+        else:
+            try:
+                check_scene(spec, name, report.spec.config_package)
+                return name, f"({report.info.origin})  {report.spec.scene.summary}"
+            except ConfigError as error:
+                problem = str(error)
+    return name, f"BROKEN  ({report.info.origin})  {problem}"

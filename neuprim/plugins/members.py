@@ -1,0 +1,86 @@
+"""What a plugin's description must hold to be usable, checked when it is loaded rather than in the middle of a run."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+from neuprim.core.extensions import Exporter, Inspector, LossExtension, SceneExtension
+from neuprim.core.fields import ConditionSpec, Field
+from neuprim.core.task import SceneSpec, TaskSpec
+
+__all__ = ["fault"]
+
+_TEXTS: dict[type, tuple[str, ...]] = {
+    TaskSpec: ("name", "summary", "config_package"),
+    SceneSpec: ("name", "summary"),
+    SceneExtension: ("task", "config_package"),
+    ConditionSpec: ("name",),
+    LossExtension: ("name", "summary"),
+    Exporter: ("name", "summary"),
+    Inspector: ("name", "summary"),
+}
+_CALLS: dict[type, tuple[str, ...]] = {
+    TaskSpec: ("build", "loss", "check"),
+    SceneSpec: ("load",),
+    SceneExtension: (),
+    ConditionSpec: ("parse",),
+    LossExtension: ("make",),
+    Exporter: ("write",),
+    Inspector: ("add",),
+}
+
+
+def fault(spec: Any) -> str | None:
+    """``"MEMBER is WHAT; expected WHAT"`` of the first member of a description that cannot be used; None if all is well."""
+    kind = next(k for k in _TEXTS if isinstance(spec, k))
+    for name in (*_TEXTS[kind], *_CALLS[kind]):
+        if not hasattr(spec, name):
+            return f"{name} is missing"
+    for name in _TEXTS[kind]:
+        value = getattr(spec, name)
+        if not isinstance(value, str) or not value.strip():
+            return f"{name} is {value!r}; expected text"
+    for name in _CALLS[kind]:
+        if not callable(getattr(spec, name)):
+            return f"{name} is of type {type(getattr(spec, name)).__name__}; expected a function"
+    if isinstance(spec, TaskSpec):
+        return _task(spec)
+    if isinstance(spec, SceneExtension):
+        return _one(spec.scene, SceneSpec, "scene")
+    if isinstance(spec, Exporter) and not isinstance(spec.options, Mapping):
+        return f"options is of type {type(spec.options).__name__}; expected a mapping"
+    return None
+
+
+def _task(spec: TaskSpec) -> str | None:
+    groups: tuple[tuple[str, Any, type], ...] = (("scenes", spec.scenes, SceneSpec), ("conditions", spec.conditions, ConditionSpec))
+    for name, members, kind in groups:
+        if not isinstance(members, tuple | list):
+            return f"{name} is of type {type(members).__name__}; expected a tuple of {kind.__name__}"
+        for i, member in enumerate(members):
+            wrong = _one(member, kind, f"{name}[{i}]")
+            if wrong:
+                return wrong
+        names = [member.name for member in members]
+        if len(set(names)) != len(names):
+            return f"{name} has two of one name among {', '.join(names)}"
+    if spec.fields is not None and not isinstance(spec.fields, Mapping):
+        return f"fields is of type {type(spec.fields).__name__}; expected a mapping of class names to classes"
+    for name, field in (spec.fields or {}).items():
+        if not isinstance(field, type) or not issubclass(field, Field):
+            return f"fields[{name!r}] is {field!r}; expected a subclass of neuprim.core.fields.Field"
+        if inspect.isabstract(field):
+            lacking = ", ".join(sorted(field.__abstractmethods__))
+            return f"fields[{name!r}] lacks the methods {lacking}"
+    if spec.example is not None and not callable(spec.example):
+        return f"example is of type {type(spec.example).__name__}; expected a function or None"
+    return None
+
+
+def _one(member: Any, kind: type, where: str) -> str | None:
+    if not isinstance(member, kind):
+        return f"{where} is of type {type(member).__name__}; expected a {kind.__name__}"
+    wrong = fault(member)
+    return None if wrong is None else f"{where}.{wrong}"

@@ -1,0 +1,368 @@
+"""Every check fails on a task that is broken in the matching way, with a message that says where."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from neuprim.core.cosine import CosineDensity
+from neuprim.core.data import Pixels
+from neuprim.core.errors import ConfigError
+from neuprim.core.fields import Conditions, ConditionSpec, Constant, Cosine, Field
+from neuprim.core.gaussian import GaussianDensity
+from neuprim.core.geometry import Geometry
+from neuprim.core.ray_cameras import AnyCamera
+from neuprim.core.schema import InitContext, ParameterSpec, Params
+from neuprim.core.task import SceneSpec, TaskSpec
+from neuprim.core.train.losses import photometric
+from neuprim.plugins.conformance import CHECKS, ConformanceError, named_checks
+from neuprim.plugins.conformance.example import Example
+from neuprim.tasks.static import TASK
+from neuprim.tasks.static.fields import SphericalHarmonics
+
+MODEL = {"neurons": 2, "sh_degree": 0, "init": {}}
+
+
+def using(density: type[CosineDensity] | type[GaussianDensity] = CosineDensity, colour: type = SphericalHarmonics, **more: Any) -> TaskSpec:
+    """The static task with other fields."""
+
+    def build(model: Mapping[str, Any], dataset: Any) -> Any:
+        first = density() if issubclass(density, GaussianDensity) else density(2)
+        return first, colour(0, dataset.channels)
+
+    fields: dict[str, type[Field]] = {**(TASK.fields or {}), density.__name__: density, colour.__name__: colour}
+    return replace(TASK, build=build, fields=fields, **more)
+
+
+# ---------------------------------------------------------------- densities that break one promise each
+
+
+class ForgetsNeurons(CosineDensity):
+    def settings(self) -> dict[str, Any]:
+        return {"neurons": 3}
+
+
+class SwallowsSettings(CosineDensity):
+    def __init__(self, neurons: int = 8, **anything: Any) -> None:
+        super().__init__(neurons)
+
+
+def specs(**changes: Any) -> type[CosineDensity]:
+    class Changed(CosineDensity):
+        def parameters(self) -> list[ParameterSpec]:
+            found = super().parameters()
+            return [*found[:-1], replace(found[-1], **changes)]
+
+    return Changed
+
+
+class Lazy(CosineDensity):
+    """Draws its start values from the global generator."""
+
+    def parameters(self) -> list[ParameterSpec]:
+        found = super().parameters()
+        return [replace(found[0], init=lambda c: torch.rand(c.count, self.neurons, 3)), *found[1:]]
+
+
+class WrongStart(CosineDensity):
+    def parameters(self) -> list[ParameterSpec]:
+        found = super().parameters()
+        return [*found[:-1], replace(found[-1], init=lambda c: torch.zeros(c.count))]
+
+
+class Meddler(CosineDensity):
+    def parameters(self) -> list[ParameterSpec]:
+        def init(context: InitContext) -> Tensor:
+            context.means.mul_(0.5)
+            return torch.ones(context.count, 1)
+
+        found = super().parameters()
+        return [*found[:-1], replace(found[-1], init=init)]
+
+
+def lowers(change: Callable[[Cosine, Geometry], Cosine]) -> type[CosineDensity]:
+    class Changed(CosineDensity):
+        def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Cosine:
+            return change(super().lower(params, geometry, conditions), geometry)
+
+    return Changed
+
+
+class Transposed(CosineDensity):
+    def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Cosine:
+        form = super().lower(params, geometry, conditions)
+        return replace(form, b2=form.b2.T)
+
+
+class LeavesOut(CosineDensity):
+    def alive(self, params: Params, conditions: Conditions) -> Tensor:
+        return torch.arange(3)
+
+
+class Unsorted(CosineDensity):
+    def alive(self, params: Params, conditions: Conditions) -> Tensor:
+        return torch.arange(len(params["b2"])).flip(0)
+
+
+class Doubled(CosineDensity):
+    def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
+        return 1.05 * super().density(params, geometry, prim, x, conditions)
+
+
+class Squares(CosineDensity):
+    def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
+        return super().scale_density(params, factor.square())
+
+
+class InPlace(CosineDensity):
+    def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
+        params["w2"].mul_(factor[:, None])
+        return {**params, "b2": params["b2"] * factor[:, None]}
+
+
+class Copies(CosineDensity):
+    """Children with their parents' weights, as the authors' code has it."""
+
+    def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
+        return dict(params)
+
+
+class Spills(GaussianDensity):
+    def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
+        return dict(params)
+
+
+class HalfDivides(CosineDensity):
+    def divide(self, params: Params, geometry: Geometry) -> tuple[Tensor, dict[str, Tensor], Geometry]:
+        return torch.ones(geometry.count, dtype=torch.bool), dict(params), geometry
+
+
+class Noisy(CosineDensity):
+    def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Cosine:
+        form = super().lower(params, geometry, conditions)
+        return replace(form, b2=form.b2 + 1e-3 * torch.rand_like(form.b2))
+
+
+class Remembers(CosineDensity):
+    """State that no checkpoint holds."""
+
+    calls = 0
+
+    def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Cosine:
+        self.calls += 1
+        form = super().lower(params, geometry, conditions)
+        return replace(form, b2=form.b2 * (1 + 1e-2 * self.calls))
+
+
+class Progresses(SphericalHarmonics):
+    """Another picture at the end of training than after loading."""
+
+    gain = 1.0
+
+    def set_progress(self, progress: float) -> None:
+        self.gain = 1.0 + progress
+
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
+        return Constant(self.gain * super().lower(params, geometry, camera, conditions).rgb)
+
+
+class Grey(SphericalHarmonics):
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
+        return Constant(super().lower(params, geometry, camera, conditions).rgb.mean(-1, keepdim=True))
+
+
+class Uphill(SphericalHarmonics):
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
+        rgb = super().lower(params, geometry, camera, conditions).rgb
+        return Constant(2 * rgb.detach() - rgb)
+
+
+# ---------------------------------------------------------------- conditions
+
+
+class Timed(SphericalHarmonics):
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
+        rgb = super().lower(params, geometry, camera, conditions).rgb
+        return Constant(rgb * (1 + conditions["time"].to(rgb)))
+
+
+class TimedByDefault(SphericalHarmonics):
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
+        rgb = super().lower(params, geometry, camera, conditions).rgb
+        return Constant(rgb * (1 + conditions.get("time", torch.tensor(0.5)).to(rgb)))
+
+
+class BlowsUp(SphericalHarmonics):
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
+        rgb = super().lower(params, geometry, camera, conditions).rgb
+        return Constant(rgb / conditions["time"].to(rgb))
+
+
+class Mute(SphericalHarmonics):
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
+        if "time" not in conditions:
+            raise KeyError("something is missing")
+        return super().lower(params, geometry, camera, conditions)
+
+
+def number(text: str) -> list[Tensor]:
+    try:
+        return [torch.tensor(float(text))]
+    except ValueError:
+        raise ConfigError(f"--time {text}: expected a number") from None
+
+
+def lenient(text: str) -> list[Tensor]:
+    try:
+        return number(text)
+    except ConfigError:
+        return [torch.tensor(0.0)]
+
+
+def timed(colour: type = Timed, parse: Callable[[str], list[Tensor]] = number, **more: Any) -> TaskSpec:
+    return using(colour=colour, conditions=(ConditionSpec("time", (), "s", (0.0, 1.0), parse),), **more)
+
+
+class WithoutTime(Example):
+    def __init__(self) -> None:
+        super().__init__(())
+
+
+class Misfit(Example):
+    def __init__(self) -> None:
+        super().__init__(())
+        self.train.images[0] = Pixels(torch.zeros(4, 4, 3))  # type: ignore[attr-defined]
+
+
+# ---------------------------------------------------------------- losses
+
+
+def negative(settings: Mapping[str, Any]) -> Any:
+    inner = photometric(settings)
+
+    def loss(rendered: Tensor, truth: Tensor) -> tuple[Tensor, dict[str, float]]:
+        value, parts = inner(rendered, truth)
+        return -value, parts
+
+    return loss
+
+
+def uphill(settings: Mapping[str, Any]) -> Any:
+    """Right values, gradients that point the wrong way."""
+    inner = photometric(settings)
+
+    def loss(rendered: Tensor, truth: Tensor) -> tuple[Tensor, dict[str, float]]:
+        value, parts = inner(rendered, truth)
+        return 2 * value.detach() - value, parts
+
+    return loss
+
+
+def per_pixel(settings: Mapping[str, Any]) -> Any:
+    return lambda rendered, truth: ((rendered - truth).abs(), {})
+
+
+def detached(settings: Mapping[str, Any]) -> Any:
+    return lambda rendered, truth: ((rendered.detach() - truth).abs().mean(), {})
+
+
+def wordy(settings: Mapping[str, Any]) -> Any:
+    return lambda rendered, truth: ((rendered - truth).abs().mean(), {"l1": "small"})
+
+
+GHOST = SceneSpec("ghost", "has no file", lambda s, c: None)  # type: ignore[arg-type, return-value]
+UNNAMED = replace(TASK, check=lambda model: None)
+
+
+def vague(model: Mapping[str, Any]) -> None:
+    if "no_such_setting" in (*model["density"], *model["colour"]):
+        raise ConfigError("something is wrong")
+
+
+MUTANTS: list[tuple[str, str, TaskSpec]] = [
+    ("members", "build is of type int", replace(TASK, build=3)),  # type: ignore[arg-type]
+    ("members", "TaskSpec.fields", replace(TASK, fields=None)),
+    ("files", "scene/static/ghost.yaml", replace(TASK, scenes=(*TASK.scenes, GHOST))),
+    ("files", "train.rates.W1", replace(TASK, fields={"SphericalHarmonics": SphericalHarmonics})),
+    ("fields", "ForgetsNeurons(**settings)", using(ForgetsNeurons)),
+    ("fields", "no_such_setting=1", using(SwallowsSettings)),
+    ("fields", "TaskSpec.fields['CosineDensity']", replace(TASK, fields={"SphericalHarmonics": SphericalHarmonics})),
+    ("parameter_specs", "'means': found a name used twice", using(specs(name="means"))),
+    ("parameter_specs", "'b2': lr: found 0", using(specs(lr=0))),
+    ("parameter_specs", "'b2': group: found 'colour'", using(specs(group="colour"))),
+    ("parameter_specs", "'b2': activation", using(specs(activation="log"))),
+    ("parameter_specs", "'b2': shape", using(specs(shape=(-1,)))),
+    ("parameter_specs", "'b 2'", using(specs(name="b 2"))),
+    ("initialisers", "'W1': two draws with one seed", using(Lazy)),
+    ("initialisers", "'b2': start value: found shape (12,); expected (12, 1)", using(WrongStart)),
+    ("initialisers", "changed in place", using(Meddler)),
+    ("dataset", "view train0: condition 'time'", timed(example=WithoutTime)),
+    ("dataset", "view train0: pixels: found (4, 4, 3)", using(example=Misfit)),
+    ("loss", "loss of the truth itself", using(loss=negative)),
+    ("loss", "shape (9, 10, 3)", using(loss=per_pixel)),
+    ("loss", "no gradient", using(loss=detached)),
+    ("loss", "loss part 'l1'", using(loss=wordy)),
+    ("lowered_forms", "lowered b2: found shape (1, 12)", using(Transposed)),
+    ("lowered_forms", "expected torch.float64", using(lowers(lambda f, g: replace(f, W1=f.W1.float())))),
+    ("lowered_forms", "channels: found 1", using(colour=Grey)),
+    ("alive", "density of a primitive that is not alive", using(LeavesOut)),
+    ("alive", "ascending", using(Unsorted)),
+    ("line_integral", "line integral of a chord, primitive", using(Doubled)),
+    ("opaque_twin", "alpha of view train0", using(Doubled)),
+    ("gradients", "gradient of w2: found none", using(lowers(lambda f, g: replace(f, w2=f.w2.detach())))),
+    ("gradients", "gradient of b1: found zero", using(lowers(lambda f, g: replace(f, b1=f.b1 * 0)))),
+    ("finite_differences", "gradient of W1, primitive", using(lowers(lambda f, g: replace(f, W1=2 * f.W1 - f.W1.detach())))),
+    ("finite_differences", "gradient of sh_dc, primitive", using(colour=Uphill)),
+    ("scale_density", "density after scale_density", using(Squares)),
+    ("scale_density", "w2: found changed in place", using(InPlace)),
+    ("clone", "a change of", using(Squares)),
+    ("split", "density of a child inside it", using(Copies)),
+    ("split", "mass of both children", using(Spills)),
+    ("divide", "density.divide: geometry: found 12 rows; expected 24", using(HalfDivides)),
+    ("determinism", "two runs of one seed: ", using(Noisy)),
+    ("learning", "mean loss over the training views", using(loss=uphill)),
+    ("save_load", "after loading: found a change", using(colour=Progresses)),
+    ("save_load", "unknown density setting", using(SwallowsSettings)),
+    ("resume", "8 steps against 4 + resume + 4", using(Remembers)),
+    ("conditions", "parse('no such value'): found it was taken", timed(parse=lenient)),
+    ("conditions", "parse('0.25'): found shape (1,)", timed(parse=lambda text: [number(text)[0].reshape(1)])),
+    ("conditions", "parse('0.25'): found 0.5", timed(parse=lambda text: [2 * number(text)[0]])),
+    ("conditions", "condition 'time' = 0.0: found colors of primitive 0 is not finite", timed(BlowsUp)),
+    ("missing_conditions", "it was drawn", timed(TimedByDefault)),
+    ("missing_conditions", "something is missing", timed(Mute)),
+    ("extremes", "tiny primitives", using(lowers(lambda f, g: replace(f, b2=f.b2 + 1e-30 / g.length_scale[:, None] ** 8)))),
+    ("clear_errors", "model.density.no_such_setting=1: found it was taken", UNNAMED),
+    ("clear_errors", "a message that names the setting", replace(TASK, check=vague)),
+]
+
+
+@pytest.mark.parametrize(("name", "text", "task"), MUTANTS, ids=[f"{name}-{i}" for i, (name, _, _) in enumerate(MUTANTS)])
+def test_a_broken_task_is_caught(name: str, text: str, task: TaskSpec) -> None:
+    with pytest.raises(ConformanceError) as caught:
+        named_checks(task, model=MODEL)[name]()
+    message = str(caught.value)
+    assert message.startswith(f"task 'static': {name}: ")
+    assert text in message
+
+
+def test_every_check_has_a_mutant() -> None:
+    assert {name for name, _, _ in MUTANTS} == set(CHECKS)
+
+
+@pytest.mark.parametrize("name", CHECKS)
+def test_the_unbroken_ones_pass(name: str) -> None:
+    """So that a mutant fails for its fault and not for what all of them share."""
+    named_checks(timed(), model=MODEL)[name]()
+    if name not in ("files", "members"):
+        named_checks(using(GaussianDensity), model=MODEL)[name]()
+
+
+def test_infinite_rates_are_noticed() -> None:
+    with pytest.raises(ConformanceError, match="lr: found inf"):
+        named_checks(using(specs(lr=math.inf)), model=MODEL)["parameter_specs"]()

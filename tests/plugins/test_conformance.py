@@ -37,7 +37,7 @@ def test_dynamic_as_in_the_paper(check: Check) -> None:
     check()
 
 
-@checks(RELIGHT, model={"colour": {"form": "multiplicative", "hidden": 4, "visibility": False}})
+@checks(RELIGHT, model={"colour": {"form": "multiplicative", "hidden": 4, "visibility": "none"}})
 def test_relight(check: Check) -> None:
     check()
 

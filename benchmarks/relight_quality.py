@@ -1,0 +1,174 @@
+"""Quality of the relighting task on `lit_solids`: ways of colouring at equal training time, where shadows come from, and losses.
+
+    python benchmarks/relight_quality.py [--seconds 300] [--seeds 3] [--parts forms losses] [--variants ...] [--tune] [--readme] [--docs]
+
+Parts:
+
+    forms      a constant colour, spherical harmonics of the light (a baseline with the network's number of parameters), equation 14 as
+               printed, and equation 14 or its multiplicative form with a light visibility per primitive or per pixel
+    losses     the default form under every loss
+
+Equal seconds are counted in steps: all variants take turns on this machine first, and each then trains for as many steps as fit into
+--seconds at its own pace, so that other work on the machine disturbs none of the comparisons. Images are 128 x 128, 500 for training,
+100 held out (new lights, new views, both), linear light over the exposure, clamped to 0..1, black background; means over seeds +- half
+the spread, of the last checkpoint. --tune tests on every eighth training view instead. Results go to
+benchmarks/results/relight_quality.json; --readme and --docs put the tables between the markers of README.md and docs/relighting.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from static_quality import cpu_name, spread
+from tables import ROOT, between_markers
+
+from neuprim.config import RunConfig, compose
+from neuprim.core.data import Dataset
+from neuprim.core.render.cpu.threads import core_count
+from neuprim.core.train.trainer import Trainer
+from neuprim.evaluate import load_dataset
+from neuprim.measure import measure, summary
+from neuprim.plugins.registry import load_task
+from neuprim.run import make_trainer, warm_up
+
+RESULTS = Path(__file__).parent / "results" / "relight_quality.json"
+PLAIN = "model.colour.visibility=none"
+FORMS = {
+    "constant colour": ("model.colour.hidden=0", PLAIN),
+    "harmonics of the light, degree 5": ("model.colour.form=harmonics",),
+    "equation 14": (PLAIN,),
+    "equation 14, visibility per primitive": ("model.colour.visibility=primitive",),
+    "equation 14, visibility per pixel": ("model.colour.visibility=pixel",),
+    "multiplicative, visibility per pixel": ("model.colour.form=multiplicative", "model.colour.visibility=pixel"),
+}
+LOSSES = {loss: (f"task.options.loss={loss}",) for loss in ("l1", "compressed", "relative")}
+CLASSES = ("lit", "cast_shadow", "attached_shadow", "highlight")
+KEYS = (
+    "psnr_linear_clamped", "psnr_display", "ssim_display", *(f"psnr_pooled_{c}" for c in CLASSES),
+    "psnr_linear_clamped_new_view", "psnr_linear_clamped_new_light", "psnr_linear_clamped_new_both",
+    "primitives", "parameters_per_primitive", "iterations", "train_seconds", "seed",
+)  # fmt: skip
+_ROUNDS, _STEPS, _GROWN = 6, 15, 150
+
+
+def prepared(words: list[str], dataset: Dataset | None) -> tuple[RunConfig, Trainer]:
+    config = compose(["task=relight", "scene=lit_solids", "train.eval_every=0", "train.max_seconds=null", *words], check_output=False)
+    task = load_task(config.task)
+    trainer = make_trainer(config, task, dataset or load_dataset(config, task))
+    warm_up(trainer)
+    return config, trainer
+
+
+def pace(variants: dict[str, list[str]], dataset: Dataset) -> dict[str, float]:
+    """Seconds a step of each, taking turns; medians over rounds, of models that have trained a little."""
+    trainers = {name: prepared(words, dataset)[1] for name, words in variants.items()}
+    for trainer in trainers.values():
+        for _ in range(_GROWN):
+            trainer.train_step()
+    took: dict[str, list[float]] = {name: [] for name in trainers}
+    for _ in range(_ROUNDS):
+        for name, trainer in trainers.items():
+            start = time.perf_counter()
+            for _ in range(_STEPS):
+                trainer.train_step()
+            took[name].append((time.perf_counter() - start) / _STEPS)
+    return {name: statistics.median(seconds) for name, seconds in took.items()}
+
+
+def fit(words: list[str], dataset: Dataset) -> dict[str, Any]:
+    config, trainer = prepared(words, dataset)
+    for _ in trainer.run():
+        pass
+    for field in (trainer.model.density, trainer.model.colour):
+        field.set_progress(1.0)
+    size = 4 * sum(v.numel() for v in trainer.model.params.values())
+    training = {"iterations": trainer.step, "train_seconds": trainer.elapsed}
+    found = summary(config, trainer.model, dataset, measure(trainer.model, dataset, config.renderer), size, training)
+    return {k: found[k] for k in KEYS if k in found}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=300.0)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--parts", nargs="*", default=["forms", "losses"], help="none: print what is recorded")
+    parser.add_argument("--variants", nargs="*", default=list(FORMS))
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="further settings of every run")
+    parser.add_argument("--tune", action="store_true", help="held-out training views; nothing is recorded")
+    parser.add_argument("--readme", action="store_true")
+    parser.add_argument("--docs", action="store_true")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    recorded: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    common = [*args.set, *(["scene.hold_out=8"] if args.tune else [])]
+    wanted: dict[str, dict[str, list[str]]] = {}
+    if "forms" in args.parts:
+        wanted["forms"] = {name: [*FORMS[name], *common] for name in args.variants}
+    if "losses" in args.parts:
+        wanted["losses"] = {name: [*words, *common] for name, words in LOSSES.items()}
+    if wanted:
+        dataset = prepared(common, None)[1].dataset
+        everything = {(part, name): words for part, own in wanted.items() for name, words in own.items()}
+        paces = pace({f"{part}: {name}": words for (part, name), words in everything.items()}, dataset)
+        recorded |= {"cpu": cpu_name(), "cores": core_count(), "seconds": args.seconds, "baselines": dataset.baselines()}  # type: ignore[attr-defined]
+        for part, own in wanted.items():
+            recorded[part] = [e for e in recorded.get(part, []) if e["name"] not in own]
+        for seed in range(args.seeds):
+            for (part, name), words in everything.items():
+                each = paces[f"{part}: {name}"]
+                found = fit([*words, f"train.iterations={round(args.seconds / each)}", f"seed={seed}"], dataset)
+                recorded[part].append({"name": name, "ms_a_step": 1e3 * each, **found})
+                print(part, json.dumps({k: round(v, 3) if isinstance(v, float) else v for k, v in recorded[part][-1].items()}), flush=True)
+                if not args.tune:
+                    RESULTS.write_text(json.dumps(recorded, indent=1) + "\n")  # after every run: a long benchmark may be cut short
+    table = quality_table(recorded)
+    print(f"\n{table}")
+    if args.docs:
+        between_markers(ROOT / "docs" / "relighting.md", "relight-quality", table)
+    if args.readme:
+        between_markers(ROOT / "README.md", "relight-quality", table)
+
+
+BASELINES = {
+    "black": "black image",
+    "no_cast_shadows": "perfect shading without cast shadows",
+    "nearest_light_of_25": "nearest light of 25, same camera",
+}
+
+
+def quality_table(recorded: dict[str, Any]) -> str:
+    """One row per baseline, form and loss."""
+    lines = [
+        f"| `lit_solids`, {recorded['seconds']:.0f} s of training | numbers per primitive | PSNR | cast shadow | lit | highlight | PSNR display | steps |",
+        "| --- |" + " --- |" * 7,
+    ]
+    for key, name in BASELINES.items():
+        b = recorded["baselines"][key]
+        pooled = " | ".join(f"{b[f'psnr_pooled_{c}']:.1f}" for c in ("cast_shadow", "lit", "highlight"))
+        lines.append(f"| *{name}* |  | {b['psnr_linear_clamped']:.1f} | {pooled} | {b['psnr_display']:.1f} |  |")
+    for part, prefix in (("forms", ""), ("losses", "default form, loss ")):
+        for name in dict.fromkeys(e["name"] for e in recorded.get(part, [])):
+            own = [e for e in recorded[part] if e["name"] == name]
+
+            def cell(key: str, digits: int, own: list[dict[str, Any]] = own) -> str:
+                return spread([e[key] for e in own], digits)
+
+            pooled = " | ".join(cell(f"psnr_pooled_{c}", 1) for c in ("cast_shadow", "lit", "highlight"))
+            lines.append(
+                f"| {prefix}{name} | {own[0]['parameters_per_primitive']} | {cell('psnr_linear_clamped', 2)} | {pooled} "
+                f"| {cell('psnr_display', 2)} | {own[0]['iterations']:,} |"
+            )
+    seeds = len({e["seed"] for e in recorded.get("forms", recorded.get("losses", []))})
+    primitives = next((e["primitives"] for e in recorded.get("forms", [])), 0)
+    lines.append(f"\n{primitives:,} primitives, {seeds} seeds; {recorded['cores']} cores of {recorded['cpu']}.")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

@@ -145,6 +145,9 @@ def _save(trainer: Trainer, config: RunConfig, dataset: Dataset) -> None:
         "iterations": trainer.step,
         "train_seconds": trainer.elapsed,
     }
+    placement = dataset.placement()
+    if placement is not None:
+        extra["world"] = placement.to_json()
     checkpoint.save_model(config.output_dir / "model.safetensors", trainer.model, config.task, extra)
 
 

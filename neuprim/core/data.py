@@ -16,6 +16,7 @@ from neuprim.core.fields import Conditions
 
 if TYPE_CHECKING:
     from neuprim.core.primitives import Primitives
+    from neuprim.core.volume_source import Placement
 
 __all__ = ["Clip", "DataSource", "Dataset", "Pixels", "PointCloud", "View", "ViewSet", "camera_extent"]
 
@@ -178,6 +179,10 @@ class Dataset(ABC):
     def diagnose(self, model: Primitives) -> dict[str, Any]:
         """Further JSON-able numbers for ``metrics.json`` that only this kind of data can tell."""
         return {}
+
+    def placement(self) -> Placement | None:
+        """How scene units follow from the world of the voxel files that the scene was made from; None without such files."""
+        return None
 
     def orbit(self, frames: int) -> list[View]:
         """Views circling the scene at the training cameras' mean distance and elevation."""

@@ -82,15 +82,21 @@ class PointCloud:
         colors: (N, C) in the data set's colour space.
         conditions: condition name -> (N,) the value under which matter was found at each point, e.g. "time" -> times 0..1;
             empty for scenes without conditions.
+        axes, quats: (N, 3) semi-axes and (N, 4) orientations wxyz, where the points are ellipsoids.
+        alphas: (N,) opacities 0..1 through their middles.
     """
 
     means: Tensor
     colors: Tensor
     conditions: Mapping[str, Tensor] = field(default_factory=dict)
+    axes: Tensor | None = None
+    quats: Tensor | None = None
+    alphas: Tensor | None = None
 
     def rows(self, index: Tensor) -> PointCloud:
         """The points at ``index``, (M,) int64 or (N,) bool, with all that belongs to them."""
-        return PointCloud(self.means[index], self.colors[index], {name: value[index] for name, value in self.conditions.items()})
+        ellipsoids = (None if value is None else value[index] for value in (self.axes, self.quats, self.alphas))
+        return PointCloud(self.means[index], self.colors[index], {n: value[index] for n, value in self.conditions.items()}, *ellipsoids)
 
 
 @dataclass(frozen=True)

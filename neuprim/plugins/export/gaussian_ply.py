@@ -4,7 +4,7 @@ Binary little-endian vertices of floats ``x y z nx ny nz f_dc_0..2 f_rest_0..44 
 normals 0, SH coefficients of degree 3 (``f_rest`` channel by channel: 15 of red, 15 of green, 15 of blue), logit of the opacity,
 natural logarithm of the standard deviations, quaternion wxyz. How the Gaussians are fitted: :mod:`neuprim.plugins.export.gaussians`.
 Colours are those of the model in its own colour space; viewers show numbers as sRGB. A model that depends on time or light is written
-under one value of each (``time=0.5``, ``light=1,2,3``); colours that are no harmonics are fitted by harmonics.
+under one value of each (``time=0.5``, ``light=1,2,3 light_intensity=10,10,10``); colours that are no harmonics are fitted by harmonics.
 
 The error is the PSNR of images of the fitted Gaussians, drawn as the 3DGS rasteriser draws them, against the model's own.
 """
@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from neuprim.core.data import View
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
 from neuprim.core.fields import Conditions
@@ -28,7 +30,7 @@ from neuprim.plugins.export.gaussians import Gaussians, draw_gaussians, fit_gaus
 __all__ = ["EXPORTER", "LAYOUT"]
 
 OPTIONS = {
-    "size": ("footprint", "footprint: as much screen as the primitive covers; moments: covariance of its density"),
+    "size": ("auto", "moments: covariance of the density (solids); footprint: as much screen as the primitive covers (smoke); auto: the better"),
     "views": ("auto", "cameras of the PSNR: test, orbit, or auto (test for models without conditions)"),
 }
 
@@ -41,19 +43,22 @@ LAYOUT = (
 
 def _write(job: ExportJob) -> ExportReport:
     options = Options(job, OPTIONS)
-    size, which = options.choice("size", "footprint", "moments"), options.choice("views", "auto", "test", "orbit")
+    size, which = options.choice("size", "auto", "footprint", "moments"), options.choice("views", "auto", "test", "orbit")
     path = target(job, "gaussians.ply", (".ply",))
     (conditions,) = conditions_of(job)
     job.progress("fitting Gaussians", 0.0)
     colours = harmonics_of(job.run, conditions)
-    gaussians = fit_gaussians(job.run, conditions, size == "footprint")
-    if not len(gaussians.means):
+    images, seen = _images(job, which, conditions)
+    fits = {name: fit_gaussians(job.run, conditions, name == "footprint") for name in ("moments", "footprint") if size in ("auto", name)}
+    if not all(len(g.means) for g in fits.values()):
         raise ConfigError(f"{job.run.directory}: no primitive absorbs anything under these conditions; nothing to export")
+    scores = {name: _psnrs(job, fit, colours, images, name) for name, fit in fits.items()}
+    size = max(scores, key=lambda name: float(np.mean(scores[name])))
+    gaussians, errors = fits[size], {"psnr": float(np.mean(scores[size])), "psnr_worst": float(np.min(scores[size]))}
     write_ply(path, _rows(gaussians, colours), ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"])
     space = str(job.run.header.get("color_space", "srgb"))
-    errors, seen = _errors(job, gaussians, colours, which, conditions)
     notes = [
-        f"{len(gaussians.means)} Gaussians; PSNR of them drawn as the 3DGS rasteriser does, against the model's images, {seen}, {space} values",
+        f"{len(gaussians.means)} Gaussians, size={size}; PSNR of them drawn as the 3DGS rasteriser does, against the model's images, {seen}, {space} values",
         "axes and units are the scene's; degree 3 harmonics",
     ]
     if colours.residual > 0:
@@ -78,17 +83,28 @@ def _rows(gaussians: Gaussians, colours: Harmonics) -> np.ndarray:
     return rows
 
 
-def _errors(job: ExportJob, gaussians: Gaussians, colours: Harmonics, which: str, conditions: Conditions) -> tuple[dict[str, float], str]:
+def _images(job: ExportJob, which: str, conditions: Conditions) -> tuple[list[tuple[View, Tensor]], str]:
+    """The model's own images, and what they show."""
     run = job.run
     views, what = comparison_views(job, which, conditions)
-    background = torch.tensor([float(x) for x in run.header.get("background", [0.0] * 3)])
-    found = []
+    background, images = _background(job), []
     for i, view in enumerate(views):
-        job.progress("comparing images", i / len(views))
+        job.progress("drawing the model", i / len(views))
         with torch.no_grad():
-            truth = render(run.model, view.camera, view.conditions, run.settings, background).rgb
-        found.append(psnr(draw_gaussians(gaussians, colours, view.camera, background), truth))
-    return {"psnr": float(np.mean(found)), "psnr_worst": float(np.min(found))}, what
+            images.append((view, render(run.model, view.camera, view.conditions, run.settings, background).rgb))
+    return images, what
+
+
+def _psnrs(job: ExportJob, gaussians: Gaussians, colours: Harmonics, images: list[tuple[View, Tensor]], name: str) -> list[float]:
+    found = []
+    for i, (view, truth) in enumerate(images):
+        job.progress(f"drawing the Gaussians (size={name})", i / len(images))
+        found.append(psnr(draw_gaussians(gaussians, colours, view.camera, _background(job)), truth))
+    return found
+
+
+def _background(job: ExportJob) -> Tensor:
+    return torch.tensor([float(x) for x in job.run.header.get("background", [0.0] * 3)])
 
 
 EXPORTER = Exporter(

@@ -68,7 +68,9 @@ def conditions_of(job: ExportJob, several: bool = False) -> list[dict[str, Tenso
     parsed = {}
     for spec in job.run.task.conditions:
         if spec.name not in job.conditions:
-            raise ConfigError(f"{spec.name}=: required, as the model depends on it ({spec.unit}); for example {spec.name}={_example(spec.shape)}")
+            raise ConfigError(
+                f"{spec.name}=: required, as the model depends on it ({spec.unit}); for example {spec.name}={_example(spec.shape)}"
+            )
         parsed[spec.name] = spec.parse(job.conditions[spec.name])
     counts = {name: len(values) for name, values in parsed.items() if len(values) > 1}
     if counts and (not several or len(set(counts.values())) > 1):

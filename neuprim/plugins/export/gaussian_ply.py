@@ -30,7 +30,10 @@ from neuprim.plugins.export.gaussians import Gaussians, draw_gaussians, fit_gaus
 __all__ = ["EXPORTER", "LAYOUT"]
 
 OPTIONS = {
-    "size": ("auto", "moments: covariance of the density (solids); footprint: as much screen as the primitive covers (smoke); auto: the better"),
+    "size": (
+        "auto",
+        "moments: covariance of the density (solids); footprint: as much screen as the primitive covers (smoke); auto: the better",
+    ),
     "views": ("auto", "cameras of the PSNR: test, orbit, or auto (test for models without conditions)"),
 }
 

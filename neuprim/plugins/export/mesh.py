@@ -112,7 +112,7 @@ def _sample(job: ExportJob, conditions: Conditions, count: int) -> tuple[np.ndar
     """Extinction on a lattice with an empty border, and (4, 4) scene_from_index."""
     low, high = (v.numpy() for v in model_box(job, [conditions]))
     step = float((high - low).max()) / count
-    shape = tuple(int(math.ceil(n)) + 7 for n in (high - low) / step)
+    shape = tuple(math.ceil(n) + 7 for n in (high - low) / step)
     if math.prod(shape) > _MOST_VOXELS:
         raise ConfigError(f"grid={count}: {math.prod(shape)} voxels; expected at most {_MOST_VOXELS}")
     matrix = np.diag([step, step, step, 1.0])
@@ -204,7 +204,7 @@ def _save(mesh: Any, colours: np.ndarray, space: str, path: Path, up: str) -> No
     written.visual = trimesh.visual.ColorVisuals(written, vertex_colors=np.round(opaque * 255).astype(np.uint8))
     if suffix == ".glb" and up == "z":
         written.apply_transform(_TO_GLTF)
-    data = written.export(file_type=suffix[1:])
+    data: Any = written.export(file_type=suffix[1:])
     with atomic_path(path) as temporary:
         temporary.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
 

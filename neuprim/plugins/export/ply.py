@@ -58,4 +58,6 @@ def _read(path: Path) -> StoredModel:
     return StoredModel(header, tensors, config)
 
 
-EXPORTER = Exporter(API_VERSION, "ply", "the whole model, one vertex per primitive; lossless, `neuprim import` reads it", _write, read=_read)
+EXPORTER = Exporter(
+    API_VERSION, "ply", "the whole model, one vertex per primitive; lossless, `neuprim import` reads it", _write, read=_read
+)

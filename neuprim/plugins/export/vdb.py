@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -80,12 +80,16 @@ def _write(job: ExportJob) -> ExportReport:
         transform = fallback if transform is None else transform
         grid = sampled_grid(job, frame.conditions, transform, scene_from_world, name, factor, threshold)
         more = {f"neuprim_{key}": float(v) for key, v in frame.conditions.items() if v.numel() == 1}
-        grid = Grid(**{**vars_of(grid), "half": options.flag("half"), "metadata": {**metadata, **more}})
+        grid = replace(grid, half=options.flag("half"), metadata={**metadata, **more})
         write_vdb(path, [grid])
         if source is not None and frame.source is not None:
             errors |= _errors(job, source, frame, path, scene_from_world, factor)
     what = placement.grid if placement else ""
-    said = {"source": f"in the units of the source's grid {what!r}", "world": "extinction per world unit", "scene": "extinction per scene unit"}
+    said = {
+        "source": f"in the units of the source's grid {what!r}",
+        "world": "extinction per world unit",
+        "scene": "extinction per scene unit",
+    }
     notes.append(f"grid {name!r} is {said[units]}: extinction per scene unit = value x {1 / factor:g}; clamped at 0 per primitive")
     if placement is not None and not placement.exact and units == "source":
         notes.append(f"the look adds extinction of other grids to {what!r}, so the density holds these too, in the units of {what!r}")
@@ -94,11 +98,6 @@ def _write(job: ExportJob) -> ExportReport:
     if errors:
         notes.append("correlation and relative_l2: the model against the files as in metrics.json; file_*: what was written against them")
     return ExportReport(tuple(paths), False, errors, tuple(notes))
-
-
-def vars_of(grid: Grid) -> dict[str, object]:
-    """A grid's fields by name."""
-    return {name: getattr(grid, name) for name in Grid.__dataclass_fields__}
 
 
 # ---------------------------------------------------------------- which frames, and where

@@ -13,9 +13,7 @@ from hypothesis import strategies as st
 from neuprim.core.errors import DataError
 from neuprim.core.ply import read_ply, write_ply
 
-ROWS = np.array(
-    [(1.5, -2, 250, 1e-300), (np.float32(0.1), 7, 3, 2.5)], [("x", "<f4"), ("count", "<i2"), ("red", "|u1"), ("mass", "<f8")]
-)
+ROWS = np.array([(1.5, -2, 250, 1e-300), (np.float32(0.1), 7, 3, 2.5)], [("x", "<f4"), ("count", "<i2"), ("red", "|u1"), ("mass", "<f8")])
 
 
 def test_every_type_comes_back_to_the_bit(tmp_path: Path) -> None:

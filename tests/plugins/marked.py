@@ -16,7 +16,7 @@ from neuprim.core.primitives import Primitives
 from neuprim.core.vdb import Grid, write_vdb
 from neuprim.plugins.registry import load_task
 
-PLACES = torch.tensor([[0.0, 0.0, 0.0], [0.8, 0.0, 0.0], [0.0, 0.6, 0.0], [0.0, 0.0, 0.4], [0.5, 0.7, 0.9]])
+PLACES = torch.tensor([[0.0, 0.0, 0.0], [0.8, 0.0, 0.0], [0.0, 0.6, 0.0], [0.0, 0.0, 0.5], [0.5, 0.7, 0.9]])
 RADII = torch.tensor([0.3, 0.1, 0.1, 0.1, 0.05])
 COLOURS = torch.tensor([[0.9, 0.2, 0.1], [0.1, 0.8, 0.2], [0.1, 0.2, 0.9], [0.8, 0.8, 0.1], [0.2, 0.9, 0.9]])
 
@@ -45,7 +45,7 @@ def static_model(neurons: int = 3, degree: int = 1) -> Primitives:
 
 def write_run(folder: Path, model: Primitives, words: list[str], **header: Any) -> Path:
     """A run directory of the model as `neuprim run` leaves it, without pictures."""
-    config = compose([*words, f"output_dir={folder}", "renderer.backend=reference"])
+    config = compose([*words, f"output_dir='{folder}'", "renderer.backend=reference"])
     folder.mkdir(parents=True)
     (folder / "config.yaml").write_text(config.to_yaml())
     extra = {"background": [1.0, 1.0, 1.0], "color_space": "srgb", "data_source": "generated", "iterations": 7, "train_seconds": 0.1 + 0.2}
@@ -70,7 +70,9 @@ def write_sequence(folder: Path, frames: tuple[int, ...] = (3, 4, 5)) -> Path:
         values[2 : 6 + 2 * i, 5:8, 4:7] = 2.0
         matrix = np.diag([WORLD_VOXEL] * 3 + [1.0])
         matrix[:3, 3] = WORLD_SHIFT
-        write_vdb(folder / f"block_{number}.vdb", [Grid.from_dense("density", values, lower=(-3, 4, 5), transform=matrix)], compression="zip")
+        write_vdb(
+            folder / f"block_{number}.vdb", [Grid.from_dense("density", values, lower=(-3, 4, 5), transform=matrix)], compression="zip"
+        )
     return folder
 
 

@@ -98,7 +98,7 @@ def test_quaternions_of_no_length_points_without_places_and_empty_files_are_refu
     write_ply(tmp_path / "e.ply", np.zeros(0, [(n, "<f4") for n in "xyz"]))
     with pytest.raises(DataError, match="no vertices"):
         fresh(tmp_path / "e.ply")
-    with pytest.raises(DataError, match="none.ply"):
+    with pytest.raises(DataError, match=r"none\.ply"):
         fresh(tmp_path / "none.ply")
-    with pytest.raises(ConfigError, match="matter, box or a .ply"):
+    with pytest.raises(ConfigError, match=r"matter, box or a \.ply"):
         fresh("bx")

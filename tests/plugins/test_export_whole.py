@@ -131,7 +131,7 @@ def test_the_built_in_formats_come_through_the_group() -> None:
 
 def test_other_plys_are_named_for_what_they_are(run_dir: Path, tmp_path: Path) -> None:
     write_ply(tmp_path / "g.ply", np.zeros(1, [("x", "<f4")]))
-    with pytest.raises(DataError, match="model.init.points"):
+    with pytest.raises(DataError, match=r"model\.init\.points"):
         import_run(tmp_path / "g.ply", tmp_path / "out")
     (tmp_path / "m.obj").write_text("x")
     with pytest.raises(ConfigError, match="no format reads"):
@@ -246,5 +246,5 @@ def test_every_bit_pattern_of_a_float_survives(tmp_path: Path) -> None:
 def test_a_damaged_run_is_the_runs_fault(tmp_path: Path) -> None:
     run = marked.static_run(tmp_path / "run")
     (run / "model.safetensors").write_bytes(b"x")
-    with pytest.raises(CheckpointError, match="model.safetensors"):
+    with pytest.raises(CheckpointError, match=r"model\.safetensors"):
         export_run(run, "ply")

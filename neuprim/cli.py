@@ -90,6 +90,9 @@ def _dispatch(words: list[str]) -> int:
     if not words[0].startswith("-") and words[0] not in commands:
         raise ConfigError(f"{words[0]}: no such command{nearest(words[0], commands)}")
     args, rest = parser.parse_known_args(words)
+    if args.command == "export":
+        args.options += [word for word in rest if not word.startswith("-")]
+        rest = [word for word in rest if word.startswith("-")]
     if args.command == "run":
         args.overrides += [word for word in rest if not word.startswith("-")]  # argparse gives up on words after a flag
         rest = [word for word in rest if word.startswith("-")]
@@ -134,6 +137,18 @@ def _parsers(with_tasks: bool) -> tuple[Parser, dict[str, argparse.ArgumentParse
     render.add_argument("--fps", type=_rate, metavar="F", help="frames per second of an animation (default: about four seconds in all)")
     render.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
     render.add_argument("--frames", type=_count, default=60, metavar="N", help="frames of an orbit (default: 60)")
+
+    export = command("export", _export, "write a run's model in another format", "Formats and their options: docs/export.md.")
+    export.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    export.add_argument("options", nargs="*", metavar="KEY=VALUE", help="options of the format, and conditions (time=0.5, light=1,2,3)")
+    export.add_argument("--format", required=True, metavar="vdb|ply|gaussian-ply|mesh|npz", help="or a plugin's")
+    export.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR/export)")
+    export.add_argument("--force", action="store_true", help="replace files that exist")
+    export.add_argument("--json", action="store_true", help="print JSON")
+
+    back = command("import", _import, "make a run directory of an exported .ply or .npz")
+    back.add_argument("file", type=Path, metavar="FILE")
+    back.add_argument("--out", type=Path, required=True, metavar="RUN_DIR", help="new directory")
 
     vdb = command("vdb", _vdb, "look into OpenVDB files", "`info` lists grids: type, transform, bounds, active voxels, values, memory.")
     vdb.add_argument("action", choices=("info",), metavar="info", help="what to do")
@@ -201,6 +216,23 @@ def _render(args: argparse.Namespace) -> int:
     paths = render_run(run_dir, args.camera, args.size, args.format, args.out, args.frames, args.conditions, args.fps)
     for path in paths:
         print(path)
+    return 0
+
+
+def _export(args: argparse.Namespace) -> int:
+    run_dir = _run_directory(args.run_dir)
+    from rich.console import Console
+
+    from neuprim.exporting import export_run, print_report
+
+    print_report(export_run(run_dir, args.format, args.out, args.options, args.force, Console(stderr=True)), args.json)
+    return 0
+
+
+def _import(args: argparse.Namespace) -> int:
+    from neuprim.exporting import import_run
+
+    print(import_run(args.file, args.out))
     return 0
 
 

@@ -139,13 +139,16 @@ def _train(trainer: Trainer, config: RunConfig, dataset: Dataset, progress: RunP
 def _save(trainer: Trainer, config: RunConfig, dataset: Dataset) -> None:
     tensors, header = trainer.state()
     checkpoint.write(config.output_dir / "checkpoint.safetensors", "checkpoint", tensors, {"task": config.task, **header})
-    extra = {
+    extra: dict[str, Any] = {
         "background": [float(x) for x in dataset.background],
         "color_space": dataset.color_space,
         "data_source": dataset.data_source,
         "iterations": trainer.step,
         "train_seconds": trainer.elapsed,
     }
+    placement = dataset.placement()
+    if placement is not None:
+        extra["world"] = placement.to_json()
     checkpoint.save_model(config.output_dir / "model.safetensors", trainer.model, config.task, extra)
 
 

@@ -59,11 +59,17 @@ class CosineDensity(DensityField):
         return {**params, "w2": params["w2"] * factor[:, None], "b2": params["b2"] * factor[:, None]}
 
 
+_FAINT, _SOLID = 0.02, 0.98
+"""Starting points that say how opaque they are start within these: beyond, little light or little gradient passes."""
+
+
 def _initial_offset(ctx: InitContext, amplitude: float) -> Tensor:
     mode, alpha = ctx.choice("mode", "opaque", "paper"), ctx.number("alpha", 0.8, 0, 1)
     opaque = -math.log1p(-alpha) / 2.0  # a central chord of a sphere has optical depth 2 b2
     if mode == "paper" and amplitude:
         return ctx.uniform(1, bound=amplitude)
+    if ctx.alphas is not None:
+        return -torch.log1p(-ctx.alphas.float().clamp(_FAINT, _SOLID))[:, None] / 2.0
     return torch.full((ctx.count, 1), opaque)
 
 

@@ -16,6 +16,7 @@ from neuprim.core.fields import Conditions
 
 if TYPE_CHECKING:
     from neuprim.core.primitives import Primitives
+    from neuprim.core.volume_source import Placement
 
 __all__ = ["Clip", "DataSource", "Dataset", "Pixels", "PointCloud", "View", "ViewSet", "camera_extent"]
 
@@ -81,15 +82,21 @@ class PointCloud:
         colors: (N, C) in the data set's colour space.
         conditions: condition name -> (N,) the value under which matter was found at each point, e.g. "time" -> times 0..1;
             empty for scenes without conditions.
+        axes, quats: (N, 3) semi-axes and (N, 4) orientations wxyz, where the points are ellipsoids.
+        alphas: (N,) opacities 0..1 through their middles.
     """
 
     means: Tensor
     colors: Tensor
     conditions: Mapping[str, Tensor] = field(default_factory=dict)
+    axes: Tensor | None = None
+    quats: Tensor | None = None
+    alphas: Tensor | None = None
 
     def rows(self, index: Tensor) -> PointCloud:
         """The points at ``index``, (M,) int64 or (N,) bool, with all that belongs to them."""
-        return PointCloud(self.means[index], self.colors[index], {name: value[index] for name, value in self.conditions.items()})
+        ellipsoids = (None if value is None else value[index] for value in (self.axes, self.quats, self.alphas))
+        return PointCloud(self.means[index], self.colors[index], {n: value[index] for n, value in self.conditions.items()}, *ellipsoids)
 
 
 @dataclass(frozen=True)
@@ -178,6 +185,10 @@ class Dataset(ABC):
     def diagnose(self, model: Primitives) -> dict[str, Any]:
         """Further JSON-able numbers for ``metrics.json`` that only this kind of data can tell."""
         return {}
+
+    def placement(self) -> Placement | None:
+        """How scene units follow from the world of the voxel files that the scene was made from; None without such files."""
+        return None
 
     def orbit(self, frames: int) -> list[View]:
         """Views circling the scene at the training cameras' mean distance and elevation."""

@@ -17,7 +17,10 @@ from neuprim.core.primitives import Primitives
 from neuprim.core.render.cpu.compile import exact_kernel
 from neuprim.core.render.cpu.threads import parallel_for
 
-__all__ = ["density_grid"]
+__all__ = ["RESOLUTION", "agreement", "density_grid", "lattice"]
+
+RESOLUTION = 96
+"""Points along the longest side of the box that a model's extinction is compared on."""
 
 _SLAB = 4  # planes per unit of work; fixed, and the result does not depend on it
 
@@ -47,6 +50,26 @@ def density_grid(
     arguments = [np.ascontiguousarray(x) for x in (*wide, offset, forward[:3], back[:3])]
     parallel_for(_fill, shape[0], _SLAB, threads, *arguments, form.omega0, grid)
     return torch.from_numpy(grid)
+
+
+def lattice(bounds: np.ndarray, resolution: int = RESOLUTION) -> tuple[Tensor, tuple[int, int, int]]:
+    """(4, 4) scene_from_index and shape of a regular grid of cell centres that fills a (2, 3) box."""
+    low, high = np.asarray(bounds, np.float64)
+    step = float((high - low).max()) / resolution
+    x, y, z = (max(1, round(float(side) / step)) for side in high - low)
+    matrix = torch.eye(4, dtype=torch.float64) * step
+    matrix[3, 3] = 1.0
+    matrix[:3, 3] = torch.from_numpy(low + step / 2)
+    return matrix, (x, y, z)
+
+
+def agreement(truth: np.ndarray, found: np.ndarray) -> tuple[float, float] | None:
+    """Pearson correlation and relative L2 error of ``found`` against ``truth``, of one shape; None where the truth is all the same."""
+    truth, found = truth.astype(np.float64), found.astype(np.float64)
+    if truth.std() == 0:
+        return None
+    correlation = float(np.corrcoef(truth.ravel(), found.ravel())[0, 1]) if found.std() > 0 else 0.0
+    return correlation, float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
 
 
 @exact_kernel

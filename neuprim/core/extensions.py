@@ -11,12 +11,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from neuprim.core.data import Dataset
 from neuprim.core.primitives import Primitives
 from neuprim.core.render.settings import RenderSettings
 from neuprim.core.task import Loss, SceneSpec, TaskSpec
+from neuprim.core.volume_source import VolumeSource
 
-__all__ = ["Exporter", "ExportJob", "ExportReport", "Inspector", "LossExtension", "SceneExtension", "TrainedModel"]
+__all__ = ["Exporter", "ExportJob", "ExportReport", "Inspector", "LossExtension", "SceneExtension", "StoredModel", "TrainedModel"]
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,7 @@ class TrainedModel:
         scene: settings of the scene it was fitted to.
         settings: how the run renders.
         dataset: loads the scene again; raises :class:`~neuprim.core.errors.DataError` where its files are gone.
+        volume: the voxel files of the scene, without drawing anything; None for scenes that have none. Raises as ``dataset``.
     """
 
     directory: Path
@@ -38,6 +42,7 @@ class TrainedModel:
     scene: Mapping[str, Any]
     settings: RenderSettings
     dataset: Callable[[], Dataset]
+    volume: Callable[[], VolumeSource | None] = lambda: None
 
 
 @dataclass(frozen=True)
@@ -46,13 +51,17 @@ class ExportJob:
 
     Attributes:
         out: file or folder the user named, or None for the exporter's default name inside the run directory.
-        options: ``KEY=VALUE`` words of the user, parsed as YAML scalars; an exporter refuses those it does not know.
+        options: ``KEY=VALUE`` words of the user, numbers and booleans as such; only names that the exporter has.
+        conditions: condition name -> text, as ``render`` takes it; empty unless the exporter takes conditions.
+        overwrite: whether files that exist may be replaced.
         progress: called with (text, fraction 0..1).
     """
 
     run: TrainedModel
     out: Path | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
+    conditions: Mapping[str, str] = field(default_factory=dict)
+    overwrite: bool = False
     progress: Callable[[str, float], None] = lambda text, fraction: None
 
 
@@ -74,12 +83,30 @@ class ExportReport:
 
 
 @dataclass(frozen=True)
+class StoredModel:
+    """A whole model out of a file.
+
+    Attributes:
+        header: as of ``model.safetensors``; unchecked.
+        tensors: name -> (N, ...) float32 array; unchecked.
+        config: text of ``config.yaml``; unchecked.
+    """
+
+    header: Mapping[str, Any]
+    tensors: Mapping[str, np.ndarray]
+    config: str
+
+
+@dataclass(frozen=True)
 class Exporter:
     """A format of ``neuprim export --format NAME``; group ``neuprim.exporters``.
 
     Attributes:
         options: option name -> (default, one line of help).
         write: does it, atomically; raises a :class:`~neuprim.core.errors.NeuprimError` for what the format cannot hold.
+        conditions: whether it takes values of the task's conditions (``time=0.5``).
+        read: for lossless formats, ``neuprim import``: what ``write`` wrote, from an untrusted file; raises
+            :class:`~neuprim.core.errors.DataError`. Chosen by the file's suffix, which is then the exporter's name.
     """
 
     api: int
@@ -87,6 +114,8 @@ class Exporter:
     summary: str
     write: Callable[[ExportJob], ExportReport]
     options: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
+    conditions: bool = False
+    read: Callable[[Path], StoredModel] | None = None
 
 
 @dataclass(frozen=True)

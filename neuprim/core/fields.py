@@ -247,6 +247,12 @@ class ColourField(Field):
         """
         return conditions
 
+    def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None] | None:
+        """The colour as :func:`neuprim.core.sh.colors` takes it under these conditions, for fields that are that: zero-order
+        coefficients (N, C) and those of the higher bands (N, B, C) or None. None for other fields.
+        """
+        return None
+
     @abstractmethod
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> LoweredColour:
         """The frame's closed form."""

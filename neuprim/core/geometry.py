@@ -69,7 +69,13 @@ class Geometry:
         return Geometry(self.means[rows], self.log_scales[rows], self.quats[rows])
 
 
-def _identity(ctx: InitContext) -> Tensor:
+def _semi_axes(ctx: InitContext) -> Tensor:
+    return (ctx.scales[:, None].repeat(1, 3) if ctx.axes is None else ctx.axes).float().log()
+
+
+def _orientation(ctx: InitContext) -> Tensor:
+    if ctx.quats is not None:
+        return ctx.quats.float()
     q = torch.zeros(ctx.count, 4)
     q[:, 0] = 1.0
     return q
@@ -77,7 +83,7 @@ def _identity(ctx: InitContext) -> Tensor:
 
 GEOMETRY_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("means", (3,), 7e-4, lambda c: c.means.float(), group="geometry", lr_unit="extent"),
-    ParameterSpec("log_scales", (3,), 2e-2, lambda c: c.scales.float().log()[:, None].repeat(1, 3), "exp", "geometry"),
-    ParameterSpec("quats", (4,), 1e-2, _identity, "normalize", "geometry"),
+    ParameterSpec("log_scales", (3,), 2e-2, _semi_axes, "exp", "geometry"),
+    ParameterSpec("quats", (4,), 1e-2, _orientation, "normalize", "geometry"),
 )
 """Every model starts with these ten numbers per primitive."""

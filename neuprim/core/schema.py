@@ -35,6 +35,8 @@ class InitContext:
         generator: the only source of randomness initialisers may use.
         settings: free settings of the preset (``model.init``), e.g. ``{"alpha": 0.8}``.
         conditions: name -> (N,) condition at which each starting point was found ("time"), where the data set says so.
+        axes: (N, 3) initial semi-axes and quats: (N, 4) wxyz their orientations, where the starting points are ellipsoids.
+        alphas: (N,) opacities in 0..1 through their middles, where they have one.
     """
 
     means: Tensor
@@ -43,6 +45,9 @@ class InitContext:
     generator: torch.Generator
     settings: Mapping[str, object] = field(default_factory=dict)
     conditions: Mapping[str, Tensor] = field(default_factory=dict)
+    axes: Tensor | None = None
+    quats: Tensor | None = None
+    alphas: Tensor | None = None
 
     @property
     def count(self) -> int:

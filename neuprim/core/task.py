@@ -11,6 +11,7 @@ from torch import Tensor
 
 from neuprim.core.data import Dataset
 from neuprim.core.fields import ColourField, ConditionSpec, DensityField, Field
+from neuprim.core.volume_source import VolumeSource
 
 __all__ = ["API_VERSION", "Loss", "SceneContext", "SceneSpec", "TaskSpec"]
 
@@ -44,11 +45,13 @@ class SceneSpec:
         name: what the user types after ``scene=``.
         summary: one line for ``neuprim tasks``.
         load: (scene settings, context) -> Dataset; raises :class:`~neuprim.core.errors.DataError` for bad input.
+        volume: for scenes made of voxel files: (scene settings, context) -> these, without drawing anything.
     """
 
     name: str
     summary: str
     load: Callable[[Mapping[str, Any], SceneContext], Dataset]
+    volume: Callable[[Mapping[str, Any], SceneContext], VolumeSource] | None = None
 
 
 @dataclass(frozen=True)

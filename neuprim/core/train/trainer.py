@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,6 +19,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from neuprim.core.data import Dataset
+from neuprim.core.datasets.initial import subset
+from neuprim.core.datasets.points_file import read_points
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NonFiniteError, nearest
 from neuprim.core.fields import ColourField, DensityField
 from neuprim.core.primitives import Primitives
@@ -49,8 +52,12 @@ class StepReport:
 def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, settings: ModelSettings, seed: int) -> Primitives:
     """Primitives on the data set's starting points, as large as their neighbours are far (RMS distance to the 3 nearest).
 
+    ``model.init.points``: "matter" (the data set's own), "box" (anywhere in its box), or a .ply file of points or 3D Gaussians;
+    the latter bring sizes, orientations and opacities of their own. ``model.init.scale`` multiplies all sizes.
+
     Raises:
-        DataError: the data set offers no starting point.
+        ConfigError: no such setting, or a setting with an impossible value.
+        DataError: the data set offers no starting point, or the file is damaged.
     """
     for key in settings.init:
         known = ("scale", "points", *density.init_settings, *colour.init_settings)
@@ -58,9 +65,13 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
             raise ConfigError(f"model.init.{key}: no such setting{nearest(key, known)}")
     generator = torch.Generator().manual_seed(seed)
     where = settings.init.get("points", "matter")
-    if where not in ("matter", "box"):
-        raise ConfigError(f"model.init.points={where!r}: expected matter or box")
-    cloud = (dataset.uniform_points if where == "box" else dataset.initial_points)(settings.primitives, generator)
+    if isinstance(where, str) and where.lower().endswith(".ply"):
+        points = read_points(Path(where).expanduser(), dataset.channels, dataset.color_space)
+        cloud = subset(points, settings.primitives, generator)
+    elif where in ("matter", "box"):
+        cloud = (dataset.uniform_points if where == "box" else dataset.initial_points)(settings.primitives, generator)
+    else:
+        raise ConfigError(f"model.init.points={where!r}: expected matter, box or a .ply file")
     if len(cloud.means) == 0:
         raise DataError(f"{dataset.name}: no starting points found; expected points or images with visible content")
     if len(cloud.means) == 1:
@@ -70,7 +81,10 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
         distance = torch.from_numpy(cKDTree(cloud.means.numpy()).query(cloud.means.numpy(), k=neighbours + 1)[0][:, 1:])
         scales = distance.square().mean(dim=1).sqrt().clamp_min(1e-6 * dataset.extent).float()
     context = InitContext(cloud.means.float(), scales, cloud.colors.float(), generator, settings.init, cloud.conditions)
-    context.scales = scales * context.number("scale", 1.0, 0)
+    factor = context.number("scale", 1.0, 0)
+    context.scales, context.quats, context.alphas = scales * factor, cloud.quats, cloud.alphas
+    if cloud.axes is not None:
+        context.axes = cloud.axes.clamp_min(1e-6 * dataset.extent) * factor
     return Primitives.initialise(density, colour, context)
 
 

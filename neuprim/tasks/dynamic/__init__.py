@@ -11,6 +11,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
+from neuprim.core.volume_source import VolumeSource
 from neuprim.tasks.dynamic.colour import FREQUENCIES, TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.dynamic.time import parse_times
@@ -48,6 +49,12 @@ def _volume(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     return load(settings, context)
 
 
+def _files(settings: Mapping[str, Any], context: SceneContext) -> VolumeSource:
+    from neuprim.tasks.dynamic.volume.scene import load_volume
+
+    return load_volume(settings, context)
+
+
 def _multiview(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     from neuprim.tasks.dynamic.multiview import load
 
@@ -60,11 +67,11 @@ TASK = TaskSpec(
     summary="Smoke and fire over time, from OpenVDB sequences or images with a time each (time inside the density)",
     config_package="neuprim.tasks.dynamic.conf",
     scenes=(
-        SceneSpec("smoke_fire", "fire under dark smoke, 100 timesteps; simulated, or scene.vdb=DIR", _volume),
-        SceneSpec("colorful_smoke", "coloured smoke, 128 timesteps; simulated, or scene.vdb=DIR", _volume),
-        SceneSpec("ground_explosion", "a blast and its cloud, 130 timesteps; simulated, or scene.vdb=DIR", _volume),
-        SceneSpec("dust_tornado", "a column of dust, 100 timesteps; simulated, or scene.vdb=DIR", _volume),
-        SceneSpec("vdb", "any sequence of .vdb files: scene.vdb=DIR", _volume),
+        SceneSpec("smoke_fire", "fire under dark smoke, 100 timesteps; simulated, or scene.vdb=DIR", _volume, _files),
+        SceneSpec("colorful_smoke", "coloured smoke, 128 timesteps; simulated, or scene.vdb=DIR", _volume, _files),
+        SceneSpec("ground_explosion", "a blast and its cloud, 130 timesteps; simulated, or scene.vdb=DIR", _volume, _files),
+        SceneSpec("dust_tornado", "a column of dust, 100 timesteps; simulated, or scene.vdb=DIR", _volume, _files),
+        SceneSpec("vdb", "any sequence of .vdb files: scene.vdb=DIR", _volume, _files),
         SceneSpec("multiview", "images with a time per frame (D-NeRF layout): scene.path=DIR", _multiview),
     ),
     build=_build,

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from neuprim.core import sh
 from neuprim.core.fields import ColourField, Conditions, Constant
@@ -66,7 +67,7 @@ class TimeHarmonics(ColourField):
             specs.append(ParameterSpec("sh_rest", (rest, C), 2e-3, _zeros(rest, C), group="colour"))
         return specs
 
-    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
+    def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:
         dc = params["sh_dc"]
         xi = time_of(conditions)
         waves = FREQUENCIES[self.frequencies] * xi * torch.arange(1, self.waves + 1, dtype=torch.float64, device=xi.device)
@@ -74,7 +75,11 @@ class TimeHarmonics(ColourField):
         for name, basis in (("time_poly", powers), ("time_cos", waves.cos()), ("time_sin", waves.sin())):
             if name in params:
                 dc = dc + (params[name] * basis.to(dc)[:, None]).sum(1)
-        return Constant(sh.colors(geometry.means, dc, params.get("sh_rest"), camera.position, self.active))
+        return dc, params.get("sh_rest")
+
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
+        dc, rest = self.harmonics(params, conditions)
+        return Constant(sh.colors(geometry.means, dc, rest, camera.position, self.active))
 
 
 def _zeros(terms: int, channels: int) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from neuprim.core import sh
 from neuprim.core.fields import ColourField, Conditions, Constant
@@ -41,6 +42,9 @@ class SphericalHarmonics(ColourField):
         if rest:
             specs.append(ParameterSpec("sh_rest", (rest, C), 2e-3, lambda c: torch.zeros(c.count, rest, C), group="colour"))
         return specs
+
+    def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:
+        return params["sh_dc"], params.get("sh_rest")
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         return Constant(sh.colors(geometry.means, params["sh_dc"], params.get("sh_rest"), camera.position, self.active))

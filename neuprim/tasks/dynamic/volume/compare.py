@@ -9,30 +9,16 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from neuprim.core.density_grid import density_grid
+from neuprim.core.density_grid import agreement, density_grid, lattice
 from neuprim.core.primitives import Primitives
 from neuprim.tasks.dynamic.volume.medium import Medium
 
 if TYPE_CHECKING:
     from neuprim.tasks.dynamic.volume.shoot import Shoot
 
-__all__ = ["compare_with_truth", "extinction_on", "lattice"]
-
-RESOLUTION = 96
-"""Points along the longest side of the box that both are compared on."""
+__all__ = ["compare_with_truth", "extinction_on"]
 
 THIRDS = ("early", "middle", "late")
-
-
-def lattice(bounds: np.ndarray, resolution: int = RESOLUTION) -> tuple[Tensor, tuple[int, int, int]]:
-    """(4, 4) scene_from_index and shape of a regular grid of cell centres that fills a (2, 3) box."""
-    low, high = np.asarray(bounds, np.float64)
-    step = float((high - low).max()) / resolution
-    x, y, z = (max(1, round(float(side) / step)) for side in high - low)
-    matrix = torch.eye(4, dtype=torch.float64) * step
-    matrix[3, 3] = 1.0
-    matrix[:3, 3] = torch.from_numpy(low + step / 2)
-    return matrix, (x, y, z)
 
 
 def extinction_on(medium: Medium, scene_from_index: Tensor, shape: tuple[int, int, int]) -> np.ndarray:
@@ -57,12 +43,11 @@ def compare_with_truth(model: Primitives, shoot: Shoot, times: list[float], per_
     matrix, shape = lattice(shoot.bounds)
     entries: list[dict[str, Any]] = []
     for t in chosen:
-        truth = extinction_on(shoot.medium(shoot.frames[t]), matrix, shape).astype(np.float64)
-        found = density_grid(model, {"time": torch.tensor(times[t])}, matrix, shape).numpy().astype(np.float64)
-        if truth.std() == 0:
+        truth = extinction_on(shoot.medium(shoot.frames[t]), matrix, shape)
+        both = agreement(truth, density_grid(model, {"time": torch.tensor(times[t])}, matrix, shape).numpy())
+        if both is None:
             continue
-        correlation = float(np.corrcoef(truth.ravel(), found.ravel())[0, 1]) if found.std() > 0 else 0.0
-        error = float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
+        correlation, error = both
         third = THIRDS[min(3 * t // count, 2)]
         entries.append({"frame": shoot.frames[t].number, "third": third, "correlation": correlation, "relative_l2": error})
     result: dict[str, Any] = {"sigma_frames": entries}

@@ -16,9 +16,11 @@ from neuprim.core import images
 from neuprim.core.data import Clip, Dataset, DataSource, Pixels, PointCloud, View, ViewSet, camera_extent
 from neuprim.core.errors import DataError
 from neuprim.core.primitives import Primitives
+from neuprim.core.volume_source import Placement
 from neuprim.tasks.dynamic.dead import dead_fraction
 from neuprim.tasks.dynamic.volume.compare import compare_with_truth
 from neuprim.tasks.dynamic.volume.shoot import Shoot
+from neuprim.tasks.dynamic.volume.source import placement_of
 
 __all__ = ["MEMORY", "MEMORY_TEST", "FrameViews", "VolumeDataset"]
 
@@ -145,6 +147,9 @@ class VolumeDataset(Dataset):
                 union |= alpha > _MATTER
             self._masks[camera] = union
         return self._masks[camera]
+
+    def placement(self) -> Placement:
+        return placement_of(self.shoot)
 
     def diagnose(self, model: Primitives) -> dict[str, Any]:
         """The model's extinction against the files', and its size against theirs."""

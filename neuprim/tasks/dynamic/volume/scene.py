@@ -24,8 +24,9 @@ from neuprim.tasks.dynamic.volume.optics import Look
 from neuprim.tasks.dynamic.volume.rig import AXES, rig
 from neuprim.tasks.dynamic.volume.settings import VolumeSettings, choose_frames
 from neuprim.tasks.dynamic.volume.shoot import Shoot
+from neuprim.tasks.dynamic.volume.source import ShootSource
 
-__all__ = ["load"]
+__all__ = ["load", "load_volume"]
 
 Progress = Callable[[str, float], None]
 
@@ -37,6 +38,19 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         ConfigError: unknown setting or impossible value.
         DataError: files that are missing, damaged, or without a usable grid; a cache that cannot be written.
     """
+    asked, name, source, shoot, held_out = _prepare(settings, context)
+    rendered = shoot.take(context.cache_dir, context.progress)
+    up = torch.tensor(AXES[asked.up], dtype=torch.float64)
+    return VolumeDataset(name, source, shoot, rendered, held_out, up, asked.train_every)
+
+
+def load_volume(settings: Mapping[str, Any], context: SceneContext) -> ShootSource:
+    """The same scene's files without any image. Raises as :func:`load`."""
+    return ShootSource(_prepare(settings, context)[3])
+
+
+def _prepare(settings: Mapping[str, Any], context: SceneContext) -> tuple[VolumeSettings, str, DataSource, Shoot, range]:
+    """All that is known before anything is rendered: settings, name, origin, what to render, and the cameras held out."""
     asked = VolumeSettings.parse(settings)
     _look(asked, AUTO[0])  # a typing error shows before anything is simulated
     folder, name, source = _files(asked, context)
@@ -50,10 +64,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     normalisation = Normalisation.from_bounds(box)
     train, test = rig(asked.size, asked.cameras, up=asked.up, field_of_view=asked.field_of_view)
     shoot = Shoot(frames, reader, look, [*train, *test], asked.samples, normalisation, normalisation.to_scene(box))
-    rendered = shoot.take(context.cache_dir, context.progress)
-    held_out = range(len(train), len(train) + len(test))
-    up = torch.tensor(AXES[asked.up], dtype=torch.float64)
-    return VolumeDataset(name, source, shoot, rendered, held_out, up, asked.train_every)
+    return asked, name, source, shoot, range(len(train), len(train) + len(test))
 
 
 def _files(asked: VolumeSettings, context: SceneContext) -> tuple[Path, str, DataSource]:

@@ -1,0 +1,117 @@
+"""What formats with colours need of any model: its colours as spherical harmonics, and cameras to compare images from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from neuprim.core import sh
+from neuprim.core.cameras import Camera, look_at, orbit
+from neuprim.core.data import View
+from neuprim.core.errors import ConfigError, NeuprimError
+from neuprim.core.extensions import ExportJob, TrainedModel
+from neuprim.core.fields import Conditions, Constant, RayNet
+
+__all__ = ["Harmonics", "comparison_views", "harmonics_of", "sphere"]
+
+_DEGREE = 3
+_DIRECTIONS = 64
+_VIEWS, _SIZE = 8, 160
+
+
+class Harmonics:
+    """Colours max(0, SH(direction) + 1/2) of the primitives that live under some conditions.
+
+    Attributes:
+        dc: (M, 3), rest: (M, 15, 3) float64 coefficients in the order and signs of 3D Gaussian splatting.
+        residual: RMS error of the fit over directions and primitives; 0.0 where the model's colours are harmonics themselves.
+    """
+
+    def __init__(self, dc: Tensor, rest: Tensor | None, residual: float) -> None:
+        bands = sh.coefficient_count(_DEGREE) - 1
+        full = torch.zeros(len(dc), bands, 3, dtype=torch.float64)
+        if rest is not None:
+            full[:, : rest.shape[1]] = rest
+        self.dc, self.rest, self.residual = dc.double(), full, residual
+
+    def towards(self, rows: Tensor, directions: Tensor) -> Tensor:
+        """(P, 3) colours of primitives ``rows`` (P,) seen along unit ``directions`` (P, 3), camera to primitive."""
+        basis = sh.basis(directions.double(), _DEGREE)
+        mixed = basis[:, :1] * self.dc[rows] + (basis[:, 1:, None] * self.rest[rows]).sum(1)
+        return (mixed + 0.5).clamp_min(0.0)
+
+
+def harmonics_of(run: TrainedModel, conditions: Conditions) -> Harmonics:
+    """Exact where the colour field is made of harmonics; else fitted, degree 3 by least squares, to the colours at the primitives'
+    centres seen from 64 directions far away, under the given conditions.
+
+    Raises:
+        ConfigError: the colours are not three channels, or of a form that has no value per primitive.
+    """
+    model = run.model
+    if model.colour.channels != 3:
+        raise ConfigError(f"{run.directory}: {model.colour.channels} colour channels; this format has red, green and blue")
+    with torch.no_grad():
+        rows = model.density.alive(model.of(model.density), conditions)
+        tint = {name: value if rows is None else value[rows] for name, value in model.of(model.colour).items()}
+        exact = model.colour.harmonics(tint, conditions)
+        if exact is not None:
+            return Harmonics(exact[0], exact[1], 0.0)
+        directions = sphere(_DIRECTIONS)
+        seen = torch.stack([_from_afar(run, conditions, d) for d in directions], 1)  # (M, V, 3)
+        basis = sh.basis(directions, _DEGREE)
+        fitted = torch.einsum("bv,nvc->nbc", torch.linalg.pinv(basis), seen - 0.5)
+        residual = float((torch.einsum("vb,nbc->nvc", basis, fitted) + 0.5 - seen).square().mean().sqrt())
+        return Harmonics(fitted[:, 0], fitted[:, 1:], residual)
+
+
+def _from_afar(run: TrainedModel, conditions: Conditions, direction: Tensor) -> Tensor:
+    """(M, 3) float64 colours at the primitives' centres from a camera so far away that all are seen along one direction."""
+    means = run.model.params["means"].double()
+    middle = means.mean(0)
+    reach = float((means - middle).norm(dim=-1).max()) + 1.0
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    camera = Camera(look_at(middle - 1e4 * reach * direction, middle, up), 1e4, 1e4, 32, 32, 64, 64)
+    colour = run.model.lower(camera, conditions).colour
+    if isinstance(colour, Constant):
+        return colour.rgb.double()
+    if isinstance(colour, RayNet):
+        every = torch.arange(len(colour.base))
+        return colour.radiance(every, torch.zeros(len(every), 3, dtype=torch.float64))
+    raise ConfigError(f"{run.directory}: colours of the form {type(colour).__name__} have no value per primitive")
+
+
+def sphere(count: int) -> Tensor:
+    """(count, 3) float64 unit vectors spread evenly (a Fibonacci lattice)."""
+    i = torch.arange(count, dtype=torch.float64)
+    z = 1 - (2 * i + 1) / count
+    turn = i * math.pi * (3 - math.sqrt(5))
+    r = (1 - z * z).sqrt()
+    return torch.stack([r * turn.cos(), r * turn.sin(), z], -1)
+
+
+def comparison_views(job: ExportJob, which: str, conditions: Conditions) -> tuple[list[View], str]:
+    """At most eight views under the given conditions, and what they are: "test" cameras of the scene or an "orbit" of the model.
+
+    ``which`` = "auto" takes test cameras where the scene can be loaded without conditions (a sequence would be drawn anew).
+    """
+    if which == "test" or (which == "auto" and not job.run.task.conditions):
+        try:
+            views = job.run.dataset().test
+            picks = sorted({round(i * (len(views) - 1) / (_VIEWS - 1)) for i in range(_VIEWS)})
+            return [replace(views.view(i), conditions=conditions) for i in picks], f"{len(picks)} test views"
+        except NeuprimError:
+            if which == "test":
+                raise
+    with torch.no_grad():
+        geometry, _ = job.run.model.lower_density(conditions)
+    means = geometry.means.double()
+    low, high = (torch.quantile(means[:100_000], q, dim=0) for q in (0.02, 0.98))
+    middle, reach = (low + high) / 2, float((high - low).norm()) / 2 + float(geometry.scales.median())
+    focal = 0.5 * _SIZE / math.tan(math.radians(20))
+    template = Camera(torch.eye(4, dtype=torch.float64), focal, focal, _SIZE / 2, _SIZE / 2, _SIZE, _SIZE)
+    cameras = orbit(template, middle, torch.tensor([0.0, 0.0, 1.0]), 3.0 * reach, math.radians(25), _VIEWS)
+    return [View(f"orbit_{i}", c, conditions) for i, c in enumerate(cameras)], f"{_VIEWS} orbit views"

@@ -1,0 +1,258 @@
+"""``vdb``: the density as an OpenVDB fog volume, one file per frame for models that change in time; lossy (sampled).
+
+Grid ``density`` is the sum over primitives of their density clamped at 0, at the voxels' centres; what is below ``threshold`` is not
+stored (background 0, inactive). A model that was fitted to .vdb files is written on the voxels and in the units of these files, frame
+by frame, so that both overlay each other; else in scene units on cubic voxels whose lattice has a corner of its index space in the
+scene's origin, one lattice for all frames. Axes are those of the data; nothing is turned.
+
+Units (metadata ``neuprim_units``): ``source``: sigma divided by the extinction per unit of the file's grid, as the scene's look has
+it; ``world``: extinction per world unit of the file, what a volume shader multiplies with a length; ``scene``: extinction per scene
+unit, sigma itself. Where nothing is known of a world, that is the scene.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from neuprim.core.density_grid import agreement, density_grid, lattice
+from neuprim.core.errors import ConfigError, NeuprimError
+from neuprim.core.extensions import Exporter, ExportJob, ExportReport
+from neuprim.core.fields import Conditions
+from neuprim.core.task import API_VERSION
+from neuprim.core.vdb import Grid, Tiles, read_grid, scale_transform, write_vdb
+from neuprim.core.volume_source import Placement, VolumeSource
+from neuprim.plugins.export.common import Options, conditions_of, free, model_box, target
+
+__all__ = ["EXPORTER", "sampled_grid"]
+
+OPTIONS = {
+    "grid": (None, "voxels along the longest side, 8 to 2048 (default: the source's own voxels, else 128)"),
+    "voxel_size": (None, "edge of a voxel in world units, instead of grid"),
+    "units": ("auto", "source, world or scene; auto: source where the model was fitted to .vdb files, else world"),
+    "threshold": (None, "values below it are not stored (default: an optical depth of 0.001 along the box)"),
+    "half": (False, "16-bit floats"),
+    "name": ("density", "of the grid"),
+    "source": (True, "whether to look for the files that the model was fitted to: their voxels, and errors against them"),
+}
+_SLAB_BYTES = 64 * 2**20
+_MOST_VOXELS = 2**34
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """``number`` is of its file name; ``source`` its index in the scene's files, None where it has none."""
+
+    number: int
+    conditions: Conditions
+    source: int | None = None
+
+
+def _write(job: ExportJob) -> ExportReport:
+    options = Options(job, OPTIONS)
+    source, placement, notes = _origin(job, options.flag("source"))
+    frames = _frames(job, placement, source)
+    paths = _paths(job, frames)
+    units = options.choice("units", "auto", "source", "world", "scene")
+    if units == "auto":
+        units = "source" if placement else "world"
+    if units == "source" and placement is None:
+        raise ConfigError("units=source: the model's header names no .vdb files; expected world or scene")
+    scene_from_world = placement.scene_from_world if placement else np.eye(4)
+    per_world = abs(np.linalg.det(scene_from_world[:3, :3])) ** (1 / 3)
+    factor = {"source": 1 / placement.sigma_per_unit if placement else 1.0, "world": per_world, "scene": 1.0}[units]
+    box = np.stack([v.numpy() for v in model_box(job, [f.conditions for f in frames])])
+    threshold = options.number("threshold", 0.0, 1e9)
+    threshold = 1e-3 / float((box[1] - box[0]).max()) * factor if threshold is None else threshold
+    name = str(job.options.get("name", "density"))
+    own = options.number("grid") is None and options.number("voxel_size") is None and source is not None
+    fallback = _transform(options, box, scene_from_world)
+    metadata = {"neuprim_units": units, "neuprim_sigma_per_unit": 1 / factor, "neuprim_threshold": threshold}
+    errors: dict[str, float] = {}
+    for i, (frame, path) in enumerate(zip(frames, paths, strict=True)):
+        job.progress("writing frames", i / len(frames))
+        transform = source.transform(frame.source) if own and source is not None and frame.source is not None else None
+        transform = fallback if transform is None else transform
+        grid = sampled_grid(job, frame.conditions, transform, scene_from_world, name, factor, threshold)
+        more = {f"neuprim_{key}": float(v) for key, v in frame.conditions.items() if v.numel() == 1}
+        grid = replace(grid, half=options.flag("half"), metadata={**metadata, **more})
+        write_vdb(path, [grid])
+        if source is not None and frame.source is not None:
+            errors |= _errors(job, source, frame, path, scene_from_world, factor)
+    what = placement.grid if placement else ""
+    said = {
+        "source": f"in the units of the source's grid {what!r}",
+        "world": "extinction per world unit",
+        "scene": "extinction per scene unit",
+    }
+    notes.append(f"grid {name!r} is {said[units]}: extinction per scene unit = value x {1 / factor:g}; clamped at 0 per primitive")
+    if placement is not None and not placement.exact and units == "source":
+        notes.append(f"the look adds extinction of other grids to {what!r}, so the density holds these too, in the units of {what!r}")
+    where = "the source's own voxels and world" if own else "cubic voxels in " + ("the source's world" if placement else "scene units")
+    notes.append(f"on {where}; values below {threshold:.3g} are left out")
+    if errors:
+        notes.append("correlation and relative_l2: the model against the files as in metrics.json; file_*: what was written against them")
+    return ExportReport(tuple(paths), False, errors, tuple(notes))
+
+
+# ---------------------------------------------------------------- which frames, and where
+
+
+def _origin(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Placement | None, list[str]]:
+    """The scene's files, how the model lies in their world, and what to tell the user about it."""
+    notes: list[str] = []
+    source = None
+    if wanted:
+        try:
+            source = job.run.volume()
+        except NeuprimError as error:
+            notes.append(f"the source's files cannot be read, so neither their voxels nor errors against them: {error}")
+    if source is not None:
+        return source, source.placement, notes
+    record = job.run.header.get("world")
+    if isinstance(record, dict):
+        return None, Placement.from_json(record, str(job.run.directory / "model.safetensors")), notes
+    return None, None, notes
+
+
+def _frames(job: ExportJob, placement: Placement | None, source: VolumeSource | None) -> list[_Frame]:
+    """Those the user names, else those of the run; a model without conditions has one."""
+    if not job.run.task.conditions:
+        return [_Frame(0, {})]
+    if job.conditions or placement is None:
+        frames = [_Frame(i, c) for i, c in enumerate(conditions_of(job, several=True))]
+        return [_Frame(f.number, f.conditions, _same(f.conditions, source)) for f in frames]
+    times = placement.times
+    return [
+        _Frame(n, {name: torch.tensor(values[i]) for name, values in times.items()}, i if source is not None else None)
+        for i, n in enumerate(placement.numbers)
+    ]
+
+
+def _same(conditions: Conditions, source: VolumeSource | None) -> int | None:
+    """The frame of the source with these conditions."""
+    for i in range(len(source.placement.numbers) if source else 0):
+        assert source is not None
+        known = source.conditions(i)
+        if known.keys() == conditions.keys() and all(torch.allclose(known[k].float(), v.float(), atol=1e-6) for k, v in conditions.items()):
+            return i
+    return None
+
+
+def _paths(job: ExportJob, frames: list[_Frame]) -> list[Path]:
+    if not job.run.task.conditions or (len(frames) == 1 and job.out is not None and job.out.suffix.lower() == ".vdb"):
+        return [target(job, "density.vdb", (".vdb",))]
+    folder = job.out if job.out is not None else job.run.directory / "export" / "vdb"
+    if folder.suffix.lower() == ".vdb" or folder.is_file():
+        raise ConfigError(f"--out {folder}: {len(frames)} frames; expected a folder")
+    width = max(4, len(str(max(f.number for f in frames))))
+    paths = [folder / f"density_{f.number:0{width}d}.vdb" for f in frames]
+    for path in paths:
+        free(job, path)
+    return paths
+
+
+def _transform(options: Options, box: np.ndarray, scene_from_world: np.ndarray) -> np.ndarray:
+    """(4, 4) index to world of the user's voxels, with the origin of both in one place."""
+    count, size = options.count("grid", 8, 2048), options.number("voxel_size", 1e-9, 1e9)
+    if count is not None and size is not None:
+        raise ConfigError("grid and voxel_size: expected one of them")
+    corners = np.linalg.inv(scene_from_world)[:3, :3] @ (box[1] - box[0])
+    return scale_transform(size or float(np.abs(corners).max()) / (count or 128))
+
+
+# ---------------------------------------------------------------- sampling
+
+
+def sampled_grid(
+    job: ExportJob, conditions: Conditions, transform: np.ndarray, scene_from_world: np.ndarray, name: str, factor: float, threshold: float
+) -> Grid:
+    """The model's extinction x ``factor`` on voxels of a world, slab by slab; dense memory is that of one slab.
+
+    Args:
+        transform: (4, 4) index to world.
+        threshold: values below it are background.
+
+    Raises:
+        ConfigError: the box of the model has too many voxels.
+    """
+    try:
+        low, high = (v.numpy() for v in model_box(job, [conditions]))
+    except ConfigError:  # nothing lives in this frame: an empty grid is a frame too
+        low = high = scene_from_world[:3, 3]
+    scene_from_index = scene_from_world @ transform
+    corners = np.stack(np.meshgrid(*np.stack([low, high], -1), indexing="ij"), -1).reshape(-1, 3)
+    back = np.linalg.inv(scene_from_index)
+    index = corners @ back[:3, :3].T + back[:3, 3]
+    if not (np.abs(index) < 2**30).all():
+        raise ConfigError(f"the model reaches voxel {np.abs(index).max():.3g}; expected fewer (voxel_size, grid)")
+    first = np.floor(index.min(0)).astype(np.int64) & ~7
+    last = (np.ceil(index.max(0)).astype(np.int64) & ~7) + 8
+    size = last - first
+    if math.prod(size.tolist()) > _MOST_VOXELS:
+        raise ConfigError(f"{' x '.join(map(str, size))} voxels around the model; expected at most {_MOST_VOXELS:.0e} (voxel_size, grid)")
+    parts = [g for g in _slabs(job, conditions, scene_from_index, first, size, name, factor, threshold) if len(g.origins)]
+    leaves = (
+        np.concatenate([g.origins for g in parts]) if parts else np.zeros((0, 3), np.int32),
+        np.concatenate([g.values for g in parts]) if parts else np.zeros((0, 8, 8, 8), np.float32),
+        np.concatenate([g.masks for g in parts]) if parts else np.zeros((0, 8, 8, 8), bool),
+    )
+    return Grid(name, np.array(transform, np.float64), np.zeros((), np.float32), *leaves, Tiles.none())
+
+
+def _slabs(
+    job: ExportJob,
+    conditions: Conditions,
+    scene_from_index: np.ndarray,
+    first: np.ndarray,
+    size: np.ndarray,
+    name: str,
+    factor: float,
+    threshold: float,
+) -> Iterator[Grid]:
+    """Sparse grids of blocks of planes that fit in a bounded memory, each a multiple of 8 along the first two axes."""
+    rows = max(8, min(int(size[1]), _SLAB_BYTES // (32 * int(size[2])) & ~7))
+    planes = max(8, min(int(size[0]), _SLAB_BYTES // (4 * rows * int(size[2])) & ~7))
+    for x in range(0, int(size[0]), planes):
+        for y in range(0, int(size[1]), rows):
+            corner = first + np.array([x, y, 0])
+            shape = (min(planes, int(size[0]) - x), min(rows, int(size[1]) - y), int(size[2]))
+            shifted = scene_from_index.copy()
+            shifted[:3, 3] += shifted[:3, :3] @ corner
+            sigma = density_grid(job.run.model, conditions, torch.from_numpy(shifted), shape, job.run.settings.threads).numpy()
+            values = sigma * np.float32(factor)
+            values[values < threshold] = 0.0
+            yield Grid.from_dense(name, values, lower=corner.tolist())
+
+
+def _errors(
+    job: ExportJob, source: VolumeSource, frame: _Frame, path: Path, scene_from_world: np.ndarray, factor: float
+) -> dict[str, float]:
+    """The model and the written file, each against the source, on the lattice of ``metrics.json``."""
+    assert frame.source is not None
+    matrix, shape = lattice(source.bounds)
+    truth = source.sigma(frame.source, matrix, shape)
+    both = agreement(truth, density_grid(job.run.model, frame.conditions, matrix, shape, job.run.settings.threads).numpy())
+    if both is None:
+        return {}
+    from scipy import ndimage
+
+    name = f"frame_{source.placement.numbers[frame.source]:04d}"
+    result = {f"{name}.correlation": both[0], f"{name}.relative_l2": both[1]}
+    grid = read_grid(path, str(job.options.get("name", "density")))
+    if grid.bounds is None:
+        return result
+    chain = np.linalg.inv(scene_from_world @ grid.transform) @ matrix.numpy()
+    points = chain[:3, :3] @ np.indices(shape, dtype=np.float64).reshape(3, -1) + chain[:3, 3:] - np.array(grid.bounds[0])[:, None]
+    found = ndimage.map_coordinates(grid.to_dense(), points, order=1, mode="grid-constant", cval=0.0).reshape(shape) / factor
+    written = agreement(truth, found)
+    assert written is not None
+    return {**result, f"{name}.file_correlation": written[0], f"{name}.file_relative_l2": written[1]}
+
+
+EXPORTER = Exporter(API_VERSION, "vdb", "the density as OpenVDB, one file per frame; lossy (sampled)", _write, OPTIONS, conditions=True)

@@ -1,0 +1,33 @@
+"""A run directory as plugins see it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from neuprim.core.extensions import TrainedModel
+from neuprim.core.files import cache_directory
+from neuprim.core.task import SceneContext
+from neuprim.core.volume_source import VolumeSource
+from neuprim.evaluate import load_dataset, load_run
+
+__all__ = ["trained_model"]
+
+Progress = Callable[[str, float], None]
+
+
+def trained_model(run_dir: Path, progress: Progress = lambda text, fraction: None) -> TrainedModel:
+    """The model of a run directory; its scene is loaded only when asked for.
+
+    Raises:
+        CheckpointError, ConfigError: naming the file that is missing or damaged.
+    """
+    config, task, model, header = load_run(run_dir)
+    for field in (model.density, model.colour):
+        field.set_progress(1.0)
+
+    def volume() -> VolumeSource | None:
+        load = task.scene(config.scene_name).volume
+        return load(config.scene, SceneContext(config.seed, cache_directory() / "scenes", progress)) if load else None
+
+    return TrainedModel(run_dir, task, model, header, config.scene, config.renderer, lambda: load_dataset(config, task, progress), volume)

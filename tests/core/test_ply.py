@@ -1,0 +1,111 @@
+"""PLY files: what is written comes back, what is damaged is refused, and nothing a header claims costs memory."""
+
+from __future__ import annotations
+
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from neuprim.core.errors import DataError
+from neuprim.core.ply import read_ply, write_ply
+
+ROWS = np.array([(1.5, -2, 250, 1e-300), (np.float32(0.1), 7, 3, 2.5)], [("x", "<f4"), ("count", "<i2"), ("red", "|u1"), ("mass", "<f8")])
+
+
+def test_every_type_comes_back_to_the_bit(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", ROWS, ["made here", "  two blanks"])
+    found = read_ply(tmp_path / "a.ply")
+    assert found.comments == ("made here", "  two blanks") and found.names == ("x", "count", "red", "mass")
+    assert found.rows.tobytes() == ROWS.tobytes()
+
+
+def test_other_programs_read_it(tmp_path: Path) -> None:
+    import trimesh
+
+    rows = np.zeros(4, [(n, "<f4") for n in "xyz"])
+    rows["x"], rows["y"], rows["z"] = np.arange(4), np.arange(4) * 2, np.arange(4) - 5
+    write_ply(tmp_path / "a.ply", rows, ['neuprim {"a": 1}'])
+    cloud = trimesh.load(tmp_path / "a.ply")
+    assert np.array_equal(np.asarray(cloud.vertices), np.stack([rows[n] for n in "xyz"], -1))
+
+
+def test_ascii_big_endian_and_lists_after_the_vertices(tmp_path: Path) -> None:
+    head = "element vertex 2\nproperty float x\nproperty uchar red\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "a.ply").write_text("ply\r\nformat ascii 1.0\r\ncomment hi\r\n" + head + "0.5 7\n-1e-3 255\n3 0 1 0\n")
+    found = read_ply(tmp_path / "a.ply")
+    assert found.rows["x"].tolist() == [0.5, np.float32(-1e-3)] and found.rows["red"].tolist() == [7, 255] and found.comments == ("hi",)
+    body = np.array([(0.5, 7), (-2, 255)], [("x", ">f4"), ("red", "u1")]).tobytes()
+    (tmp_path / "b.ply").write_bytes(("ply\nformat binary_big_endian 1.0\n" + head).encode() + body + b"\x03rest")
+    assert read_ply(tmp_path / "b.ply").rows["x"].tolist() == [0.5, -2.0]
+
+
+HEAD = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nend_header\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "end_header"),
+        ("obj\n", "expected a PLY file"),
+        ("ply\nformat binary_little_endian 1.0\n", "end_header"),
+        ("ply\n" + "comment x\n" * 600_000, "end_header in"),
+        (HEAD.format("binary_little_endian", 999_999_999_999), "bytes follow"),
+        (HEAD.format("ascii", 999_999_999_999), "bytes follow"),
+        (HEAD.format("ascii", -1), "expected a count"),
+        (HEAD.format("ascii", "٣"), "expected a count"),
+        (HEAD.format("ascii", 1) + "nothing\n", "not numbers"),
+        (HEAD.format("ascii", 2) + "1\n \n\n\n\n", "1 vertices"),
+        (HEAD.format("ascii", 1) + "1 2\n", "expected 1 of 1"),
+        (HEAD.format("msdos", 1), "expected format"),
+        ("ply\nelement vertex 1\nproperty float x\nend_header\n", "no format"),
+        ("ply\nformat ascii 1.0\nend_header\n", "no element vertex"),
+        ("ply\nformat ascii 1.0\nelement face 1\nend_header\n", "expected vertex"),
+        (HEAD.format("ascii", 1).replace("float x", "list uchar int x"), "scalar property"),
+        (HEAD.format("ascii", 1).replace("float x", "float x\nproperty float x"), "twice"),
+        (HEAD.format("ascii", 1).replace("float", "uchar") + "256\n", "outside its type"),
+        (HEAD.format("ascii", 1).replace("float", "uchar") + "nan\n", "outside its type"),
+    ],
+)
+def test_damage_is_named(tmp_path: Path, text: str, reason: str) -> None:
+    path = tmp_path / "bad.ply"
+    path.write_text(text)
+    tracemalloc.start()
+    with pytest.raises(DataError) as caught:
+        read_ply(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert reason in str(caught.value) and str(path) in str(caught.value)
+    assert peak < 50e6 + 10 * path.stat().st_size
+
+
+def test_a_missing_file_and_a_folder_are_no_bugs(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.ply", tmp_path):
+        with pytest.raises(DataError):
+            read_ply(path)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_no_bytes_break_it(tmp_path: Path, data: st.DataObject) -> None:
+    write_ply(tmp_path / "a.ply", ROWS, ["x"])
+    raw = bytearray((tmp_path / "a.ply").read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(raw) - 1))
+        kind = data.draw(st.sampled_from(["flip", "cut", "insert"]))
+        if kind == "flip":
+            raw[at] = data.draw(st.integers(0, 255))
+        elif kind == "cut":
+            del raw[at : at + data.draw(st.integers(1, 30))]
+        else:
+            raw[at:at] = data.draw(st.binary(max_size=12))
+        raw = raw or bytearray(b"p")
+    (tmp_path / "b.ply").write_bytes(bytes(raw))
+    try:
+        found = read_ply(tmp_path / "b.ply")
+    except DataError:
+        return
+    assert found.rows.nbytes <= 8 * len(raw)

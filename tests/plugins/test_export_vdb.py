@@ -1,0 +1,187 @@
+"""`neuprim export --format vdb`: voxels where the primitives are, in the units and on the voxels of the source."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neuprim.core.density_grid import density_grid
+from neuprim.core.errors import ConfigError
+from neuprim.core.vdb import Grid, read_grid
+from neuprim.exporting import export_run
+from neuprim.plugins.export import vdb as exporter
+from neuprim.trained import trained_model
+from tests.core.test_vdb_oracle import compare, environment, other_python
+from tests.plugins import marked
+
+
+def centre_of(grid: Grid, near: tuple[float, float, float], radius: float) -> np.ndarray:
+    """World position of the middle of what lies within ``radius`` of a place."""
+    assert grid.bounds is not None
+    dense, low = grid.to_dense(), np.array(grid.bounds[0])
+    where = np.argwhere(dense > 0)
+    world = (where + low) @ grid.transform[:3, :3].T + grid.transform[:3, 3]
+    close = np.linalg.norm(world - near, axis=1) < radius
+    assert close.any()
+    result: np.ndarray = world[close].mean(0)
+    return result
+
+
+@pytest.fixture(scope="module")
+def static(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return marked.static_run(tmp_path_factory.mktemp("runs") / "static")
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    return marked.dynamic_run(folder / "moving", marked.write_sequence(folder / "files"))
+
+
+def test_each_ball_is_where_it_belongs(static: Path, tmp_path: Path) -> None:
+    report = export_run(static, "vdb", tmp_path / "d.vdb", ["grid=160"])
+    grid = read_grid(report.files[0], "density")
+    assert not report.lossless and report.errors == {}
+    for place, radius in zip(marked.PLACES.tolist(), marked.RADII.tolist(), strict=True):
+        assert np.linalg.norm(centre_of(grid, tuple(place), radius + 0.03) - place) < 0.01
+    assert float(grid.background) == 0 and grid.metadata["neuprim_units"] == "world"
+    assert grid.active_voxels < 0.1 * np.prod([h - l for l, h in zip(*grid.bounds, strict=True)])
+
+
+def test_values_are_sigma_at_the_centres(static: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exporter, "_SLAB_BYTES", 4 * 8 * 64 * 16)  # many slabs
+    grid = read_grid(export_run(static, "vdb", tmp_path / "d.vdb", ["voxel_size=0.04", "threshold=1"]).files[0], "density")
+    low, high = grid.bounds or ((0,) * 3, (0,) * 3)
+    matrix = np.array(grid.transform)
+    assert np.array_equal(matrix, np.diag([0.04, 0.04, 0.04, 1]))
+    matrix[:3, 3] += matrix[:3, :3] @ np.array(low)
+    shape = tuple(h - l for l, h in zip(low, high, strict=True))
+    expected = density_grid(trained_model(static).model, {}, torch.from_numpy(matrix), shape).numpy()  # type: ignore[arg-type]
+    expected[expected < 1] = 0
+    assert expected.max() > 10 and np.allclose(grid.to_dense(), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_a_sequence_lies_on_the_voxels_of_its_files_and_in_their_units(moving: Path, tmp_path: Path) -> None:
+    report = export_run(moving, "vdb", tmp_path / "frames")
+    assert [p.name for p in report.files] == ["density_0003.vdb", "density_0004.vdb", "density_0005.vdb"]
+    run = trained_model(moving)
+    source = run.volume()
+    assert source is not None
+    world_from_scene = np.linalg.inv(source.placement.scene_from_world)
+    for i, path in enumerate(report.files):
+        grid = read_grid(path, "density")
+        assert np.allclose(grid.transform[:3, 3], marked.WORLD_SHIFT) and grid.voxel_size == (marked.WORLD_VOXEL,) * 3
+        assert grid.metadata["neuprim_units"] == "source" and grid.metadata["neuprim_time"] == pytest.approx(i / 2)
+        geometry, _ = run.model.lower_density({"time": torch.tensor(i / 2)})
+        first = world_from_scene[:3, :3] @ geometry.means[0].numpy() + world_from_scene[:3, 3]
+        index = np.rint((first - marked.WORLD_SHIFT) / marked.WORLD_VOXEL).astype(int)
+        place = torch.from_numpy(source.placement.scene_from_world @ grid.transform)
+        place[:3, 3] += place[:3, :3] @ torch.from_numpy(index).double()
+        sigma = float(density_grid(run.model, {"time": torch.tensor(i / 2)}, place, (1, 1, 1)))
+        value = float(grid.to_dense((tuple(index), tuple(index + 1)))[0, 0, 0])  # type: ignore[arg-type]
+        assert value > 0 and value * source.placement.sigma_per_unit == pytest.approx(sigma, rel=1e-4)
+
+
+def test_errors_are_those_of_the_runs_own_comparison(moving: Path, tmp_path: Path) -> None:
+    from neuprim.tasks.dynamic.volume.compare import compare_with_truth
+
+    report = export_run(moving, "vdb", tmp_path / "frames")
+    run = trained_model(moving)
+    expected = compare_with_truth(run.model, run.volume().shoot, [0.0, 0.5, 1.0])["sigma_frames"]  # type: ignore[union-attr]
+    assert len(expected) == 3
+    for entry in expected:
+        name = f"frame_{entry['frame']:04d}"
+        assert report.errors[f"{name}.correlation"] == entry["correlation"]
+        assert report.errors[f"{name}.relative_l2"] == entry["relative_l2"]
+        assert report.errors[f"{name}.file_correlation"] == pytest.approx(entry["correlation"], abs=0.05)
+
+
+def test_units_times_and_voxels_can_be_chosen(moving: Path, tmp_path: Path) -> None:
+    values = {}
+    for units in ("source", "world", "scene"):
+        report = export_run(moving, "vdb", tmp_path / units, ["time=0:1:5", f"units={units}", "grid=24", "name=smoke"])
+        assert [p.name for p in report.files] == [f"density_{i:04d}.vdb" for i in range(5)]
+        assert {k.split(".")[0] for k in report.errors} == {"frame_0003", "frame_0004", "frame_0005"}  # times 0, 1/2 and 1
+        grid = read_grid(report.files[2], "smoke")
+        assert grid.range is not None and grid.bounds is not None
+        values[units] = grid.range[1]
+    per_unit = trained_model(moving).volume().placement.sigma_per_unit  # type: ignore[union-attr]
+    scale = trained_model(moving).volume().placement.scene_from_world[0, 0]  # type: ignore[union-attr]
+    assert values["scene"] == pytest.approx(values["source"] * per_unit, rel=1e-5)
+    assert values["world"] == pytest.approx(values["scene"] * scale, rel=1e-5)
+    one = export_run(moving, "vdb", tmp_path / "one.vdb", ["time=0.5"])
+    assert one.files == (tmp_path / "one.vdb",)
+
+
+def test_without_the_files_the_header_still_places_it(tmp_path: Path) -> None:
+    files = marked.write_sequence(tmp_path / "files")
+    known = trained_model(marked.dynamic_run(tmp_path / "a", files)).volume()
+    assert known is not None
+    run = marked.dynamic_run(tmp_path / "b", files, world=known.placement.to_json())
+    with_files = export_run(run, "vdb", tmp_path / "with", ["voxel_size=0.25"])
+    files.rename(tmp_path / "elsewhere")
+    without = export_run(run, "vdb", tmp_path / "without", ["voxel_size=0.25"])
+    assert without.errors == {} and any("cannot be read" in note for note in without.notes)
+    for a, b in zip(with_files.files, without.files, strict=True):
+        one, two = read_grid(a, "density"), read_grid(b, "density")
+        assert np.array_equal(one.transform, two.transform) and np.array_equal(one.to_dense(), two.to_dense())
+    bare = marked.dynamic_run(tmp_path / "c", files)
+    with pytest.raises(ConfigError, match="time=: required"):
+        export_run(bare, "vdb", tmp_path / "bare")
+    assert export_run(bare, "vdb", tmp_path / "bare", ["time=0.5"]).errors == {}
+
+
+def test_files_are_not_replaced_unless_forced(moving: Path, tmp_path: Path) -> None:
+    export_run(moving, "vdb", tmp_path / "frames", ["time=0.5:1:2", "grid=8"])
+    with pytest.raises(ConfigError, match="--force"):
+        export_run(moving, "vdb", tmp_path / "frames", ["time=0:1:3", "grid=8"])
+    assert len(export_run(moving, "vdb", tmp_path / "frames", ["time=0:1:3", "grid=8"], overwrite=True).files) == 3
+
+
+def test_a_time_when_nothing_lives_is_an_empty_frame(tmp_path: Path) -> None:
+    run = marked.dynamic_run(tmp_path / "run", marked.write_sequence(tmp_path / "files"))
+    from safetensors.torch import load_file
+
+    from neuprim.core import checkpoint
+
+    tensors = load_file(run / "model.safetensors")
+    header = checkpoint.read_header(run / "model.safetensors", "model")
+    tensors["log_window"] -= 3.0
+    checkpoint.write(run / "model.safetensors", "model", tensors, {k: v for k, v in header.items() if k not in ("format", "kind")})
+    report = export_run(run, "vdb", tmp_path / "frames")
+    assert read_grid(report.files[0], "density").active_voxels == 0 and read_grid(report.files[1], "density").active_voxels > 0
+
+
+@pytest.mark.slow
+def test_openvdb_itself_reads_it(moving: Path, tmp_path: Path) -> None:
+    python = other_python()
+    for path in export_run(moving, "vdb", tmp_path / "frames").files:
+        (grid,) = compare(python, path, tmp_path)  # values, active voxels, transform and metadata
+        assert grid.active_voxels > 50 and grid.name == "density"
+
+
+@pytest.mark.slow
+def test_openvdb_agrees_on_a_place_in_the_world(static: Path, tmp_path: Path) -> None:
+    """The marked corner, found by OpenVDB's own transform."""
+    path = export_run(static, "vdb", tmp_path / "d.vdb", ["grid=100"]).files[0]
+    code = f"""
+import json
+try:
+    import openvdb
+except ImportError:
+    import pyopenvdb as openvdb
+grid = openvdb.read({str(path)!r}, 'density')
+acc = grid.getConstAccessor()
+found = []
+for p in {marked.PLACES.tolist()!r}:
+    found.append(acc.getValue(tuple(round(v) for v in grid.transform.worldToIndex(tuple(p)))))
+print(json.dumps(found))
+"""
+    done = subprocess.run([other_python(), "-c", code], capture_output=True, text=True, timeout=300, env=environment())
+    assert done.returncode == 0, done.stderr
+    assert all(v > 10 for v in json.loads(done.stdout))

@@ -179,6 +179,10 @@ class Dataset(ABC):
         """Further JSON-able numbers for ``metrics.json`` that only this kind of data can tell."""
         return {}
 
+    def facts(self) -> dict[str, Any]:
+        """JSON-able facts that drawing the model may need when the data are gone; kept in the model's header under "data"."""
+        return {"up": [float(x) for x in self.up], "center": [float(x) for x in self.center]}
+
     def orbit(self, frames: int) -> list[View]:
         """Views circling the scene at the training cameras' mean distance and elevation."""
         cameras = [self.train.view(i).camera for i in range(len(self.train))]

@@ -2,10 +2,14 @@
 
     python benchmarks/relight_environment.py RUN_DIR [--lights 16 64 256] [--views N] [--record] [--picture FILE.png] [--keep DIR]
 
-"same lights": the model's image against the ray-cast sum over the very point lights that stand for the environment, so that only the model
-is wrong. "distant": against 1024 lights at 1e4 units, so that their number and their finite distance count too. "lights alone": the ray
-caster under the few lights against the distant ones, what a perfect model would score. PSNR of linear light clamped to 0..1, means over
-views of the test split. --record writes the table to docs/relighting.md, --keep the environments as OpenEXR files.
+- same lights: the model's image against the ray-cast sum over the very point lights that stand for the environment, so that only the
+  model is wrong;
+- seen lights: both without the lights more than 15 degrees off every training light;
+- distant: against 1024 lights at 1e4 units, so that the lights' number and finite distance count too;
+- lights alone: the ray caster under the few lights against the distant ones, what a perfect model would score there.
+
+PSNR of linear light clamped to 0..1, means over views of the test split. --record writes the table to docs/relighting.md, --keep the
+environments as OpenEXR files.
 """
 
 from __future__ import annotations
@@ -21,6 +25,7 @@ from tables import ROOT, Table, between_markers
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.data import View
 from neuprim.core.environment import Environment
 from neuprim.core.images import write_exr, write_png
 from neuprim.core.metrics import psnr
@@ -33,6 +38,7 @@ from neuprim.tasks.relight.lit.scene import solids
 
 PAGE = ROOT / "docs" / "relighting.md"
 MANY, DISTANT = 1024, 1e4
+PIXELS = 176  # of one image in the picture
 
 
 def directions(height: int) -> Tensor:
@@ -78,7 +84,7 @@ def main() -> None:
     parser.add_argument("--lights", type=int, nargs="*", default=[16, 64, 256])
     parser.add_argument("--views", type=int, default=3)
     parser.add_argument("--record", action="store_true", help="write the table to docs/relighting.md")
-    parser.add_argument("--picture", type=Path, help="truth above, model below, one column per environment")
+    parser.add_argument("--picture", type=Path, help="environment; truth and model under those of 64 lights that are near trained ones")
     parser.add_argument("--keep", type=Path, help="write the environments here")
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -87,7 +93,7 @@ def main() -> None:
     far = {**facts, "lights": {**facts["lights"], "distance": DISTANT}}
     step = max(len(dataset.test) // args.views, 1)
     views = [dataset.test.view(i) for i in range(0, len(dataset.test), step)][: args.views]
-    table = Table("environment", "lights", "same lights", "distant", "lights alone", "seconds per image")
+    table = Table("environment", "lights", "same lights", "seen lights", "distant", "lights alone", "seconds per image")
     columns = []
     for name, radiance in environments().items():
         if args.keep:
@@ -104,14 +110,23 @@ def main() -> None:
                 drawn = draw_sum(model, view, lights, config.renderer, torch.zeros(3)).double()
                 seconds += time.perf_counter() - start
                 cast = truth(scene, view.camera, lights, 2)
-                pairs = ((drawn, cast), (drawn, reference), (cast, reference))
+                seen = list(around.frames(False))
+                fair = draw_sum(model, view, seen, config.renderer, torch.zeros(3)).double(), truth(scene, view.camera, seen, 2)
+                pairs = ((drawn, cast), fair, (drawn, reference), (cast, reference))
                 scores.append([psnr(a.clamp(0, 1), b.clamp(0, 1)) for a, b in pairs])
-                if view is views[0] and count == (64 if 64 in args.lights else args.lights[-1]):
-                    columns.append(torch.cat([display(x.float(), "linear").clamp(0, 1) for x in (cast, drawn)]))
             means = [f"{x:.2f} dB" for x in np.mean(scores, axis=0)]
             table.row(name, len(lights), *means, f"{seconds / len(views):.2f}")
             for note in around.notes:
                 print(f"  {note}")
+        if args.picture:
+            camera = views[-1].camera.resized(PIXELS, PIXELS)
+            around = illuminate(environment, 64, facts)
+            lights = list(around.frames(False))
+            drawn = draw_sum(model, View("picture", camera), lights, config.renderer, torch.zeros(3))
+            planes = radiance.clamp(0, 1).movedim(-1, 0)[None]
+            small = torch.nn.functional.interpolate(planes, size=(PIXELS // 2, PIXELS), mode="bilinear", antialias=True)[0].movedim(0, -1)
+            images = [small, truth(scene, camera, lights, 3).float(), drawn]
+            columns.append(torch.cat([display(x, "linear").clamp(0, 1) for x in images]))
     if args.picture:
         write_png(args.picture, torch.cat(columns, 1))
     if args.record:

@@ -22,6 +22,8 @@ def add_environment_flags(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--environment-samples", type=_count, metavar="N", help="lights that stand for it (default: 64)")
     group.add_argument("--environment-rotation", type=_degrees, metavar="DEG", help="anticlockwise about up, seen from above (default: 0)")
     group.add_argument("--environment-scale", type=_factor, metavar="X", help="multiplies its radiance (default: 1)")
+    unseen = "light from where the model never saw any: draw what it guesses, or leave it out (default: keep)"
+    group.add_argument("--environment-unseen", choices=("keep", "drop"), help=unseen)
 
 
 def environment_of(args: argparse.Namespace) -> EnvironmentFile | None:
@@ -30,7 +32,7 @@ def environment_of(args: argparse.Namespace) -> EnvironmentFile | None:
     Raises:
         ConfigError: one of the others without it.
     """
-    settings = {name: getattr(args, f"environment_{name}") for name in ("samples", "rotation", "scale")}
+    settings = {name: getattr(args, f"environment_{name}") for name in ("samples", "rotation", "scale", "unseen")}
     settings = {name: value for name, value in settings.items() if value is not None}
     if args.environment is None:
         if settings:
@@ -38,7 +40,8 @@ def environment_of(args: argparse.Namespace) -> EnvironmentFile | None:
         return None
     from neuprim.core.environment import EnvironmentFile
 
-    return EnvironmentFile(args.environment, **settings)
+    guesses = settings.pop("unseen", "keep") == "keep"
+    return EnvironmentFile(args.environment, **settings, guesses=guesses)
 
 
 def _count(text: str) -> int:

@@ -97,9 +97,12 @@ def render_run(
     lights: Sequence[Conditions] = ()
     if environment is not None:
         around = _illumination(environment, config, task, header, conditions)
-        lights = around.conditions
+        lights = around.frames(environment.guesses)
+        if not lights:
+            raise ConfigError(f"--environment-unseen drop: all light of {environment.path} comes from where the model never saw any")
+        hint = " (--environment-unseen drop leaves it out)" if environment.guesses and any(around.guessed) else ""
         for note in around.notes:
-            tell(f"{environment.path}: {note}")
+            tell(f"{environment.path}: {note}{hint}")
     if camera.endswith(".json"):
         views = [View(name, c) for name, c in read_cameras(Path(camera), size)]
     else:

@@ -43,12 +43,14 @@ class EnvironmentFile:
         samples: number of lights that stand for it.
         rotation: degrees about the scene's upward direction.
         scale: multiplies the radiance.
+        guesses: whether light from directions that the model never saw counts.
     """
 
     path: Path
     samples: int = 64
     rotation: float = 0.0
     scale: float = 1.0
+    guesses: bool = True
 
 
 @dataclass(frozen=True)
@@ -71,10 +73,18 @@ class Illumination:
     Attributes:
         conditions: of each frame, one or more; they replace the view's own of the same names.
         notes: one line each, for the user.
+        guessed: of each frame, whether its light comes from where the model never saw any; empty if none does.
     """
 
     conditions: tuple[dict[str, Tensor], ...]
     notes: tuple[str, ...] = ()
+    guessed: tuple[bool, ...] = ()
+
+    def frames(self, guesses: bool) -> tuple[dict[str, Tensor], ...]:
+        """The conditions, without the guessed ones unless ``guesses``; none may be left."""
+        if guesses or not any(self.guessed):
+            return self.conditions
+        return tuple(c for c, guess in zip(self.conditions, self.guessed, strict=True) if not guess)
 
 
 class Environment:

@@ -95,5 +95,6 @@ def illuminate(environment: Environment, count: int, facts: Mapping[str, Any]) -
             ({"light": (center + distance * up).float(), "light_intensity": torch.zeros(3)},), ("the environment is black",)
         )
     unseen = environment.share_beyond(trained, FAR)
+    guessed = ((beams.directions @ trained.T).amax(1) < math.cos(math.radians(FAR))).tolist()
     far = f"{unseen:.0%} of the environment's light comes from more than {FAR:g} degrees off every training light, where the model guesses"
-    return Illumination(tuple(frames), (far,) if unseen > 0.01 else ())
+    return Illumination(tuple(frames), (far,) if unseen > 0.01 else (), tuple(guessed))

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import time
 from pathlib import Path
 
 import numpy as np
@@ -93,7 +92,7 @@ def main() -> None:
     far = {**facts, "lights": {**facts["lights"], "distance": DISTANT}}
     step = max(len(dataset.test) // args.views, 1)
     views = [dataset.test.view(i) for i in range(0, len(dataset.test), step)][: args.views]
-    table = Table("environment", "lights", "same lights", "seen lights", "distant", "lights alone", "seconds per image")
+    table = Table("environment", "lights", "same lights", "seen lights", "distant", "lights alone")
     columns = []
     for name, radiance in environments().items():
         if args.keep:
@@ -104,18 +103,16 @@ def main() -> None:
         for count in args.lights:
             around = illuminate(environment, count, facts)
             lights = list(around.conditions)
-            scores, seconds = [], 0.0
+            scores = []
             for view, reference in zip(views, distant, strict=True):
-                start = time.perf_counter()
                 drawn = draw_sum(model, view, lights, config.renderer, torch.zeros(3)).double()
-                seconds += time.perf_counter() - start
                 cast = truth(scene, view.camera, lights, 2)
                 seen = list(around.frames(False))
                 fair = draw_sum(model, view, seen, config.renderer, torch.zeros(3)).double(), truth(scene, view.camera, seen, 2)
                 pairs = ((drawn, cast), fair, (drawn, reference), (cast, reference))
                 scores.append([psnr(a.clamp(0, 1), b.clamp(0, 1)) for a, b in pairs])
             means = [f"{x:.2f} dB" for x in np.mean(scores, axis=0)]
-            table.row(name, len(lights), *means, f"{seconds / len(views):.2f}")
+            table.row(name, len(lights), *means)
             for note in around.notes:
                 print(f"  {note}")
         if args.picture:

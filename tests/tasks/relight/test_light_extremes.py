@@ -17,14 +17,15 @@ from neuprim.core.render import RenderSettings, render
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer, initial_model
 from neuprim.tasks.relight.colour import LightNetwork
+from neuprim.tasks.relight.directions import unit
 from neuprim.tasks.relight.harmonics import LightHarmonics
 from neuprim.tasks.relight.loss import LOSSES, hdr_loss
-from neuprim.tasks.relight.visibility import light_visibility
 from tests import scenes
 from tests.core import tiny
 from tests.numerics.compare import row_errors, undecided, weights
 
 COUNT = 20
+UNSHADOWED, SHADOWED = False, True  # LightNetwork's ``visibility``
 
 
 def model(field: LightNetwork | LightHarmonics, dtype: torch.dtype = torch.float32) -> Primitives:
@@ -68,7 +69,7 @@ def test_kernels_equal_float64_under_any_light(form: str, falloff: bool, name: s
         field: LightNetwork | LightHarmonics = LightHarmonics(3, 3, falloff)
     else:
         hidden, kind = (0, "additive") if form == "H=0" else (5, form)
-        field = LightNetwork(hidden, form=kind, visibility=False, falloff=falloff)
+        field = LightNetwork(hidden, form=kind, visibility=UNSHADOWED, falloff=falloff)
     fast, slow = model(field), model(field, torch.float64)
     where = LIGHTS[name] + (fast.params["means"][3].detach() if name == "near a centre" else 0)
     power = float(where.norm().square()) if falloff else 1.0  # so that something is seen
@@ -91,7 +92,7 @@ def test_kernels_equal_float64_under_any_light(form: str, falloff: bool, name: s
         assert float(row_errors(grads[0][key], expected).max()) < 1e-3, key
 
 
-@pytest.mark.parametrize("visibility", [False, True])
+@pytest.mark.parametrize("visibility", [UNSHADOWED, SHADOWED])
 @pytest.mark.parametrize("falloff", [False, True])
 @pytest.mark.parametrize("distance", [1e6, 1e12, 1e18])
 def test_lights_at_infinity_have_finite_gradients(distance: float, falloff: bool, visibility: bool) -> None:
@@ -104,7 +105,7 @@ def test_lights_at_infinity_have_finite_gradients(distance: float, falloff: bool
 
 
 def test_a_distant_light_is_a_direction() -> None:
-    m = model(LightNetwork(4, visibility=False))
+    m = model(LightNetwork(4, visibility=UNSHADOWED))
     images = []
     for distance in (1e6, 1e9, 1e18):
         c = {"light": distance * torch.tensor([0.6, -0.3, 0.7]), "light_intensity": torch.ones(3)}
@@ -114,12 +115,33 @@ def test_a_distant_light_is_a_direction() -> None:
     assert all(torch.allclose(images[0], other, atol=2e-5) for other in images[1:])
 
 
-def test_visibility_is_a_share_for_every_light() -> None:
-    m = model(LightNetwork(0, visibility=False))
-    lowered = m.lower(scenes.camera(), {"light": torch.zeros(3), "light_intensity": torch.ones(3)})
-    for where in (*LIGHTS.values(), torch.zeros(3), m.params["means"][3].detach(), m.params["means"].detach().mean(0)):
-        found = light_visibility(lowered.geometry, lowered.density, where)
-        assert found.shape == (COUNT,) and bool(((found >= 0) & (found <= 1)).all()), where
+def test_shadows_only_darken_whatever_the_light() -> None:
+    shadowed, plain = (model(LightNetwork(0, visibility=v)) for v in (SHADOWED, UNSHADOWED))
+    for where in (*LIGHTS.values(), torch.zeros(3), plain.params["means"][3].detach(), plain.params["means"].detach().mean(0)):
+        c = {"light": where, "light_intensity": torch.ones(3)}
+        with torch.no_grad():
+            dark, bright = (render(m, scenes.camera(33, 25), c).rgb for m in (shadowed, plain))
+        assert bright.max() > 0.2 and bool(((dark >= 0) & (dark <= bright + 1e-6)).all()), where
+
+
+def test_directions_at_zero_and_at_infinity() -> None:
+    v = torch.tensor([[0.0, 0, 0], [1e-30, 0, 0], [1e-6, 0, 0], [3.0, 4.0, 0.0], [3e30, 4e30, 0.0], [0.0, -1e38, 0.0]]).requires_grad_()
+    found = unit(v)
+    assert torch.allclose(found, torch.tensor([[0.0, 0, 0], [0, 0, 0], [1, 0, 0], [0.6, 0.8, 0], [0.6, 0.8, 0], [0, -1, 0]]), atol=1e-6)
+    (found * torch.tensor([1.0, -2.0, 3.0])).sum().backward()
+    assert v.grad is not None and bool(torch.isfinite(v.grad).all()) and float(v.grad.abs().max()) < 1e7
+    w = torch.randn(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    assert torch.autograd.gradcheck(unit, (w,))
+
+
+def test_harmonics_know_the_direction_of_any_light() -> None:
+    m = model(LightHarmonics(3, 3))
+    with torch.no_grad():
+        near, far = (
+            render(m, scenes.camera(), {"light": d * torch.tensor([0.6, -0.3, 0.7]), "light_intensity": torch.ones(3)}).rgb
+            for d in (1e6, 1e30)
+        )
+    assert near.max() > 0.1 and torch.allclose(near, far, atol=2e-5)
 
 
 # ---------------------------------------------------------------- losses
@@ -184,7 +206,7 @@ def fit(
     dataset = tiny.TwoPrimitives()
     dataset.train = Lit(6, 0.0, change, intensity)
     dataset.background, dataset.color_space = torch.zeros(3), "linear"
-    field = LightNetwork(3, visibility=False)
+    field = LightNetwork(3, visibility=UNSHADOWED)
     first = start or initial_model(CosineDensity(2), field, dataset, ModelSettings(primitives=12, neurons=2), 0)
     settings = TrainSettings(iterations=iterations, population=PopulationSettings(strategy="fixed"))
     trainer = Trainer(first, dataset, hdr_loss({"options": {"loss": loss}}), settings, RenderSettings(backend="reference"), 0)

@@ -33,6 +33,7 @@ from neuprim.tasks.relight.lit.scene import solids
 from neuprim.tasks.relight.lit.shading import shade
 from tests import scenes
 
+UNSHADOWED = False  # LightNetwork's ``visibility``
 SETTINGS = RenderSettings(backend="reference")
 
 
@@ -51,7 +52,7 @@ def texel(row: int = 5, column: int = 9, height: int = 16) -> Tensor:
 
 
 def some_model() -> Primitives:
-    field = LightNetwork(3, visibility=False, falloff=True)
+    field = LightNetwork(3, visibility=UNSHADOWED, falloff=True)
     g = torch.Generator().manual_seed(5)
     t = {k: v for k, v in scenes.tensors(12, 2, seed=3).items() if k != "colors"}
     t |= {s.name: 0.5 * torch.randn((12, *s.shape), generator=g) for s in field.parameters()}
@@ -91,7 +92,7 @@ def test_a_white_sky_shows_albedo() -> None:
 @pytest.mark.parametrize("count", [1, 5, 64])
 def test_energy_through_the_model_for_any_number_of_lights(count: int) -> None:
     """A constant colour c at the lights' centre receives all of the energy: 4 pi c under white."""
-    field = LightNetwork(0, visibility=False, falloff=True)
+    field = LightNetwork(0, visibility=UNSHADOWED, falloff=True)
     t = {k: v[:1] for k, v in scenes.tensors(1, 1).items() if k != "colors"}
     t |= {"means": torch.tensor([[0.1, 0.2, 0.3]]), "c_dc": torch.tensor([[0.3, 0.2, 0.1]])}
     t |= {s.name: torch.zeros(1, *s.shape) for s in field.parameters() if s.name != "c_dc"}

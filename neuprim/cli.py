@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from neuprim import __version__
 from neuprim.core.errors import ConfigError, NeuprimError, nearest
+from neuprim.environment_flags import add_environment_flags, environment_of
 
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
@@ -97,7 +98,8 @@ def _dispatch(words: list[str]) -> int:
         args.overrides += [word for word in rest if not word.startswith("-")]  # argparse gives up on words after a flag
         rest = [word for word in rest if word.startswith("-")]
     if args.command == "render":
-        args.conditions, rest = _conditions(args.run_dir, rest)
+        own = [flag for flag in commands["render"]._option_string_actions if flag.startswith("--")]
+        args.conditions, rest = _conditions(args.run_dir, rest, own)
     if rest:
         known = [flag for flag in commands[args.command]._option_string_actions if flag.startswith("--")]
         raise ConfigError(f"{rest[0]}: no such argument of `neuprim {args.command}`{nearest(rest[0], known)}")
@@ -137,6 +139,7 @@ def _parsers(with_tasks: bool) -> tuple[Parser, dict[str, argparse.ArgumentParse
     render.add_argument("--fps", type=_rate, metavar="F", help="frames per second of an animation (default: about four seconds in all)")
     render.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
     render.add_argument("--frames", type=_count, default=60, metavar="N", help="frames of an orbit (default: 60)")
+    add_environment_flags(render)
 
     export = command("export", _export, "write a run's model in another format", "Formats and their options: docs/export.md.")
     export.add_argument("run_dir", type=Path, metavar="RUN_DIR")
@@ -211,9 +214,19 @@ def _render(args: argparse.Namespace) -> int:
             raise ConfigError(f"--camera {args.camera}: expected orbit, test or a .json file")
         if not Path(args.camera).is_file():
             raise ConfigError(f"--camera {args.camera}: no such file")
-    from neuprim.evaluate import render_run
+    environment = environment_of(args)
+    from rich.console import Console
 
-    paths = render_run(run_dir, args.camera, args.size, args.format, args.out, args.frames, args.conditions, args.fps)
+    from neuprim.evaluate import render_run
+    from neuprim.progress import DrawProgress
+
+    with DrawProgress(Console(stderr=True)) as progress:
+        paths = render_run(
+            *(run_dir, args.camera, args.size, args.format, args.out, args.frames, args.conditions, args.fps),
+            environment=environment,
+            tell=progress.note,
+            progress=progress.show,
+        )
     for path in paths:
         print(path)
     return 0
@@ -265,8 +278,11 @@ def _doctor(args: argparse.Namespace) -> int:
 # ---------------------------------------------------------------- arguments
 
 
-def _conditions(run_dir: Path, words: list[str]) -> tuple[dict[str, str], list[str]]:
-    """Condition name -> text, from the flags that the run's task defines, and the words that are none of them."""
+def _conditions(run_dir: Path, words: list[str], own: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """Condition name -> text, from the flags that the run's task defines, and the words that are none of them.
+
+    ``own``: flags of the command itself, to suggest where a word is none of either.
+    """
     if not words:
         return {}, []
     from neuprim.config import RunConfig
@@ -278,7 +294,7 @@ def _conditions(run_dir: Path, words: list[str]) -> tuple[dict[str, str], list[s
         parser.add_argument("--" + condition.name.replace("_", "-"), dest=condition.name)
     args, rest = parser.parse_known_args(words)
     if rest:
-        flags = ["--camera", "--size", "--format", "--fps", "--out", "--frames", *parser._option_string_actions]
+        flags = [*own, *parser._option_string_actions]
         raise ConfigError(f"{rest[0]}: no such argument of `neuprim render` for task {spec.name!r}{nearest(rest[0], flags)}")
     return {name: text for name, text in vars(args).items() if text is not None}, []
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,15 @@ from neuprim.core import images
 from neuprim.core.camera_file import read_cameras
 from neuprim.core.checkpoint import load_model
 from neuprim.core.data import Dataset, View
+from neuprim.core.datasets.records import Record
+from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
 from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.fields import Conditions
 from neuprim.core.files import cache_directory
 from neuprim.core.film import write_film
 from neuprim.core.primitives import Primitives
 from neuprim.core.task import SceneContext, TaskSpec
-from neuprim.measure import display, draw, measure, summary
+from neuprim.measure import display, draw, draw_sum, measure, summary
 from neuprim.plugins.registry import find_scene, load_task
 
 __all__ = ["FORMATS", "evaluate_run", "load_dataset", "load_run", "read_metrics", "render_run"]
@@ -68,6 +71,9 @@ def render_run(
     frames: int,
     conditions: Mapping[str, str],
     fps: float | None = None,
+    environment: EnvironmentFile | None = None,
+    tell: Callable[[str], None] = lambda text: None,
+    progress: Callable[[str, float], None] = lambda text, fraction: None,
 ) -> list[Path]:
     """Draw a run's model: ``camera`` is "orbit", "test" or a JSON file of cameras (see :mod:`neuprim.core.camera_file`).
 
@@ -77,6 +83,9 @@ def render_run(
     Args:
         conditions: name -> text, e.g. ``{"time": "0:1"}``.
         fps: of an animation; None lets it last four seconds, at 5 to 30 frames per second.
+        environment: light from all around instead of the task's light.
+        tell: called with lines for the user, e.g. what the model never saw.
+        progress: called with (text, fraction 0..1) while images are drawn.
 
     Raises:
         DataError, ConfigError, CheckpointError: bad cameras, conditions, or run directory.
@@ -85,6 +94,15 @@ def render_run(
     config, task, model, header = load_run(run_dir)
     background = torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)])
     color_space = str(header.get("color_space", "srgb"))
+    lights: Sequence[Conditions] = ()
+    if environment is not None:
+        around = _illumination(environment, config, task, header, conditions)
+        lights = around.frames(environment.guesses)
+        if not lights:
+            raise ConfigError(f"--environment-unseen drop: all light of {environment.path} comes from where the model never saw any")
+        hint = " (--environment-unseen drop leaves it out)" if environment.guesses and any(around.guessed) else ""
+        for note in around.notes:
+            tell(f"{environment.path}: {note}{hint}")
     if camera.endswith(".json"):
         views = [View(name, c) for name, c in read_cameras(Path(camera), size)]
     else:
@@ -92,6 +110,8 @@ def render_run(
         views = dataset.orbit(frames) if camera == "orbit" else [dataset.test.view(i) for i in range(len(dataset.test))]
     if size is not None:
         views = [replace(v, camera=v.camera.resized(*size)) for v in views]
+    if lights:  # these replace the views' own; the first stands for all where only their presence counts
+        views = [replace(v, conditions={**v.conditions, **lights[0]}) for v in views]
     views, animated = with_conditions(views, task, conditions)
     format = format or _format_of(out, animated)
 
@@ -102,27 +122,61 @@ def render_run(
         raise ConfigError(
             f"--out {out}: {len(views)} views do not fit one .{format} file; give a folder, or --format webp for an animation"
         )
+    done = 0
+
+    def image(view: View) -> torch.Tensor:
+        def drawn() -> None:
+            nonlocal done
+            done += 1
+            progress(f"view {done // each + (done % each > 0)} of {len(views)}", done / (each * len(views)))
+
+        each = max(len(lights), 1)
+        if lights:
+            return draw_sum(model, view, lights, config.renderer, background, drawn)
+        result = draw(model, view, config.renderer, background)
+        drawn()
+        return result
+
     if animate:
         target = out if single and out is not None else folder.with_suffix(f".{format}")
         target.parent.mkdir(parents=True, exist_ok=True)
-        stack = [display(draw(model, v, config.renderer, background), color_space) for v in views]
+        stack = [display(image(v), color_space) for v in views]
         write_film(target, stack, fps or min(30.0, max(len(views) / 4.0, 5.0)))
         return [target]
     paths = []
     for v in views:
         path = out if single and out is not None else folder / f"{_file_name(v.name)}.{format}"
         path.parent.mkdir(parents=True, exist_ok=True)
-        image = draw(model, v, config.renderer, background)
+        pixels = image(v)
         if format == "exr":
-            images.write_exr(path, image if color_space == "linear" else images.srgb_to_linear(image.clamp_min(0.0)), half=False)
+            images.write_exr(path, pixels if color_space == "linear" else images.srgb_to_linear(pixels.clamp_min(0.0)), half=False)
         elif format == "png":
-            images.write_png(path, display(image, color_space))
+            images.write_png(path, display(pixels, color_space))
         elif format == "webp":
-            images.write_webp(path, display(image, color_space))
+            images.write_webp(path, display(pixels, color_space))
         else:
-            write_film(path, [display(image, color_space)], fps or 12.0)
+            write_film(path, [display(pixels, color_space)], fps or 12.0)
         paths.append(path)
     return paths
+
+
+def _illumination(
+    choice: EnvironmentFile, config: RunConfig, task: TaskSpec, header: Mapping[str, Any], conditions: Mapping[str, str]
+) -> Illumination:
+    """The frames that stand for an environment."""
+    if task.environment is None:
+        raise ConfigError(f"--environment {choice.path}: task {task.name!r} has no light that it could replace")
+    facts = header.get("data")
+    if facts is None:  # written before models kept them
+        facts = load_dataset(config, task).facts()
+    if not isinstance(facts, dict):
+        raise DataError(f"the model's header: data is {type(facts).__name__}; expected an object")
+    up = Record(facts, "the model's header: data").array("up", (3,), "3 numbers")
+    found = task.environment(read_environment(choice.path, up, choice.rotation, choice.scale), choice.samples, facts)
+    clash = sorted(conditions.keys() & found.conditions[0].keys())
+    if clash:
+        raise ConfigError(f"--{clash[0].replace('_', '-')} and --environment: give one of them")
+    return found
 
 
 def _format_of(out: Path | None, animated: bool) -> str:

@@ -21,11 +21,12 @@ import neuprim
 from neuprim.config import RunConfig
 from neuprim.core import images
 from neuprim.core.data import Dataset, View
+from neuprim.core.fields import Conditions
 from neuprim.core.metrics import means, psnr, ssim, to_json
 from neuprim.core.primitives import Primitives
 from neuprim.core.render import RenderSettings, choose_backend, render
 
-__all__ = ["ViewMetrics", "display", "draw", "measure", "summary"]
+__all__ = ["ViewMetrics", "display", "draw", "draw_sum", "measure", "summary"]
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,31 @@ def draw(model: Primitives, view: View, settings: RenderSettings, background: Te
     """(H, W, C) image of one view, without gradients."""
     with torch.no_grad():
         return render(model, view.camera, view.conditions, settings, background).rgb
+
+
+def draw_sum(
+    model: Primitives,
+    view: View,
+    lights: Sequence[Conditions],
+    settings: RenderSettings,
+    background: Tensor,
+    drawn: Callable[[], None] = lambda: None,
+) -> Tensor:
+    """(H, W, C) sum of one view's images under conditions that change light alone, over the background once; without gradients.
+
+    Exact for what is linear in light, as opacity does not depend on it. Sums are float64.
+
+    Args:
+        lights: one or more; each replaces the view's conditions of the same names.
+        drawn: called after every image.
+    """
+    total, alpha = torch.zeros(()), torch.zeros(())
+    for light in lights:
+        with torch.no_grad():
+            frame = render(model, view.camera, {**view.conditions, **light}, settings)
+        total, alpha = total + frame.rgb.double(), frame.alpha
+        drawn()
+    return (total + (1.0 - alpha.double())[..., None] * background.double()).to(frame.rgb)
 
 
 def display(image: Tensor, color_space: str) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from types import TracebackType
 
 from rich.console import Console
@@ -9,7 +10,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from neuprim.core.train.trainer import StepReport
 
-__all__ = ["RunProgress"]
+__all__ = ["DrawProgress", "RunProgress"]
 
 
 class RunProgress:
@@ -75,3 +76,39 @@ class RunProgress:
         self.bar.update(self.task, completed=1.0, info=text)
         if not self.live:
             self.note(text)
+
+
+class DrawProgress:
+    """Context manager around the drawing of images: a bar on a terminal that is gone afterwards, a line now and then elsewhere."""
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.live = console.is_terminal
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f}%"),
+            TextColumn("eta"),
+            TimeRemainingColumn(),
+        )
+        self.bar = Progress(*columns, console=console, transient=True, disable=not self.live)
+        self.task: TaskID = self.bar.add_task("", total=1.0)
+        self._started = time.monotonic()
+
+    def __enter__(self) -> DrawProgress:
+        self.bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.bar.stop()
+
+    def note(self, text: str) -> None:
+        """A line that stays."""
+        self.console.print(f"neuprim: {text}", highlight=False, soft_wrap=True, markup=False)
+
+    def show(self, text: str, fraction: float) -> None:
+        """How far it is; without a terminal, every half a minute."""
+        self.bar.update(self.task, description=text, completed=fraction)
+        if not self.live and fraction < 1.0 and time.monotonic() > self._started + 30.0:
+            self._started = time.monotonic()
+            self.note(f"{text}, {fraction:.0%}")

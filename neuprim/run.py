@@ -143,6 +143,7 @@ def _save(trainer: Trainer, config: RunConfig, dataset: Dataset) -> None:
         "background": [float(x) for x in dataset.background],
         "color_space": dataset.color_space,
         "data_source": dataset.data_source,
+        "data": dataset.facts(),
         "iterations": trainer.step,
         "train_seconds": trainer.elapsed,
     }

@@ -10,6 +10,7 @@ import pytest
 import neuprim
 from neuprim.cli import _print_metrics, main
 from neuprim.config import RunConfig
+from neuprim.core.environment import EnvironmentFile
 from neuprim.core.errors import DataError, NonFiniteError
 from tests.plugins.fakes import install, site, toy
 
@@ -31,8 +32,8 @@ def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         made.append(run_dir)
         return {"psnr": 31.23456, "views": 20, "worst": {"name": "r_3", "psnr": 27.0}}
 
-    def render_run(*args: Any) -> list[Path]:
-        made.append(args)
+    def render_run(*args: Any, environment: Any = None, tell: Any = None, progress: Any = None) -> list[Path]:
+        made.append(args if environment is None else (*args, environment))
         return [Path("a.png"), Path("b.png")]
 
     for name, functions in (("run", {"run": run}), ("evaluate", {"evaluate_run": evaluate_run, "render_run": render_run})):
@@ -192,6 +193,9 @@ def test_render(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     flags = ["--camera", "cams.json", "--size", "640x480", "--format", "exr", "--out", "o", "--frames", "3", "--fps", "12"]
     assert main(["render", "r", *flags, "--time", "0:1", "--light-pos=-1,0,2"]) == 0
     assert calls[-1] == (Path("r"), "cams.json", (640, 480), "exr", Path("o"), 3, {"time": "0:1", "light_pos": "-1,0,2"}, 12.0)
+    flags = ["--camera", "orbit", "--environment", "sky.exr", "--environment-samples", "9", "--environment-rotation=-45"]
+    assert main(["render", "r", *flags]) == 0
+    assert calls[-1][-1] == EnvironmentFile(Path("sky.exr"), 9, -45.0, 1.0)
 
 
 def test_render_knows_the_conditions_of_the_runs_task(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:

@@ -190,6 +190,10 @@ class Dataset(ABC):
         """How scene units follow from the world of the voxel files that the scene was made from; None without such files."""
         return None
 
+    def facts(self) -> dict[str, Any]:
+        """JSON-able facts that drawing the model may need when the data are gone; kept in the model's header under "data"."""
+        return {"up": [float(x) for x in self.up], "center": [float(x) for x in self.center]}
+
     def orbit(self, frames: int) -> list[View]:
         """Views circling the scene at the training cameras' mean distance and elevation."""
         cameras = [self.train.view(i).camera for i in range(len(self.train))]

@@ -10,16 +10,20 @@ from typing import Any
 from torch import Tensor
 
 from neuprim.core.data import Dataset
+from neuprim.core.environment import Environment, Illumination
 from neuprim.core.fields import ColourField, ConditionSpec, DensityField, Field
 from neuprim.core.volume_source import VolumeSource
 
-__all__ = ["API_VERSION", "Loss", "SceneContext", "SceneSpec", "TaskSpec"]
+__all__ = ["API_VERSION", "Illuminate", "Loss", "SceneContext", "SceneSpec", "TaskSpec"]
 
 API_VERSION = 1
 """Version of the interfaces in ``neuprim.core``; a plugin names the one it was written for."""
 
 Loss = Callable[[Tensor, Tensor], tuple[Tensor, dict[str, float]]]
 """(rendered (H, W, C), ground truth (H, W, C)) -> (scalar loss with gradient, named parts for the log)."""
+
+Illuminate = Callable[[Environment, int, Mapping[str, Any]], Illumination]
+"""(light from all around, number of lights that stand for it, what the data set said in :meth:`Dataset.facts`) -> frames to add up."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,8 @@ class TaskSpec:
         loss: loss settings -> the training loss.
         check: (model settings) raises :class:`~neuprim.core.errors.ConfigError` for choices the task does not have, before
             any data is loaded.
+        environment: what an image of the light all around means to the task (``neuprim render --environment``); None for tasks that
+            have no light. Images must be linear in it, and their opacity independent of it.
     """
 
     api: int
@@ -83,6 +89,7 @@ class TaskSpec:
     example: Callable[[], Dataset] | None = None
     """A tiny data set, made in memory, that the checks of :mod:`neuprim.plugins.conformance` use in place of their own: for tasks
     whose fields ask for something beside posed images and conditions within their ranges. Images of about 10 x 10 pixels will do."""
+    environment: Illuminate | None = None
 
     def parameter_names(self) -> set[str]:
         """Names of the parameters that the task's fields have at any settings.

@@ -12,6 +12,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.tasks.relight.colour import FORMS, VISIBILITY, LightNetwork
+from neuprim.tasks.relight.environment import illuminate
 from neuprim.tasks.relight.harmonics import LightHarmonics
 from neuprim.tasks.relight.lights import parse_intensities, parse_lights
 from neuprim.tasks.relight.loss import hdr_loss
@@ -81,4 +82,5 @@ TASK = TaskSpec(
         ConditionSpec("light_intensity", (3,), "radiometric", (0.0, 1e6), parse_intensities),
     ),
     fields={"CosineDensity": CosineDensity, "LightNetwork": LightNetwork, "LightHarmonics": LightHarmonics},
+    environment=illuminate,
 )

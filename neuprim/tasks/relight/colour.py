@@ -21,6 +21,7 @@ from neuprim.core.fields import ColourField, Conditions, LoweredDensity, RayNet,
 from neuprim.core.geometry import Geometry
 from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import InitContext, ParameterSpec, Params
+from neuprim.tasks.relight.directions import unit
 from neuprim.tasks.relight.visibility import light_visibility
 
 __all__ = ["FORMS", "LightNetwork"]
@@ -91,7 +92,7 @@ class LightNetwork(ColourField):
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> RayNet:
         means = geometry.means
-        view = _unit(means - camera.position.to(means))
+        view = unit(means - camera.position.to(means))
         to_light = conditions["light"].to(means) - means
         strength = conditions["light_intensity"].to(means).expand(self.channels)
         factor = strength.expand(means.shape[0], -1)
@@ -99,9 +100,7 @@ class LightNetwork(ColourField):
             factor = factor / to_light.square().sum(-1, keepdim=True).clamp_min(1e-12)
         if "visibility" in conditions:
             factor = factor * conditions["visibility"].to(means)[:, None]
-        phase = (
-            (params["net_view"] * view[:, None]).sum(-1) + (params["net_light"] * _unit(to_light)[:, None]).sum(-1) + params["net_phase"]
-        )
+        phase = (params["net_view"] * view[:, None]).sum(-1) + (params["net_light"] * unit(to_light)[:, None]).sum(-1) + params["net_phase"]
         if self.form == "additive":
             base, out = params["c_dc"], params["net_out"]
         else:
@@ -124,7 +123,3 @@ _DARKEST = 1e-3
 
 def _output(ctx: InitContext) -> float:
     return float(ctx.settings.get("output", 0.05))  # type: ignore[arg-type]
-
-
-def _unit(vector: Tensor) -> Tensor:
-    return vector / vector.norm(dim=-1, keepdim=True).clamp_min(1e-30)

@@ -20,6 +20,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.flip import flip_available
 from neuprim.core.metrics import means
 from neuprim.core.primitives import Primitives
+from neuprim.tasks.relight.environment import summary
 from neuprim.tasks.relight.measure import scores
 
 __all__ = ["EXPOSURE_PERCENTILE", "Falloff", "PointLit", "bright"]
@@ -78,6 +79,11 @@ class PointLit(PosedImages):
             truth = self.test.pixels(i).over(self.background)
             entries.append(self._judged(i, guess(i, truth), truth, structure=False))
         return means(entries)
+
+    def facts(self) -> dict[str, Any]:
+        """Also where the training lights were, as the scene's centre sees them: see :func:`~neuprim.tasks.relight.environment.summary`."""
+        lights = torch.stack([self.train.view(i).conditions["light"] for i in range(len(self.train))])
+        return {**super().facts(), "lights": summary(lights, self.center, self.falloff, self.exposure)}
 
     def orbit(self, frames: int) -> list[View]:
         """Views circling the scene while the light circles it the other way, once, at its mean distance and height."""

@@ -12,6 +12,7 @@ from neuprim.core.fields import ColourField, Conditions, Constant
 from neuprim.core.geometry import Geometry
 from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import ParameterSpec, Params
+from neuprim.tasks.relight.directions import unit
 
 __all__ = ["LightHarmonics", "real_harmonics"]
 
@@ -42,7 +43,7 @@ class LightHarmonics(ColourField):
         to_light = conditions["light"].to(color) - geometry.means
         squared = to_light.square().sum(-1, keepdim=True).clamp_min(1e-12)
         if self.degree:
-            bands = real_harmonics(to_light / squared.sqrt(), self.degree)[:, 1:]
+            bands = real_harmonics(unit(to_light), self.degree)[:, 1:]
             color = color + (bands[:, :, None] * params["light_sh"]).sum(1)
         strength = conditions["light_intensity"].to(color) / (squared if self.falloff else 1.0)
         return Constant(color.clamp_min(0.0) * strength)

@@ -28,6 +28,8 @@ BIAS, SOFTNESS = 0.2, 0.08
 """In units of a quarter of the scene's diameter as the light sees it: how far behind the depth image a lit surface may lie, and over
 what distance light fades."""
 
+_FAR = 1e3  # scene radii
+
 
 def light_visibility(
     geometry: Geometry, density: LoweredDensity, light: Tensor, size: int = SIZE, bias: float = BIAS, softness: float = SOFTNESS
@@ -45,6 +47,8 @@ def light_visibility(
         distance = float((light - center).norm())
         if distance < 1e-9 * max(radius, 1e-30):
             return lambda points: torch.ones(len(points))
+        if distance > _FAR * radius:  # from there all rays are parallel, and a float32 depth image keeps no digits
+            light, distance = center + (light - center) * (_FAR * radius / distance), _FAR * radius
         half = math.asin(min(radius / distance, 0.94))
         focal = 0.5 * size / math.tan(half)
         up = torch.tensor([0.0, 0.0, 1.0] if abs(float(light[2] - center[2])) < 0.9 * distance else [0.0, 1.0, 0.0], dtype=torch.float64)

@@ -15,7 +15,7 @@ from tests import scenes
 from tests.numerics.extremes.measure import OPEN, Case
 from tests.numerics.extremes.oracle import Integrals, long_integrals
 
-__all__ = ["SIZE", "aimed", "crowd", "cut", "grazing", "log_uniform", "normalised", "primitive", "signed", "single"]
+__all__ = ["SIZE", "aimed", "crowd", "cut", "grazing", "log_uniform", "networked", "normalised", "primitive", "signed", "single"]
 
 SIZE = 24  # pixels on a side
 
@@ -176,3 +176,19 @@ def crowd(
         t["means"][1::2, 2] = t["means"][0::2, 2]
     settings = replace(OPEN, alpha_min=alpha_min, alpha_max=alpha_max, transmittance_min=transmittance_min)
     return Case({k: v.double() for k, v in t.items()}, camera, settings)
+
+
+def networked(rng: np.random.Generator, case: Case, rate: tuple[float, float] | float = (0.5, 10.0)) -> Case:
+    """The same with a colour network per primitive, whose fastest unit turns ``rate`` radians over a length of 2 m."""
+    t = {k: v for k, v in case.tensors.items() if k != "colors"}
+    n, hidden = len(t["means"]), int(rng.choice([1, 8, 16]))
+    Wx = rng.normal(size=(n, hidden, 3))
+    turn = log_uniform(rng, *rate) if isinstance(rate, tuple) else rate
+    Wx *= turn / 2 / np.linalg.norm(Wx, axis=-1).max(axis=1)[:, None, None]
+    network = {
+        "Wx": Wx,
+        "bias": rng.uniform(-math.pi, math.pi, size=(n, hidden)),
+        "Wout": rng.uniform(-1, 1, size=(n, 3, hidden)) / math.sqrt(hidden),
+        "base": rng.uniform(0.2, 1.0, size=(n, 3)),
+    }
+    return replace(case, tensors=t | {k: torch.from_numpy(v).float().double() for k, v in network.items()})

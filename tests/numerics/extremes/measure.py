@@ -17,9 +17,9 @@ from neuprim.core.cameras import Camera
 from neuprim.core.render import RenderSettings, render_lowered
 from tests import scenes
 from tests.numerics.compare import undecided
-from tests.numerics.extremes.oracle import Integrals, long_integrals
+from tests.numerics.extremes.oracle import Integrals, long_colours, long_integrals
 
-__all__ = ["Case", "Errors", "compare", "drawn", "gradient_errors", "gradients", "integral_errors"]
+__all__ = ["Case", "Errors", "colour_errors", "compare", "drawn", "gradient_errors", "gradients", "integral_errors"]
 
 OPEN = RenderSettings(alpha_min=0.0, transmittance_min=0.0, alpha_max=0.9999)
 SOLID = 0.45  # shorter chords, as a share of the central one, are thin: D < 0.2, or cut by a near plane
@@ -113,10 +113,33 @@ def integral_errors(case: Case, backend: str, exact: Integrals | None = None) ->
     return Errors(float(share.max()), float(rim.max()), 0.0, "", where, int(exact.hit.sum()), wide, 1)
 
 
+def colour_errors(case: Case, backend: str, exact: Integrals) -> Errors:
+    """Worst error of a colour network of one primitive over the size of its numbers, on solid and on thin chords.
+
+    Colour is what a pixel has over what it has of colour 1, so that the opacity's own error does not count, nor that of 1 - T.
+    """
+    plain = case.tensors | {"Wout": 0 * case.tensors["Wout"], "base": torch.ones_like(case.tensors["base"])}
+    with torch.no_grad():
+        settings = replace(case.settings, backend=backend)  # type: ignore[arg-type]
+        out, of_one = (render_lowered(scenes.lowered(t), case.camera, settings) for t in (case.tensors, plain))
+    opacity = of_one.rgb.double().numpy()
+    seen = exact.hit & (opacity[..., 0] > 1e-30)
+    colour, size = long_colours(case.tensors, 0, exact)
+    found = out.rgb.double().numpy() / np.where(seen[..., None], opacity, 1)
+    error = np.where(seen[..., None], np.abs(found - colour) / size, 0).max(-1).astype(np.float64)
+    error = np.where(np.isfinite(error), error, np.inf)
+    short = exact.scale < SOLID * exact.central
+    solid, thin = np.where(short, 0, error), np.where(short, error, 0)
+    at = np.unravel_index(np.argmax(solid), solid.shape)
+    where = float(exact.scale[at] / exact.central[at])
+    wide = int(out.stats.extra.get("delicate", 0))
+    return Errors(float(solid.max()), float(thin.max()), 0.0, "", where, int(seen.sum()), wide, 1)
+
+
 def gradients(case: Case, backend: str, seed: int, keep: Tensor | None = None) -> list[dict[str, Tensor]]:
     """Gradients of a few random functionals of rgb and alpha."""
     g = torch.Generator().manual_seed(seed)
-    h, w, C = case.camera.height, case.camera.width, case.tensors["colors"].shape[1]
+    h, w, C = case.camera.height, case.camera.width, scenes.channels(case.tensors)
     keep = torch.ones(h, w, 1, dtype=torch.float64) if keep is None else keep
     leaves = {k: v.detach().clone().requires_grad_() for k, v in case.tensors.items()}
     out = render_lowered(scenes.lowered(leaves), case.camera, replace(case.settings, backend=backend))  # type: ignore[arg-type]
@@ -178,7 +201,7 @@ def compare(case: Case, backend: str, precision: str, whole: bool, gradients: bo
         errors, skip = frame_errors(case, backend)
     else:
         exact = long_integrals(case.tensors, 0, case.camera, case.settings.near)
-        errors = integral_errors(case, backend, exact)
+        errors = (colour_errors if "Wx" in case.tensors else integral_errors)(case, backend, exact)
         skip = torch.from_numpy((np.abs(exact.D) < RIM).astype(np.bool_))
     if gradients:
         errors.gradient, errors.parameter = gradient_errors(case, backend, skip=skip)

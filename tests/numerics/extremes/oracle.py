@@ -16,7 +16,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 
-__all__ = ["Integrals", "long_integrals", "mp_integral"]
+__all__ = ["Integrals", "long_colours", "long_integrals", "mp_integral"]
 
 L = np.longdouble
 Array = np.ndarray[Any, Any]
@@ -33,6 +33,7 @@ class Integrals:
         central: the same for a chord through the centre in the same direction, uncut.
         D: 1 - |x_m|^2 of the whole line; positive where it meets the ellipsoid.
         rate: the largest change of a neuron's phase along the chord, radians.
+        local: (H, W, 3) x~_m, the middle of the chord that the near plane leaves, in units of m from the centre, scene axes.
     """
 
     depth: Array
@@ -40,6 +41,7 @@ class Integrals:
     central: Array
     D: Array
     rate: Array
+    local: Array
 
     @property
     def hit(self) -> Array:
@@ -92,7 +94,16 @@ def long_integrals(t: dict[str, Tensor], row: int, camera: Camera, near: float) 
     field = b2.reshape(-1)[0] + (w2 * np.cos(phase) * sinc).sum(-1)
     amplitude = np.abs(b2).sum() + np.abs(w2).sum()
     rate = 2 * np.abs(change).max(-1) if W1.shape[0] else np.zeros_like(half)
-    return Integrals(2 * half * norm * field, 2 * half * norm * amplitude, 2 * norm / np.sqrt(a) * amplitude, D, rate)
+    return Integrals(
+        2 * half * norm * field, 2 * half * norm * amplitude, 2 * norm / np.sqrt(a) * amplitude, D, rate, (middle * axes) @ local.T
+    )
+
+
+def long_colours(t: dict[str, Tensor], row: int, exact: Integrals) -> tuple[Array, Array]:
+    """(H, W, C) colours of primitive ``row``'s network at the chords' middles, and (C,) |base| + sum |Wout|, their size."""
+    Wx, bias, Wout, base = (_long(t[k][row]) for k in ("Wx", "bias", "Wout", "base"))
+    waves = np.cos(exact.local @ Wx.T + bias)
+    return np.maximum(base + waves @ Wout.T, 0), np.abs(base) + np.abs(Wout).sum(1)
 
 
 def mp_integral(t: dict[str, Tensor], row: int, camera: Camera, near: float, px: int, py: int, digits: int = 50) -> tuple[Any, Any]:

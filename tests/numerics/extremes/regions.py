@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tests.numerics.extremes.draw import crowd, cut, grazing, log_uniform, signed, single
+from tests.numerics.extremes.draw import crowd, cut, grazing, log_uniform, networked, signed, single
 from tests.numerics.extremes.measure import Case
 
-__all__ = ["FORWARD", "GRADIENT", "REGIONS", "THIN", "Region"]
+__all__ = ["COLOUR", "FORWARD", "GRADIENT", "REGIONS", "THIN", "Region"]
 
 FORWARD, GRADIENT, THIN = 1e-6, 1e-3, 4e-7
+COLOUR = 4e-6  # of a network's colour, at the fastest units that float32 draws
 IMAGE = 5e-6  # of a pixel under tens of primitives, whose errors add up
 
 
@@ -68,6 +69,40 @@ def _ratios() -> list[Region]:
     return out
 
 
+def _networks() -> list[Region]:
+    """Colours that vary within a primitive; the density's rates stay everyday."""
+    cases: dict[str, tuple[dict[str, object], tuple[float, float] | float]] = {
+        "everyday": ({}, (0.5, 10.0)),
+        "distance/radius 0.1": ({"distance": (0.1, 0.1), "fov": 90.0}, (0.5, 10.0)),
+        "distance/radius 1000": ({"distance": (1e3, 1e3)}, (0.5, 10.0)),
+        "distance/radius 100000": ({"distance": (1e5, 1e5)}, (0.5, 10.0)),
+        "0 rad": ({}, 0.0),
+        "30 rad": ({}, 30.0),
+        "50 rad": ({}, 50.0),
+        "100 rad": ({}, 100.0),
+        "1000 rad": ({}, 1000.0),
+        "needles": ({"ratio": (10.0, 1e4), "kind": "needle", "pixels": (0.3, 12.0)}, (0.5, 10.0)),
+        "discs": ({"ratio": (10.0, 1e4), "kind": "disc", "pixels": (0.3, 12.0)}, (0.5, 10.0)),
+        "needles and discs, far, 100 rad": ({"ratio": (1e2, 1e4), "distance": (1e2, 1e5), "pixels": (0.3, 12.0)}, 100.0),
+        "near plane through the chord": ({"distance": (0.02, 1.0), "ratio": (1.2, 20.0), "fov": 80.0}, (0.5, 10.0)),
+        "scales 1e-20": ({"scale": 1e-20}, (0.5, 10.0)),
+        "scales 1e20": ({"scale": 1e20}, (0.5, 10.0)),
+    }
+    out = []
+    for name, (more, rate) in cases.items():
+        fast = isinstance(rate, float) and rate >= 30.0
+        out.append(
+            Region(
+                f"colour network, {name}",
+                lambda r, more=more, rate=rate: networked(r, single(r, **more), rate),  # type: ignore[misc, arg-type]
+                forward=COLOUR if fast else FORWARD,
+                thin=COLOUR if fast else FORWARD,
+                reason="float32 draws units of up to 4 turns over half a chord, whose phase it knows to 3e-6 rad" if fast else "",
+            )
+        )
+    return out
+
+
 REGIONS: tuple[Region, ...] = (
     Region("everyday", lambda r: single(r)),
     *_distances(),
@@ -103,5 +138,12 @@ REGIONS: tuple[Region, ...] = (
     ),
     Region("equal depths", lambda r: crowd(r, 8, equal=True), forward=IMAGE, whole=True),
     Region("crowd", lambda r: crowd(r, 60, alpha_min=1 / 255, transmittance_min=1e-4), forward=IMAGE, whole=True),
+    *_networks(),
+    Region(
+        "colour network, crowd",
+        lambda r: networked(r, crowd(r, 30, alpha_min=1 / 255, transmittance_min=1e-4)),
+        forward=IMAGE,
+        whole=True,
+    ),
     Region("everything at once", lambda r: single(r, (0.02, 1e5), (1.2, 1e4), rate=(0.1, 1e2), pixels=(0.1, 30.0))),
 )

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from PIL import Image
 from rich.console import Console
 
 from neuprim.cli import main
 from neuprim.config import compose
 from neuprim.core.errors import ConfigError
+from neuprim.core.images import write_exr
 from neuprim.evaluate import render_run
 from neuprim.run import run
 
@@ -46,6 +49,19 @@ def test_the_light_goes_round(finished: Path, tmp_path: Path) -> None:
     assert main(words) == 0
     with Image.open(target) as film:
         assert getattr(film, "n_frames", 1) == 5
+
+
+def test_light_from_all_around(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sky = torch.linspace(1.0, 0.0, 16)[:, None, None].expand(16, 32, 3)
+    write_exr(tmp_path / "sky.exr", sky, half=False)
+    words = ["render", str(finished), "--environment", str(tmp_path / "sky.exr"), "--environment-samples", "5", "--frames", "3"]
+    assert main([*words, "--camera", "test", "--out", str(tmp_path / "test")]) == 0
+    assert len(list((tmp_path / "test").glob("*.png"))) == 6
+    assert main([*words, "--camera", "orbit", "--out", str(tmp_path / "film.webp")]) == 0
+    assert "of the environment's light comes from more than 15 degrees off every training light" in capsys.readouterr().err
+    with Image.open(tmp_path / "film.webp") as film:
+        assert getattr(film, "n_frames", 1) == 3
+        assert np.asarray(film.convert("RGB")).std() > 5
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,265 @@
+"""Light from all around: an image of latitude and longitude, and a few directions that stand for it.
+
+The top row of the image is up, the bottom row down. The middle column looks along the first horizontal axis; to the right of it, as seen
+from inside, directions turn clockwise about up. With up = +z: the middle column is +x, a quarter to its right -y, both edges -x, a quarter
+to its left +y (the convention of Blender's environment textures). Where up is another axis, the first horizontal axis is the scene's x,
+or y if x is up, made perpendicular to it; the second, a quarter to the left, is up x first. A rotation turns the light anticlockwise
+about up as seen from above: by 90 degrees, what came from +x comes from +y.
+
+Directions are chosen by cutting the image into rectangles, each cut the one that most lowers the sum over all rectangles of the variance of
+direction weighted by energy (Viriyothai and Debevec 2009, "Variance minimization light probe sampling", in place of the median cut). A
+rectangle's light carries all of its energy, so the total per colour is the image's for any number of lights.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.images import image_info, read_image, srgb_to_linear
+
+__all__ = ["MAX_LIGHTS", "Beams", "Environment", "EnvironmentFile", "Illumination", "read_environment"]
+
+MAX_LIGHTS = 4096
+_ROWS = 512  # larger images are summed to at most so many rows of cells, of which no energy is lost
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, linear
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EnvironmentFile:
+    """What a user asks for.
+
+    Attributes:
+        path: see :func:`read_environment`.
+        samples: number of lights that stand for it.
+        rotation: degrees about the scene's upward direction.
+        scale: multiplies the radiance.
+        guesses: whether light from directions that the model never saw counts.
+    """
+
+    path: Path
+    samples: int = 64
+    rotation: float = 0.0
+    scale: float = 1.0
+    guesses: bool = True
+
+
+@dataclass(frozen=True)
+class Beams:
+    """Distant light from M directions.
+
+    Attributes:
+        directions: (M, 3) float64 unit vectors towards where the light comes from, scene axes.
+        irradiance: (M, 3) float64 linear RGB on a surface that faces it: radiance times solid angle.
+    """
+
+    directions: Tensor
+    irradiance: Tensor
+
+
+@dataclass(frozen=True)
+class Illumination:
+    """What a task makes of an environment: frames to draw one by one and to add up.
+
+    Attributes:
+        conditions: of each frame, one or more; they replace the view's own of the same names.
+        notes: one line each, for the user.
+        guessed: of each frame, whether its light comes from where the model never saw any; empty if none does.
+    """
+
+    conditions: tuple[dict[str, Tensor], ...]
+    notes: tuple[str, ...] = ()
+    guessed: tuple[bool, ...] = ()
+
+    def frames(self, guesses: bool) -> tuple[dict[str, Tensor], ...]:
+        """The conditions, without the guessed ones unless ``guesses``; none may be left."""
+        if guesses or not any(self.guessed):
+            return self.conditions
+        return tuple(c for c, guess in zip(self.conditions, self.guessed, strict=True) if not guess)
+
+
+class Environment:
+    """Radiance from every direction, see the module.
+
+    Args:
+        radiance: (H, 2H, 3) linear RGB, finite and not negative.
+        up: (3,) the direction of the top row, scene axes.
+        rotation: degrees about ``up``.
+        where: names the image in messages.
+
+    Raises:
+        DataError: another shape, or values that are negative or not finite.
+    """
+
+    def __init__(self, radiance: Tensor, up: Tensor | None = None, rotation: float = 0.0, where: str = "environment") -> None:
+        if radiance.dim() != 3 or radiance.shape[2] != 3 or radiance.shape[1] != 2 * radiance.shape[0] or not radiance.numel():
+            found = "x".join(str(n) for n in (radiance.shape[1], radiance.shape[0])) if radiance.dim() == 3 else str(tuple(radiance.shape))
+            raise DataError(f"{where}: image is {found}; expected latitude and longitude, RGB, twice as wide as high")
+        axes = _axes(torch.tensor([0.0, 0.0, 1.0]) if up is None else up)
+        self._flux, self._moment = _cells(radiance, axes, math.radians(rotation), where)
+
+    @property
+    def irradiance(self) -> Tensor:
+        """(3,) float64 sum of radiance times solid angle over all directions; 4 pi for a uniform environment of radiance 1."""
+        return torch.from_numpy(self._flux.sum((0, 1)))
+
+    def beams(self, count: int) -> Beams:
+        """At most ``count`` directions that carry all of the energy; fewer where fewer cells of the image shine, none if it is black.
+
+        Equal arguments give equal directions; nothing is random.
+
+        Raises:
+            ConfigError: a count outside 1..:data:`MAX_LIGHTS`.
+        """
+        if not 1 <= count <= MAX_LIGHTS:
+            raise ConfigError(f"{count} lights for an environment; expected 1 to {MAX_LIGHTS}")
+        directions, irradiance = [], []
+        for r0, r1, c0, c1 in _rectangles(self._moment, self._flux @ _LUMINANCE, count):
+            flux, moment = self._flux[r0:r1, c0:c1].sum((0, 1)), self._moment[r0:r1, c0:c1].sum((0, 1))
+            length = np.linalg.norm(moment)
+            if length <= 1e-9 * float(flux @ _LUMINANCE):  # light from all sides alike has no direction; any is as good
+                moment, length = self._moment[r0, c0], np.linalg.norm(self._moment[r0, c0])
+            directions.append(moment / length)
+            irradiance.append(flux)
+        shape = (len(directions), 3)
+        return Beams(*(torch.from_numpy(np.array(x, dtype=np.float64).reshape(shape)) for x in (directions, irradiance)))
+
+    def share_beyond(self, directions: Tensor, degrees: float) -> float:
+        """Share 0..1 of the energy (luminance) that comes from farther than ``degrees`` from each of (D, 3) unit ``directions``."""
+        weight = self._flux @ _LUMINANCE
+        total = float(weight.sum())
+        if total == 0.0:
+            return 0.0
+        known = directions.detach().double().numpy().T
+        beyond = 0.0
+        for row, moment in zip(weight, self._moment, strict=True):
+            lit = row > 0
+            if lit.any():
+                nearest = (moment[lit] @ known).max(axis=1) / np.linalg.norm(moment[lit], axis=1)
+                beyond += float(row[lit][nearest < math.cos(math.radians(degrees))].sum())
+        return beyond / total
+
+
+def read_environment(path: Path, up: Tensor | None = None, rotation: float = 0.0, scale: float = 1.0) -> Environment:
+    """The environment in an OpenEXR file (linear radiance), or in a PNG or JPEG (sRGB, made linear); alpha is ignored.
+
+    Args:
+        up, rotation: see :class:`Environment`.
+        scale: multiplies the radiance.
+
+    Raises:
+        DataError: as :func:`neuprim.core.images.read_image`, and for another shape than 2:1 or negative values.
+    """
+    info = image_info(path)
+    if info.width != 2 * info.height:
+        raise DataError(
+            f"{path}: image is {info.width}x{info.height}; expected an environment in latitude and longitude, twice as wide as high"
+        )
+    pixels = read_image(path)[..., :3]
+    radiance = pixels if info.linear else srgb_to_linear(pixels.float() / 255.0)
+    return Environment(radiance if scale == 1.0 else radiance.float() * scale, up, rotation, str(path))
+
+
+def _axes(up: Tensor) -> Array:
+    """(3, 3) rows: first horizontal axis, second, up."""
+    top = up.detach().double().numpy()
+    length = np.linalg.norm(top)
+    if not (np.isfinite(length) and length > 0):
+        raise DataError(f"up is {top.tolist()}; expected a direction")
+    top = top / length
+    first = np.eye(3)[0 if abs(top[0]) < 0.9 else 1]
+    first = first - (first @ top) * top
+    first = first / np.linalg.norm(first)
+    return np.stack([first, np.cross(top, first), top])
+
+
+def _cells(radiance: Tensor, axes: Array, turn: float, where: str) -> tuple[Array, Array]:
+    """(R, C, 3) radiance times solid angle, and (R, C, 3) its luminance times direction, summed over blocks of texels."""
+    height, width = radiance.shape[:2]
+    block = -(-height // _ROWS)
+    starts = np.arange(0, width, block)
+    azimuth = 2 * math.pi * (0.5 - (np.arange(width) + 0.5) / width) + turn
+    around = np.stack([np.cos(azimuth), np.sin(azimuth)], -1) @ axes[:2]
+    flux: list[Array] = []
+    moment: list[Array] = []
+    for top in range(0, height, block):
+        rows = np.arange(top, min(top + block, height))
+        band = radiance[top : top + block].double().numpy()
+        wrong = ~(np.isfinite(band) & (band >= 0))
+        if wrong.any():
+            y, x, channel = (int(i[0]) for i in np.nonzero(wrong))
+            raise DataError(f"{where}: radiance {band[y, x, channel]} at row {top + y}, column {x}, channel {channel}; expected 0 or more")
+        polar = (rows + 0.5) * (math.pi / height)
+        solid = (2 * math.pi / width) * 2 * np.sin(polar) * math.sin(0.5 * math.pi / height)  # cos of the upper edge - cos of the lower
+        energy = band * solid[:, None, None]
+        luminance = (energy @ _LUMINANCE)[..., None]
+        way = np.sin(polar)[:, None, None] * around + np.cos(polar)[:, None, None] * axes[2]
+        for sums, values in ((flux, energy), (moment, luminance * way)):
+            sums.append(np.add.reduceat(values.sum(axis=0), starts, axis=0))
+    return np.stack(flux), np.stack(moment)
+
+
+def _rectangles(moment: Array, weight: Array, count: int) -> list[tuple[int, int, int, int]]:
+    """At most ``count`` rectangles (first row, end, first column, end) with energy, which together have all of it."""
+    rows, columns = weight.shape
+    table = np.zeros((rows + 1, columns + 1, 4))
+    table[1:, 1:] = np.concatenate([moment, weight[..., None]], -1).cumsum(0).cumsum(1)
+    total = table[-1, -1, 3]
+    if total == 0.0:
+        return []
+    whole: tuple[int, int, int, int] = (0, rows, 0, columns)
+    queue = [(-float(_spread(table[-1, -1])), whole)]
+    done: list[tuple[int, int, int, int]] = []
+    while queue and len(queue) + len(done) < count:
+        _, box = heapq.heappop(queue)
+        parts = _cut(table, box, 1e-12 * total)
+        if not parts:
+            done.append(box)
+        for part in parts:
+            heapq.heappush(queue, (-float(_spread(_sum(table, part))), part))
+    return sorted(done + [box for _, box in queue])
+
+
+def _sum(table: Array, box: tuple[int, int, int, int]) -> Array:
+    r0, r1, c0, c1 = box
+    return np.asarray(table[r1, c1] - table[r0, c1] - table[r1, c0] + table[r0, c0])
+
+
+def _spread(sums: Array) -> Array:
+    """Energy times variance of direction, W - |M|^2/W, of (..., 4) sums (M, W)."""
+    weight = sums[..., 3]
+    return np.asarray(np.maximum(weight - (sums[..., :3] ** 2).sum(-1) / np.maximum(weight, 1e-300), 0.0))
+
+
+def _cut(table: Array, box: tuple[int, int, int, int], least: float) -> list[tuple[int, int, int, int]]:
+    """The two parts of the best cut; none if no cut lowers the spread by ``least``."""
+    r0, r1, c0, c1 = box
+    whole = _sum(table, box)
+    best, parts = float(_spread(whole)) - least, []
+    rows = table[r0 + 1 : r1, c1] - table[r0, c1] - table[r0 + 1 : r1, c0] + table[r0, c0]
+    columns = table[r1, c0 + 1 : c1] - table[r1, c0] - table[r0, c0 + 1 : c1] + table[r0, c0]
+    for along_rows, first in ((True, rows), (False, columns)):
+        if not len(first):
+            continue
+        second = whole - first
+        cost = _spread(first) + _spread(second)
+        cost[np.minimum(first[:, 3], second[:, 3]) <= 0.1 * least] = np.inf  # a part without energy is no light
+        at = int(cost.argmin())
+        if cost[at] < best:
+            best = float(cost[at])
+            middle = at + 1
+            parts = (
+                [(r0, r0 + middle, c0, c1), (r0 + middle, r1, c0, c1)]
+                if along_rows
+                else [(r0, r1, c0, c0 + middle), (r0, r1, c0 + middle, c1)]
+            )
+    return parts

@@ -1,0 +1,203 @@
+"""Images of the light all around: directions, energy, and the few lights that stand for them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+from torch import Tensor
+
+from neuprim.core.environment import Environment, read_environment
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.images import linear_to_srgb, write_exr, write_png
+
+
+def dark(height: int = 8) -> Tensor:
+    return torch.zeros(height, 2 * height, 3)
+
+
+def wild(height: int, seed: int = 0) -> Tensor:
+    """Random radiance over six orders of magnitude, a third of it black."""
+    g = torch.Generator().manual_seed(seed)
+    values = 10 ** (6 * torch.rand(height, 2 * height, 3, generator=g) - 3)
+    return values * (torch.rand(height, 2 * height, 1, generator=g) > 0.33)
+
+
+def direction(row: int, column: int, height: int) -> list[float]:
+    """Of a texel with up = z: the middle column is +x, right of it towards -y."""
+    polar, azimuth = math.pi * (row + 0.5) / height, 2 * math.pi * (0.5 - (column + 0.5) / (2 * height))
+    return [math.sin(polar) * math.cos(azimuth), math.sin(polar) * math.sin(azimuth), math.cos(polar)]
+
+
+# ---------------------------------------------------------------- where light comes from
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "expected"),
+    [(64, 128, (1, 0, 0)), (64, 192, (0, -1, 0)), (64, 64, (0, 1, 0)), (64, 0, (-1, 0, 0)), (0, 17, (0, 0, 1)), (127, 200, (0, 0, -1))],
+)
+def test_which_texel_is_which_direction(row: int, column: int, expected: tuple[int, int, int]) -> None:
+    image = dark(128)
+    image[row, column] = 1.0
+    (found,) = Environment(image).beams(5).directions
+    assert found.tolist() == pytest.approx(expected, abs=0.03)
+    assert found.tolist() == pytest.approx(direction(row, column, 128), abs=1e-12)
+
+
+def test_other_upward_axes() -> None:
+    image = dark(64)
+    image[0] = 1.0
+    assert Environment(image, torch.tensor([0.0, 2.0, 0.0])).beams(1).directions[0].tolist() == pytest.approx([0, 1, 0], abs=1e-9)
+    image = dark(64)
+    image[32, 32] = 1.0  # the horizon, a quarter to the left of the middle: up x first axis
+    assert Environment(image, torch.tensor([0.0, 1.0, 0.0])).beams(1).directions[0].tolist() == pytest.approx([0, 0, -1], abs=0.04)
+    assert Environment(image, torch.tensor([1.0, 0.0, 0.0])).beams(1).directions[0].tolist() == pytest.approx([0, 0, 1], abs=0.04)
+
+
+def test_a_rotation_turns_every_light() -> None:
+    image = wild(16)
+    still, turned = Environment(image).beams(20), Environment(image, rotation=90.0).beams(20)
+    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)  # +x to +y
+    assert torch.allclose(turned.directions, still.directions @ quarter.T, atol=1e-12)
+    assert torch.allclose(turned.irradiance, still.irradiance)
+    whole = Environment(image, rotation=360.0).beams(20)
+    assert torch.allclose(whole.directions, still.directions, atol=1e-9)
+
+
+# ---------------------------------------------------------------- energy
+
+
+@pytest.mark.parametrize("height", [1, 2, 16, 513, 700])
+def test_white_has_the_sphere(height: int) -> None:
+    environment = Environment(torch.full((height, 2 * height, 3), 0.75))
+    assert environment.irradiance.tolist() == pytest.approx([0.75 * 4 * math.pi] * 3, rel=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 64, 500])
+@pytest.mark.parametrize("height", [3, 20, 530])
+def test_energy_is_kept_for_any_number_of_lights(height: int, count: int) -> None:
+    image = wild(height)
+    environment = Environment(image)
+    beams = environment.beams(count)
+    polar = (torch.arange(height, dtype=torch.float64) * math.pi / height).cos()
+    solid = (polar - torch.cat([polar[1:], -torch.ones(1, dtype=torch.float64)])) * math.pi / height
+    expected = (image.double() * solid[:, None, None]).sum((0, 1))
+    assert torch.allclose(beams.irradiance.sum(0), expected, rtol=1e-12)
+    assert torch.allclose(environment.irradiance, expected, rtol=1e-12)
+    shining = int((image.amax(-1) > 0).sum())
+    assert len(beams.directions) == min(count, shining)
+    assert torch.allclose(beams.directions.norm(dim=1), torch.ones(len(beams.directions), dtype=torch.float64))
+    assert bool((beams.irradiance >= 0).all()) and bool((beams.irradiance.sum(1) > 0).all())
+
+
+def test_one_bright_texel_is_one_light() -> None:
+    image = dark(8)
+    image[2, 5] = torch.tensor([3.0, 2.0, 1.0])
+    for count in (1, 64):
+        beams = Environment(image).beams(count)
+        assert beams.directions.shape == (1, 3)
+        assert beams.directions[0].tolist() == pytest.approx(direction(2, 5, 8), abs=1e-12)
+        solid = 2 * math.pi / 16 * (math.cos(math.pi * 2 / 8) - math.cos(math.pi * 3 / 8))
+        assert beams.irradiance[0].tolist() == pytest.approx([3 * solid, 2 * solid, solid])
+
+
+def test_many_lights_light_a_surface_like_the_whole() -> None:
+    """Irradiance under a half-dark random environment, of surfaces facing every way."""
+    image = wild(32, seed=4).clamp_max(30.0)
+    every, few = Environment(image).beams(4096), Environment(image).beams(256)
+    normals = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64), dim=1)
+    exact, found = ((normals @ b.directions.T).clamp_min(0) @ b.irradiance for b in (every, few))
+    assert len(every.directions) > 1000
+    assert float((found / exact - 1).abs().max()) < 0.03
+
+
+def test_uniform_light_spreads_evenly() -> None:
+    beams = Environment(torch.ones(64, 128, 3)).beams(128)
+    share = beams.irradiance[:, 0] / (4 * math.pi / 128)
+    assert 0.4 < float(share.min()) and float(share.max()) < 2.1
+    assert float((beams.directions * beams.irradiance[:, :1]).sum(0).norm()) < 0.05 * 4 * math.pi
+
+
+def test_a_sun_gets_a_light_of_its_own() -> None:
+    image = torch.full((128, 256, 3), 0.5)
+    image[30:32, 100:102] = 5e4
+    beams = Environment(image).beams(32)
+    sun = torch.tensor(direction(30, 100, 128), dtype=torch.float64)
+    brightest = int(beams.irradiance.sum(1).argmax())
+    assert float(beams.directions[brightest] @ sun) > math.cos(math.radians(2.0))
+    assert len(beams.directions) == 32
+
+
+def test_light_from_all_sides_still_has_some_direction() -> None:
+    assert torch.isfinite(Environment(torch.ones(4, 8, 3)).beams(1).directions).all()
+
+
+def test_no_light_is_no_beam() -> None:
+    beams = Environment(dark()).beams(9)
+    assert beams.directions.shape == (0, 3) and Environment(dark()).irradiance.tolist() == [0, 0, 0]
+    assert Environment(dark()).share_beyond(torch.tensor([[0.0, 0, 1]]), 10.0) == 0.0
+
+
+def test_the_same_lights_again() -> None:
+    one, two = (Environment(wild(40)).beams(100) for _ in range(2))
+    assert torch.equal(one.directions, two.directions) and torch.equal(one.irradiance, two.irradiance)
+
+
+@pytest.mark.parametrize("count", [0, -1, 5000])
+def test_impossible_numbers_of_lights(count: int) -> None:
+    with pytest.raises(ConfigError, match="expected 1 to 4096"):
+        Environment(dark()).beams(count)
+
+
+# ---------------------------------------------------------------- what was never seen
+
+
+@pytest.mark.parametrize("degrees", [10.0, 60.0, 120.0])
+def test_share_beyond_a_cap(degrees: float) -> None:
+    environment = Environment(torch.ones(128, 256, 3))
+    known = torch.tensor([[0.6, 0.0, 0.8], [0.6, 0.0, 0.8]])
+    expected = 1 - (1 - math.cos(math.radians(degrees))) / 2
+    assert environment.share_beyond(known, degrees) == pytest.approx(expected, abs=0.005)
+
+
+# ---------------------------------------------------------------- files
+
+
+def test_from_a_file(tmp_path: Path) -> None:
+    image = wild(16)
+    write_exr(tmp_path / "a.exr", image, half=False)
+    found, expected = read_environment(tmp_path / "a.exr", scale=2.0).beams(10), Environment(image).beams(10)
+    assert torch.allclose(found.directions, expected.directions)
+    assert torch.allclose(found.irradiance, 2 * expected.irradiance)
+
+
+def test_display_referred_files_become_linear(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", linear_to_srgb(torch.full((16, 32, 3), 0.25)))
+    assert read_environment(tmp_path / "a.png").irradiance.tolist() == pytest.approx([math.pi] * 3, rel=0.02)
+
+
+@pytest.mark.parametrize(("value", "message"), [(np.nan, "nan"), (np.inf, "inf"), (-np.inf, "-inf"), (-0.5, r"-0\.5")])
+def test_impossible_radiance(tmp_path: Path, value: float, message: str) -> None:
+    image = dark(8)
+    image[3, 7, 1] = value
+    channels = {name: image[..., i].contiguous().numpy() for i, name in enumerate("RGB")}
+    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels) as file:
+        file.write(str(tmp_path / "bad.exr"))  # the project's own writer refuses
+    with pytest.raises(DataError, match=rf"bad\.exr: .*{message} at row 3, column 7, channel 1; expected"):
+        read_environment(tmp_path / "bad.exr")
+
+
+def test_other_shapes(tmp_path: Path) -> None:
+    write_exr(tmp_path / "square.exr", torch.ones(8, 8, 3), half=False)
+    with pytest.raises(
+        DataError, match=r"square\.exr: image is 8x8; expected an environment in latitude and longitude, twice as wide as high"
+    ):
+        read_environment(tmp_path / "square.exr")
+    with pytest.raises(DataError, match="image is 4x4; expected"):
+        Environment(torch.ones(4, 4, 3))
+    with pytest.raises(DataError, match=r"none\.exr: file not found"):
+        read_environment(tmp_path / "none.exr")

@@ -1,0 +1,293 @@
+"""Light from all around a relit model: against one point light, against the light's own arithmetic, and on the command line."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from neuprim.cli import main
+from neuprim.config import compose
+from neuprim.core import checkpoint
+from neuprim.core.cosine import CosineDensity
+from neuprim.core.data import View
+from neuprim.core.environment import Environment
+from neuprim.core.errors import DataError
+from neuprim.core.images import read_image, write_exr
+from neuprim.core.primitives import Primitives
+from neuprim.core.render import RenderSettings, render
+from neuprim.core.solids.raycast import Scene
+from neuprim.core.task import SceneContext
+from neuprim.measure import draw_sum
+from neuprim.tasks.relight import TASK
+from neuprim.tasks.relight.colour import LightNetwork
+from neuprim.tasks.relight.environment import FAR, illuminate, summary
+from neuprim.tasks.relight.lit.scene import solids
+from neuprim.tasks.relight.lit.shading import shade
+from tests import scenes
+
+UNSHADOWED = "none"  # LightNetwork's ``visibility``
+SETTINGS = RenderSettings(backend="reference")
+
+
+def facts(distance: float = 4.5, falloff: str = "inverse_square", exposure: float = 1.0, **more: Any) -> dict[str, Any]:
+    """As a data set with lights all over the upper hemisphere tells them."""
+    g = torch.Generator().manual_seed(0)
+    offsets = torch.nn.functional.normalize(torch.randn(400, 3, generator=g), dim=1)
+    offsets[:, 2] = offsets[:, 2].abs()
+    return {"up": [0.0, 0.0, 1.0], "center": [0.1, 0.2, 0.3], "lights": summary(distance * offsets + torch.tensor([0.1, 0.2, 0.3]), torch.tensor([0.1, 0.2, 0.3]), falloff, exposure)} | more  # fmt: skip
+
+
+def texel(row: int = 5, column: int = 9, height: int = 16) -> Tensor:
+    image = torch.zeros(height, 2 * height, 3)
+    image[row, column] = torch.tensor([900.0, 600.0, 300.0])
+    return image
+
+
+def some_model() -> Primitives:
+    field = LightNetwork(3, visibility=UNSHADOWED, falloff=True)
+    g = torch.Generator().manual_seed(5)
+    t = {k: v for k, v in scenes.tensors(12, 2, seed=3).items() if k != "colors"}
+    t |= {s.name: 0.5 * torch.randn((12, *s.shape), generator=g) for s in field.parameters()}
+    t["c_dc"] = t["c_dc"].abs() + 0.5
+    return Primitives(CosineDensity(2), field, t)
+
+
+# ---------------------------------------------------------------- intensities
+
+
+@pytest.mark.parametrize(
+    ("falloff", "exposure", "factor"), [("inverse_square", 1.0, 3.0**2), ("inverse_square", 2.5, 2.5 * 9), ("none", 1.0, 1 / math.pi)]
+)
+def test_intensity_gives_the_centre_the_environments_irradiance(falloff: str, exposure: float, factor: float) -> None:
+    environment = Environment(texel())
+    (light,) = illuminate(environment, 64, facts(3.0, falloff, exposure)).conditions
+    (beam,) = zip(*vars(environment.beams(64)).values(), strict=True)
+    offset = light["light"].double() - torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    assert torch.allclose(offset, 3.0 * beam[0], atol=1e-6)
+    assert torch.allclose(light["light_intensity"].double(), factor * beam[1], rtol=1e-6)
+
+
+def test_a_white_sky_shows_albedo() -> None:
+    """The ray caster's own shading of the built-in slab: a matt surface under uniform light of 1 is as bright as its albedo."""
+    scene = Scene([s for s in solids() if s.name == "slab"])
+    told = {**facts(1e4), "center": [0.0, 0.0, 0.0]}
+    lights = illuminate(Environment(torch.ones(64, 128, 3)), 600, told).conditions
+    total = np.zeros(3)
+    for light in lights:
+        seen = shade(scene, [0.2, 0.1, 3.0], [[0.0, 0.0, -1.0]], light["light"].numpy(), 1.0)
+        total += seen.rgb[0].astype(np.float64) * light["light_intensity"].double().numpy()
+    albedo = scene.intersect([0.2, 0.1, 3.0], np.array([[0.0, 0.0, -1.0]], np.float32)).albedo[0]
+    assert albedo.min() > 0.4
+    assert total == pytest.approx(albedo, rel=0.02)
+
+
+@pytest.mark.parametrize("count", [1, 5, 64])
+def test_energy_through_the_model_for_any_number_of_lights(count: int) -> None:
+    """A constant colour c at the lights' centre receives all of the energy: 4 pi c under white."""
+    field = LightNetwork(0, visibility=UNSHADOWED, falloff=True)
+    t = {k: v[:1] for k, v in scenes.tensors(1, 1).items() if k != "colors"}
+    t |= {"means": torch.tensor([[0.1, 0.2, 0.3]]), "c_dc": torch.tensor([[0.3, 0.2, 0.1]])}
+    t |= {s.name: torch.zeros(1, *s.shape) for s in field.parameters() if s.name != "c_dc"}
+    model = Primitives(CosineDensity(1), field, t)
+    lights = illuminate(Environment(torch.ones(32, 64, 3)), count, facts()).conditions
+    view = View("v", scenes.camera(12, 10))
+    seen = draw_sum(model, view, lights, SETTINGS, torch.zeros(3))
+    alpha = render(model, view.camera, lights[0], SETTINGS).alpha[..., None]
+    assert len(lights) == count and alpha.max() > 0.1
+    assert torch.allclose(seen, 4 * math.pi * alpha * t["c_dc"], rtol=1e-5, atol=1e-7)
+
+
+# ---------------------------------------------------------------- images
+
+
+def test_one_texel_is_one_light_and_the_background_counts_once() -> None:
+    model, view, sky = some_model(), View("v", scenes.camera(16, 12)), torch.tensor([0.5, 0.7, 0.9])
+    (light,) = illuminate(Environment(texel()), 64, facts()).conditions
+    one = render(model, view.camera, light, SETTINGS, sky).rgb
+    assert one.max() > 1.0
+    assert torch.allclose(draw_sum(model, view, [light], SETTINGS, sky), one, atol=1e-6)
+    halves = [{**light, "light_intensity": light["light_intensity"] * s} for s in (0.25, 0.75)]
+    assert torch.allclose(draw_sum(model, view, halves, SETTINGS, sky), one, atol=1e-5)
+
+
+def test_a_view_keeps_its_other_conditions() -> None:
+    seen: list[dict[str, Tensor]] = []
+
+    class Listening(Primitives):
+        def lower(self, camera: Any, conditions: Any) -> Any:
+            seen.append(dict(conditions))
+            return super().lower(camera, conditions)
+
+    model = some_model()
+    view = View("v", scenes.camera(4, 4), {"wavelength": torch.tensor(0.5), "light": torch.zeros(3)})
+    lights = illuminate(Environment(texel()), 1, facts()).conditions
+    draw_sum(Listening(model.density, model.colour, model.params), view, lights, SETTINGS, torch.zeros(3))
+    assert [sorted(c) for c in seen] == [["light", "light_intensity", "wavelength"]]
+    assert torch.equal(seen[0]["light"], lights[0]["light"])
+
+
+def test_darkness_is_one_light_of_no_intensity() -> None:
+    found = illuminate(Environment(torch.zeros(4, 8, 3)), 64, facts())
+    assert [c["light_intensity"].tolist() for c in found.conditions] == [[0, 0, 0]]
+    assert found.notes == ("the environment is black",)
+
+
+# ---------------------------------------------------------------- what was never seen
+
+
+def test_light_from_below_is_announced() -> None:
+    below = torch.zeros(32, 64, 3)
+    below[24:] = 1.0
+    (note,) = illuminate(Environment(below), 16, facts()).notes
+    assert note.startswith(f"100% of the environment's light comes from more than {FAR:g} degrees")
+    above = below.flip(0)
+    assert illuminate(Environment(above), 16, facts()).notes == ()
+
+
+def test_the_summary_covers_the_lights() -> None:
+    g = torch.Generator().manual_seed(1)
+    lights = torch.nn.functional.normalize(torch.randn(3000, 3, generator=g), dim=1) * torch.linspace(2, 4, 3000)[:, None]
+    found = summary(lights, torch.zeros(3), "none", 2.0)
+    kept = torch.tensor(found["directions"])
+    units = torch.nn.functional.normalize(lights, dim=1)
+    assert kept.shape == (256, 3) and found["distance"] == pytest.approx(3.0, abs=0.01) and found["exposure"] == 2.0
+    assert float((units @ kept.T).amax(1).min()) > math.cos(math.radians(10.0))
+    assert len(json.dumps(found)) < 8192
+    assert len(summary(lights[:5], torch.zeros(3), "none", 1.0)["directions"]) == 5
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"lights": None}, "lights is null; expected an object"),
+        ({"center": [0, 0]}, "center is a list of 2; expected 3 numbers"),
+        ({"lights": {**facts()["lights"], "distance": -1.0}}, r"distance is -1\.0; expected a distance above 0"),
+        ({"lights": {**facts()["lights"], "falloff": "cubic"}}, 'falloff is "cubic"; expected none or inverse_square'),
+        ({"lights": {**facts()["lights"], "directions": []}}, "directions is a list of 0; expected 1 to 256 directions"),
+        ({"lights": {**facts()["lights"], "directions": [[1, 2, "x"]]}}, "expected a finite number"),
+        ({"lights": {**facts()["lights"], "directions": [[0, 0, 1]] * 257}}, "directions is a list of 257"),
+    ],
+)
+def test_damaged_headers(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(DataError, match=f"the model's header: data.*{message}"):
+        illuminate(Environment(texel()), 4, {**facts(), **change})
+
+
+def test_a_data_set_tells_where_its_lights_were(tmp_path: Path) -> None:
+    small = {"size": 8, "train_views": 100, "test_views": 3, "supersampling": 1}
+    dataset = TASK.scene("lit_solids").load(small, SceneContext(0, tmp_path))
+    told = json.loads(json.dumps(dataset.facts()))
+    assert told["up"] == [0, 0, 1] and len(told["lights"]["directions"]) == 100
+    assert 4.0 < told["lights"]["distance"] < 5.0 and told["lights"]["falloff"] == "inverse_square"
+    above = torch.zeros(32, 64, 3)
+    above[:5] = 1.0
+    assert illuminate(Environment(above), 8, told).notes == ()
+
+
+# ---------------------------------------------------------------- commands
+
+
+@pytest.fixture
+def finished(tmp_path: Path) -> Path:
+    """A run directory with a model that nobody trained, and cameras; no data are needed."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    words = ["task=relight", "scene=olat", "scene.path=nowhere", "renderer.backend=reference", f"output_dir='{folder}'"]
+    (folder / "config.yaml").write_text(compose(words).to_yaml())
+    header = {"background": [0.5, 0.5, 0.5], "color_space": "linear", "data": facts()}
+    checkpoint.save_model(folder / "model.safetensors", some_model(), "relight", header)
+    pose = torch.linalg.inv(scenes.camera().viewmat) @ torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+    frames = [{"file_path": name, "transform_matrix": pose.tolist()} for name in ("a", "b")]
+    (tmp_path / "cameras.json").write_text(json.dumps({"w": 16, "h": 12, "camera_angle_x": 0.7, "frames": frames}))
+    (tmp_path / "one.json").write_text(json.dumps({"w": 16, "h": 12, "camera_angle_x": 0.7, "frames": frames[:1]}))
+    write_exr(tmp_path / "texel.exr", texel(), half=False)
+    write_exr(tmp_path / "rolled_texel.exr", texel().roll(-8, 1), half=False)
+    return folder
+
+
+def drawn(run: Path, name: str, *flags: str) -> Tensor:
+    out = run.parent / f"{name}.exr"
+    assert main(["render", str(run), "--camera", str(run.parent / "one.json"), "--out", str(out), *flags]) == 0
+    return read_image(out)
+
+
+def test_one_texel_is_the_flag_light(finished: Path) -> None:
+    (light,) = illuminate(Environment(texel()), 1, facts()).conditions
+    words = {k: ",".join(f"{x:.9g}" for x in v.tolist()) for k, v in light.items()}
+    one = drawn(finished, "light", f"--light={words['light']}", f"--light-intensity={words['light_intensity']}")
+    file = str(finished.parent / "texel.exr")
+    assert torch.allclose(drawn(finished, "around", "--environment", file), one, atol=1e-6)
+    assert one.std() > 0.05 and torch.allclose(one[0, 0], torch.full((3,), 0.5), atol=1e-6)
+    double = drawn(finished, "double", "--environment", file, "--environment-scale", "2")
+    assert not torch.allclose(double, one, atol=1e-2) and torch.allclose(double[0, 0], one[0, 0], atol=1e-6)
+
+
+def test_rotation_is_a_turned_image(finished: Path) -> None:
+    flags = ["--environment", str(finished.parent / "texel.exr")]
+    still, turned = drawn(finished, "still", *flags), drawn(finished, "turned", *flags, "--environment-rotation", "90")
+    rolled = drawn(finished, "rolled", "--environment", str(finished.parent / "rolled_texel.exr"))
+    assert torch.allclose(turned, rolled, atol=1e-6) and not torch.allclose(turned, still, atol=1e-2)
+
+
+def test_several_cameras_and_films(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flags = ["--camera", str(finished.parent / "cameras.json"), "--environment", str(finished.parent / "texel.exr")]
+    assert main(["render", str(finished), *flags, "--out", str(finished.parent / "many")]) == 0
+    assert sorted(p.name for p in (finished.parent / "many").iterdir()) == ["camera_000.png", "camera_001.png"]
+    assert main(["render", str(finished), *flags, "--format", "gif", "--out", str(finished.parent / "film.gif")]) == 0
+    with Image.open(finished.parent / "film.gif") as film:
+        assert film.size == (16, 12)
+    capsys.readouterr()
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    capsys.readouterr()
+    assert main(["render", *words]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and error.startswith("neuprim: error: ")
+    return error
+
+
+def test_refusals(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = str(finished.parent / "texel.exr")
+    base = [str(finished), "--camera", str(finished.parent / "one.json")]
+    assert "--light and --environment: give one of them" in refusal(capsys, *base, "--environment", file, "--light", "1,2,3")
+    assert "--environment-samples is given without --environment" in refusal(capsys, *base, "--environment-samples", "9")
+    assert "'0': expected a whole number from 1 to 4096" in refusal(capsys, *base, "--environment", file, "--environment-samples", "0")
+    assert "expected an angle in degrees" in refusal(capsys, *base, "--environment", file, "--environment-rotation", "nan")
+    assert "no.exr: file not found" in refusal(capsys, *base, "--environment", "no.exr")
+    assert "did you mean '--environment'" in refusal(capsys, *base, "--enviroment", file)
+    negative = texel()
+    negative[0, 0, 0] = -1.0
+    write_exr(finished.parent / "negative.exr", negative, half=False)
+    assert "radiance -1.0 at row 0, column 0, channel 0" in refusal(capsys, *base, "--environment", str(finished.parent / "negative.exr"))
+
+
+def test_what_the_model_never_saw_is_one_line(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_exr(finished.parent / "below.exr", texel(15), half=False)
+    base = ["render", str(finished), "--camera", str(finished.parent / "one.json"), "--out", str(finished.parent / "b.exr")]
+    assert main([*base, "--environment", str(finished.parent / "below.exr")]) == 0
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "below.exr: 100% of the environment's light comes from more than 15 degrees" in error
+    assert main([*base, "--environment", str(finished.parent / "texel.exr")]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_tasks_without_light_refuse(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from neuprim.tasks.static import TASK as static
+
+    config = compose(["task=static", "scene=blender", "scene.path=nowhere", "model.neurons=2"])
+    (finished / "config.yaml").write_text(config.to_yaml())
+    t = scenes.tensors(3, 2)
+    _, field = static.build({**vars(config.model), "options": config.options}, type("D", (), {"channels": 3})())  # type: ignore[arg-type]
+    params = {k: v for k, v in t.items() if k != "colors"} | {s.name: torch.zeros(3, *s.shape) for s in field.parameters()}
+    checkpoint.save_model(finished / "model.safetensors", Primitives(CosineDensity(2), field, params), "static", {})
+    words = [str(finished), "--camera", str(finished.parent / "one.json"), "--environment", str(finished.parent / "texel.exr")]
+    assert "task 'static' has no light that it could replace" in refusal(capsys, *words)

@@ -1,6 +1,6 @@
 """Quality of the relighting task on `lit_solids`: ways of colouring at equal training time, where shadows come from, and losses.
 
-    python benchmarks/relight_quality.py [--seconds 300] [--seeds 3] [--parts forms losses] [--variants ...] [--tune] [--readme] [--docs]
+    python benchmarks/relight_quality.py [--seconds 300] [--seeds 3] [--parts forms losses] [--variants ...] [--once ...] [--tune] [--readme] [--docs]
 
 Parts:
 
@@ -99,6 +99,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--parts", nargs="*", default=["forms", "losses"], help="none: print what is recorded")
     parser.add_argument("--variants", nargs="*", default=list(FORMS))
+    parser.add_argument("--once", nargs="*", default=[], help="variants that run with the first seed only")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="further settings of every run")
     parser.add_argument("--tune", action="store_true", help="held-out training views; nothing is recorded")
     parser.add_argument("--readme", action="store_true")
@@ -121,6 +122,8 @@ def main() -> None:
             recorded[part] = [e for e in recorded.get(part, []) if e["name"] not in own]
         for seed in range(args.seeds):
             for (part, name), words in everything.items():
+                if seed and (name in args.once or part in args.once):
+                    continue
                 each = paces[f"{part}: {name}"]
                 found = fit([*words, f"train.iterations={round(args.seconds / each)}", f"seed={seed}"], dataset)
                 recorded[part].append({"name": name, "ms_a_step": 1e3 * each, **found})

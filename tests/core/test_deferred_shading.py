@@ -1,0 +1,100 @@
+"""Factors per pixel: where they are asked for, what they multiply, and what they leave alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from neuprim.core.primitives import Lowered
+from neuprim.core.ray_cameras import RayCamera
+from neuprim.core.render import RenderSettings, render_lowered
+from neuprim.core.render.shading import points_seen
+from tests import scenes
+
+BACKGROUND = torch.tensor([0.3, 0.6, 0.9])
+
+
+def lowered() -> Lowered:
+    return scenes.lowered(scenes.tensors(12, 3, seed=4))
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_points_are_where_the_depth_image_says(backend: str) -> None:
+    camera, found = scenes.camera(), []
+    settings = RenderSettings(backend=backend, depth=True)  # type: ignore[arg-type]
+    plain = render_lowered(lowered(), camera, settings)
+    assert plain.depth is not None
+
+    def shade(points: torch.Tensor) -> torch.Tensor:
+        found.append(points)
+        return torch.ones(len(points))
+
+    shaded = render_lowered(replace(lowered(), shade=shade), camera, settings)
+    hit = plain.alpha > 0
+    assert found[0].dtype == torch.float64 and len(found[0]) == int(hit.sum())
+    view = camera.viewmat.double()
+    x, y, z = (found[0] @ view[:3, :3].T + view[:3, 3]).unbind(-1)
+    rows, columns = torch.nonzero(hit, as_tuple=True)
+    assert torch.allclose(z, plain.depth[hit].double(), atol=1e-9)
+    assert torch.allclose(camera.fx * x / z + camera.cx, columns.double() + 0.5, atol=1e-6)
+    assert torch.allclose(camera.fy * y / z + camera.cy, rows.double() + 0.5, atol=1e-6)
+    assert torch.allclose(shaded.rgb, plain.rgb, atol=1e-6)
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_matter_is_shaded_and_the_background_is_not(backend: str) -> None:
+    camera, settings = scenes.camera(), RenderSettings(backend=backend)  # type: ignore[arg-type]
+    black = render_lowered(lowered(), camera, settings)
+    half = render_lowered(replace(lowered(), shade=lambda p: torch.full((len(p),), 0.5)), camera, settings, BACKGROUND)
+    expected = 0.5 * black.rgb + (1 - black.alpha)[..., None] * BACKGROUND
+    assert half.depth is None and torch.equal(half.alpha, black.alpha)
+    assert torch.allclose(half.rgb, expected.to(half.rgb), atol=1e-5)
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_gradients_are_those_of_the_product(backend: str) -> None:
+    """Against a factor put on by hand to the picture over black; a depth image that nothing is asked of adds nothing."""
+    camera, settings = scenes.camera(), RenderSettings(backend=backend)  # type: ignore[arg-type]
+    weights = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
+    grads = []
+    for shaded in (True, False):
+        t = {k: v.clone().requires_grad_() for k, v in scenes.tensors(12, 3, seed=4).items()}
+        scene = scenes.lowered(t)
+        if shaded:
+            rgb = render_lowered(replace(scene, shade=lambda p: torch.sigmoid(p[:, 0])), camera, settings).rgb
+        else:
+            plain = render_lowered(scene, camera, replace(settings, depth=True))
+            assert plain.depth is not None
+            points = points_seen(plain.depth, camera)
+            factor = torch.where(plain.alpha > 0, torch.sigmoid(points[..., 0]).to(plain.rgb), 1.0).detach()
+            rgb = plain.rgb * factor[..., None]
+        (rgb * weights.to(rgb)).sum().backward()
+        grads.append({k: v.grad for k, v in t.items() if v.grad is not None})
+    assert grads[0].keys() == grads[1].keys() and len(grads[0]) >= 7
+    for name, found in grads[0].items():
+        assert torch.equal(found, grads[1][name]), name
+
+
+def test_more_rays_per_pixel_are_shaded_one_by_one() -> None:
+    """A factor of 0 or 1 with an edge inside pixels gives values in between."""
+    camera = scenes.camera()
+
+    def edge(points: torch.Tensor) -> torch.Tensor:
+        return (points[:, 0] > 0.0137).float()
+
+    full = render_lowered(lowered(), camera, RenderSettings(samples=3)).rgb
+    cut = render_lowered(replace(lowered(), shade=edge), camera, RenderSettings(samples=3)).rgb
+    ratio = (cut / full.clamp_min(1e-6))[full.sum(-1) > 0.1]
+    assert bool(((ratio > 0.05) & (ratio < 0.95)).any()) and bool((ratio > 0.999).any()) and bool((ratio < 0.001).any())
+
+
+def test_ray_cameras_are_shaded_at_a_distance() -> None:
+    pinhole = scenes.camera()
+    y, x = torch.meshgrid(*(torch.arange(n).double() + 0.5 for n in (pinhole.height, pinhole.width)), indexing="ij")
+    rays = torch.stack([(x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy, torch.ones_like(x)], -1).double()
+    length = rays.norm(dim=-1)
+    camera = RayCamera(pinhole.viewmat, rays / length[..., None])
+    depth = torch.rand(pinhole.height, pinhole.width, generator=torch.Generator().manual_seed(0)).double() + 1.0
+    assert torch.allclose(points_seen(depth * length, camera), points_seen(depth, pinhole), atol=1e-12)

@@ -153,6 +153,32 @@ def test_shadows_carry_no_gradient_and_are_bounded() -> None:
     assert not found.requires_grad and bool(((found >= 0) & (found <= 1)).all())
 
 
+@pytest.mark.parametrize("distance", [1e3, 1e8, 1e18])
+def test_distant_lights_cast_the_shadows_of_near_ones(distance: float) -> None:
+    geometry, density = slabs()
+    direction = torch.tensor([0.2, 0.1, 1.0])
+    near, far = (light_visibility(geometry, density, d * direction)(geometry.means) for d in (100.0, distance))
+    assert float(near.min()) < 0.1 and float(near.max()) > 0.9 and torch.allclose(near, far, atol=0.05)
+
+
+@pytest.mark.parametrize("polar", [0.0, 40.0, 70.0, 80.0])
+def test_a_flat_floor_does_not_shadow_itself(polar: float) -> None:
+    """A floor of flat discs, in points between their centres, under light down to 10 degrees above it."""
+    side = torch.linspace(-1, 1, 15)
+    means = torch.cat([torch.cartesian_prod(side, side), torch.zeros(225, 1)], -1)
+    scales = torch.tensor([0.15, 0.15, 0.01]).log().expand(225, 3)
+    geometry = Geometry(means, scales, torch.tensor([[1.0, 0, 0, 0]] * 225))
+    density = Cosine(torch.zeros(225, 0, 3), torch.zeros(225, 0), torch.zeros(225, 0), torch.full((225, 1), 100.0))
+    angle = math.radians(polar)
+    light = 4.5 * torch.tensor([math.sin(angle), 0.0, math.cos(angle)])
+    inner = torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) * 1.8 - 0.9
+    points = torch.cat([inner, torch.zeros(500, 1)], -1).double()
+    assert float(light_visibility(geometry, density, light)(points).min()) > 0.85
+    below = points - torch.tensor([0.0, 0.0, 0.6], dtype=torch.float64)
+    under = below[(below[:, 0] + 0.6 * math.tan(angle)).abs() < 0.8]  # whose light would have to cross the floor
+    assert not len(under) or float(light_visibility(geometry, density, light)(under).max()) < 0.1
+
+
 # ---------------------------------------------------------------- harmonics
 
 

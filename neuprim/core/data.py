@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
@@ -15,6 +16,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.fields import Conditions
 
 if TYPE_CHECKING:
+    from neuprim.core.density_truth import DensityTruth
     from neuprim.core.primitives import Primitives
 
 __all__ = ["Clip", "DataSource", "Dataset", "Pixels", "PointCloud", "View", "ViewSet", "camera_extent"]
@@ -178,6 +180,17 @@ class Dataset(ABC):
     def diagnose(self, model: Primitives) -> dict[str, Any]:
         """Further JSON-able numbers for ``metrics.json`` that only this kind of data can tell."""
         return {}
+
+    def density_truth(self, path: Path | None = None) -> DensityTruth | None:
+        """The extinction that the scene was made from, or None where that is not known.
+
+        Args:
+            path: an OpenVDB file, or a folder of frames, to take in its place, read by the scene's own rules.
+
+        Raises:
+            DataError: nothing in ``path`` fits.
+        """
+        return None
 
     def orbit(self, frames: int) -> list[View]:
         """Views circling the scene at the training cameras' mean distance and elevation."""

@@ -9,30 +9,19 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from neuprim.core.density_grid import density_grid
+from neuprim.core.density_grid import agreement, density_grid, lattice
 from neuprim.core.primitives import Primitives
 from neuprim.tasks.dynamic.volume.medium import Medium
 
 if TYPE_CHECKING:
     from neuprim.tasks.dynamic.volume.shoot import Shoot
 
-__all__ = ["compare_with_truth", "extinction_on", "lattice"]
+__all__ = ["RESOLUTION", "compare_with_truth", "extinction_on"]
 
 RESOLUTION = 96
 """Points along the longest side of the box that both are compared on."""
 
 THIRDS = ("early", "middle", "late")
-
-
-def lattice(bounds: np.ndarray, resolution: int = RESOLUTION) -> tuple[Tensor, tuple[int, int, int]]:
-    """(4, 4) scene_from_index and shape of a regular grid of cell centres that fills a (2, 3) box."""
-    low, high = np.asarray(bounds, np.float64)
-    step = float((high - low).max()) / resolution
-    x, y, z = (max(1, round(float(side) / step)) for side in high - low)
-    matrix = torch.eye(4, dtype=torch.float64) * step
-    matrix[3, 3] = 1.0
-    matrix[:3, 3] = torch.from_numpy(low + step / 2)
-    return matrix, (x, y, z)
 
 
 def extinction_on(medium: Medium, scene_from_index: Tensor, shape: tuple[int, int, int]) -> np.ndarray:
@@ -54,17 +43,13 @@ def compare_with_truth(model: Primitives, shoot: Shoot, times: list[float], per_
     """
     count = len(shoot.frames)
     chosen = sorted({int((i + 0.5) * count / (3 * per_third)) for i in range(3 * per_third)})
-    matrix, shape = lattice(shoot.bounds)
+    matrix, shape = lattice(shoot.bounds, RESOLUTION)
     entries: list[dict[str, Any]] = []
     for t in chosen:
-        truth = extinction_on(shoot.medium(shoot.frames[t]), matrix, shape).astype(np.float64)
-        found = density_grid(model, {"time": torch.tensor(times[t])}, matrix, shape).numpy().astype(np.float64)
-        if truth.std() == 0:
-            continue
-        correlation = float(np.corrcoef(truth.ravel(), found.ravel())[0, 1]) if found.std() > 0 else 0.0
-        error = float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
-        third = THIRDS[min(3 * t // count, 2)]
-        entries.append({"frame": shoot.frames[t].number, "third": third, "correlation": correlation, "relative_l2": error})
+        truth = extinction_on(shoot.medium(shoot.frames[t]), matrix, shape)
+        numbers = agreement(truth, density_grid(model, {"time": torch.tensor(times[t])}, matrix, shape).numpy())
+        if numbers is not None:
+            entries.append({"frame": shoot.frames[t].number, "third": THIRDS[min(3 * t // count, 2)], **numbers})
     result: dict[str, Any] = {"sigma_frames": entries}
     for key in ("correlation", "relative_l2"):
         for third in THIRDS:

@@ -19,6 +19,7 @@ from neuprim.core.primitives import Primitives
 from neuprim.tasks.dynamic.dead import dead_fraction
 from neuprim.tasks.dynamic.volume.compare import compare_with_truth
 from neuprim.tasks.dynamic.volume.shoot import Shoot
+from neuprim.tasks.dynamic.volume.truth import VolumeTruth
 
 __all__ = ["MEMORY", "MEMORY_TEST", "FrameViews", "VolumeDataset"]
 
@@ -155,6 +156,9 @@ class VolumeDataset(Dataset):
             "dead_fraction": dead_fraction(model, self.test.times),
             **compare_with_truth(model, self.shoot, [float(t) for t in self.test.times]),
         }
+
+    def density_truth(self, path: Path | None = None) -> VolumeTruth:
+        return VolumeTruth(self.shoot, path)
 
 
 def _stored(path: Path) -> dict[str, Any]:

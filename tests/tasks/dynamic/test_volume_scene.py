@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from neuprim.core.density_grid import lattice
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.task import SceneContext
 from neuprim.core.vdb import Grid, scale_transform, write_vdb

@@ -146,7 +146,7 @@ class _Film:
             raise ConfigError(f"--grid {request.grid}: expected at most {round(POINTS_LIMIT ** (1 / 3))}")
         self.matrix, self.shape = lattice(box, request.grid)
         self.numbers = [self._compare(i, request) for i in range(len(self))]
-        self.top, self.gain = self._scale(box)
+        self.top, self.gain, self.focus = self._scale(box)
         low, high = ([round(x, 4) for x in corner] for corner in np.asarray(box).tolist())
         request.say(
             f"extinction of {self.model.count} primitives on {' x '.join(map(str, self.shape))} points from {low} to {high} scene units, "
@@ -173,24 +173,28 @@ class _Film:
         request.say(f"{self.truth.frames[number].name}  {in_words(conditions)}  {words}")
         return numbers
 
-    def _scale(self, box: np.ndarray) -> tuple[float, float]:
-        """Largest extinction shown, and by how much volumes are shown more or less opaque than they are."""
+    def _scale(self, box: np.ndarray) -> tuple[float, float, tuple[float, ...]]:
+        """Largest extinction shown, by how much volumes are shown more or less opaque than they are, and the middle of the matter."""
         matrix, shape = lattice(box, _COARSE)
-        most, depth = 0.0, 0.0
+        most, depth, total = 0.0, 0.0, np.zeros(shape)
         for conditions, number in self.pairs:
             grids = [density_grid(self.model, conditions, matrix, shape).numpy()]
             if self.truth is not None:
                 grids.append(self.truth.grid(number, matrix, shape).numpy())
+            total += grids[-1]
             for grid in grids:
                 filled = grid[grid > 0]
                 most = max(most, float(np.quantile(filled, 0.995))) if filled.size else most
                 depth = max(depth, *(float(grid.sum(axis).max()) * float(matrix[0, 0]) for axis in range(3)))
-        return round_up(most), _DEPTH / depth if depth > 0 else 1.0
+        weights = total + 1e-12 * (total.max() or 1.0)
+        index = [float(np.average(np.arange(n), weights=weights.sum(tuple({0, 1, 2} - {a})))) for a, n in enumerate(shape)]
+        focus = matrix[:3, :3].numpy() @ np.array(index) + matrix[:3, 3].numpy()
+        return round_up(most), _DEPTH / depth if depth > 0 else 1.0, tuple(focus.tolist())
 
     def frame(self, index: int) -> FieldFrame:
         """A fresh frame; its grids live as long as it does."""
         conditions, number = self.pairs[index]
-        made = FieldFrame(self.model, conditions, in_words(conditions), self.matrix, self.shape, self.top, self.gain)
+        made = FieldFrame(self.model, conditions, in_words(conditions), self.matrix, self.shape, self.top, self.gain, self.focus)
         made = replace(made, color_space=self.color_space, needed=self.needed, options=self.options, numbers=self.numbers[index])
         truth = self.truth
         if truth is None:

@@ -46,6 +46,7 @@ class FieldFrame:
         title: the conditions in words, e.g. "time 0.5".
         scene_from_index, shape: of the grid; its axes are the scene's.
         top: largest extinction shown, 1/scene unit; the same for all frames, so that colours mean the same.
+        focus: (3,) middle of the matter of all frames, scene units.
         gain: by which a volume's opacity is stronger than the density's own, for the same reason the same for all frames.
         needed: names of the conditions of the model's task.
         truth: (X, Y, Z) float32 ground truth on the grid, or None; computed when called.
@@ -60,6 +61,7 @@ class FieldFrame:
     shape: tuple[int, int, int]
     top: float
     gain: float
+    focus: tuple[float, ...] = (0.0, 0.0, 0.0)
     color_space: str = "srgb"
     needed: tuple[str, ...] = ()
     options: ViewOptions = field(default_factory=ViewOptions)

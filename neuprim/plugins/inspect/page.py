@@ -71,6 +71,7 @@ def write_page(path: Path, film: Frames, inspectors: Sequence[Inspector]) -> Non
         "step": first.step,
         "top": first.top,
         "gain": first.gain,
+        "focus": [float(x) for x in (np.array(first.focus) - first.box[0]) / (first.box[1] - first.box[0])],
         "modes": [v for v in _VIEWS if there.get(v, True)],
         "first": names[0],
         "lut": _colours(COLOURS),

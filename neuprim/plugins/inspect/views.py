@@ -24,17 +24,17 @@ FAINT = 1.0 / 255.0
 
 def _bar(frame: FieldFrame, title: str = UNIT) -> dict[str, Any]:
     """A scalar bar of the frame's own panel; plotters tell bars apart by their titles only."""
-    look = {"title_font_size": 15, "label_font_size": 13, "n_labels": 3, "fmt": "%.3g", "color": "white"}
+    look = {"title_font_size": 15, "label_font_size": 13, "n_labels": 2, "fmt": "%.3g", "color": "white"}
     return {"title": title + " " * frame.panel, "width": 0.6, "height": 0.09, "position_x": 0.2, "position_y": 0.02, **look}
 
 
-def _add_bar(plotter: Any, frame: FieldFrame, low: float, colours: str, title: str = UNIT) -> None:
+def _add_bar(plotter: Any, frame: FieldFrame, clim: tuple[float, float], colours: str, title: str = UNIT) -> None:
     """A scalar bar that does not hang on what is drawn: opaque, and there where nothing else is."""
     import pyvista
 
     ends = pyvista.PolyData(np.repeat(frame.box[:1], 2, 0))
-    ends["values"] = np.array([low, frame.top], np.float32)
-    plotter.add_mesh(ends, scalars="values", cmap=colours, clim=(low, frame.top), point_size=1, scalar_bar_args=_bar(frame, title))
+    ends["values"] = np.array(clim, np.float32)
+    plotter.add_mesh(ends, scalars="values", cmap=colours, clim=clim, point_size=1, scalar_bar_args=_bar(frame, title))
 
 
 def _outline(plotter: Any, frame: FieldFrame) -> None:
@@ -51,30 +51,31 @@ def _opacities(frame: FieldFrame, values: np.ndarray) -> np.ndarray:
     return alpha
 
 
-def _add_volume(plotter: Any, frame: FieldFrame, values: np.ndarray, low: float, colours: str, title: str) -> None:
-    ramp = np.linspace(low, frame.top, _STEPS)
-    data = image(frame, np.clip(values, low, frame.top))
+def _add_volume(plotter: Any, frame: FieldFrame, values: np.ndarray, clim: tuple[float, float], colours: str, title: str) -> None:
+    ramp = np.linspace(*clim, _STEPS)
+    data = image(frame, np.clip(values, *clim))
     plotter.add_volume(
         data,
         scalars="values",
         cmap=colours,
-        clim=(low, frame.top),
+        clim=clim,
         opacity=np.rint(255 * _opacities(frame, ramp)),
         opacity_unit_distance=frame.step,
         shade=False,
         mapper="smart",
         show_scalar_bar=False,
     )
-    _add_bar(plotter, frame, low, colours, title)
+    _add_bar(plotter, frame, clim, colours, title)
     _outline(plotter, frame)
 
 
 def _volume(plotter: Any, frame: FieldFrame) -> None:
-    _add_volume(plotter, frame, frame.sigma, 0.0, COLOURS, UNIT)
+    _add_volume(plotter, frame, frame.sigma, (0.0, frame.top), COLOURS, UNIT)
 
 
 def _difference(plotter: Any, frame: FieldFrame) -> None:
-    _add_volume(plotter, frame, frame.difference, -frame.top, "coolwarm", "model - truth [1/scene unit]")
+    reach = frame.top / 2  # errors are smaller than what they are errors of
+    _add_volume(plotter, frame, frame.difference, (-reach, reach), "coolwarm", "model - truth [1/scene unit]")
 
 
 def levels_of(frame: FieldFrame) -> tuple[float, ...]:
@@ -99,12 +100,11 @@ def _isosurface(plotter: Any, frame: FieldFrame) -> None:
                 show_scalar_bar=False,
             )
     _outline(plotter, frame)
-    _add_bar(plotter, frame, 0.0, SURFACES)
+    _add_bar(plotter, frame, (0.0, frame.top), SURFACES)
 
 
 def _slices(plotter: Any, frame: FieldFrame) -> None:
-    low, high = frame.box
-    x, y, z = (low + high) / 2
+    x, y, z = frame.focus
     cut = image(frame, frame.sigma).slice_orthogonal(x=x, y=y, z=z)
     plotter.add_mesh(cut, scalars="values", cmap=COLOURS, clim=(0.0, frame.top), lighting=False, scalar_bar_args=_bar(frame))
     _outline(plotter, frame)
@@ -135,7 +135,7 @@ def _primitives(plotter: Any, frame: FieldFrame) -> None:
             mesh, scalars="colour", rgb=True, smooth_shading=True, ambient=0.3, diffuse=0.8, specular=0.15, show_scalar_bar=False
         )
     _outline(plotter, frame)
-    words = f"{len(chosen)} of {frame.model.count} primitives at their true size\nleft out: opacity below {FAINT:g}"
+    words = f"{len(chosen)} of {frame.model.count} primitives at their true size\nleft out: opacity below 1/255"
     plotter.add_text(words, position="lower_right", font_size=8, color="white")
 
 
@@ -183,7 +183,7 @@ def _primitive(plotter: Any, frame: FieldFrame) -> None:
 
 VOLUME = Inspector(API_VERSION, "volume", "the extinction as a cloud", _volume)
 ISOSURFACE = Inspector(API_VERSION, "isosurface", "surfaces of equal extinction", _isosurface)
-SLICES = Inspector(API_VERSION, "slices", "three planes through the middle of the box", _slices)
+SLICES = Inspector(API_VERSION, "slices", "three planes through the middle of the matter", _slices)
 PRIMITIVES = Inspector(API_VERSION, "primitives", "the ellipsoids in their own colours", _primitives, shows="model")
 PRIMITIVE = Inspector(API_VERSION, "primitive", "the density inside one primitive, cut open", _primitive, shows="primitive")
 DIFFERENCE = Inspector(API_VERSION, "difference", "model minus ground truth", _difference, shows="both")

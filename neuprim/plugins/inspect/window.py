@@ -34,7 +34,8 @@ class Window:
         import pyvista
 
         self.panels = list(panels)
-        columns = len(panels) if len(panels) <= 3 else -(-len(panels) // 2)
+        paired = any(side == "truth" for _, side in panels)  # then each row has a view of the model and the same of the truth
+        columns = len(panels) if len(panels) <= 3 else 2 if paired else -(-len(panels) // 2)
         self.shape = (-(-len(panels) // columns), columns)
         asked = size or (columns * _PANEL[0], self.shape[0] * _PANEL[1])
         make: Any = pyvista.Plotter
@@ -76,8 +77,8 @@ class Window:
                 away_here = one.rotations[0].double().numpy() @ np.array([1.0, -1.0, 0.9])
                 away_here, up = away_here / np.linalg.norm(away_here), one.rotations[0].double().numpy()[:, 2]
             else:
-                margin = 0.92  # the box is seen at an angle
-                center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+                margin, radius = 0.97, float(np.linalg.norm(high - low)) / 2  # the box is seen at an angle
+                center = (low + high) / 2 - 0.08 * radius * np.eye(3)["xyz".index(self._up)]  # the scalar bar is below
                 away_here, up = away, np.eye(3)["xyz".index(self._up)]
             camera = self.plotter.camera
             camera.focal_point, camera.up = center, up

@@ -77,7 +77,7 @@ class Window:
                 away_here = one.rotations[0].double().numpy() @ np.array([1.0, -1.0, 0.9])
                 away_here, up = away_here / np.linalg.norm(away_here), one.rotations[0].double().numpy()[:, 2]
             else:
-                margin, radius = 0.97, float(np.linalg.norm(high - low)) / 2  # the box is seen at an angle
+                margin, radius = 1.02, float(np.linalg.norm(high - low)) / 2  # the box is seen at an angle
                 center = (low + high) / 2 - 0.08 * radius * np.eye(3)["xyz".index(self._up)]  # the scalar bar is below
                 away_here, up = away, np.eye(3)["xyz".index(self._up)]
             camera = self.plotter.camera

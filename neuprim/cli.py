@@ -9,13 +9,12 @@ from __future__ import annotations
 import argparse
 import errno
 import os
-import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from neuprim import __version__
+from neuprim import __version__, arguments
 from neuprim.core.errors import ConfigError, NeuprimError, nearest
 from neuprim.environment_flags import add_environment_flags, environment_of
 
@@ -97,9 +96,8 @@ def _dispatch(words: list[str]) -> int:
     if args.command == "run":
         args.overrides += [word for word in rest if not word.startswith("-")]  # argparse gives up on words after a flag
         rest = [word for word in rest if word.startswith("-")]
-    if args.command == "render":
-        own = [flag for flag in commands["render"]._option_string_actions if flag.startswith("--")]
-        args.conditions, rest = _conditions(args.run_dir, rest, own)
+    if args.command in ("render", "inspect"):
+        args.conditions, rest = _conditions(args.run_dir, rest, args.command, commands[args.command])
     if rest:
         known = [flag for flag in commands[args.command]._option_string_actions if flag.startswith("--")]
         raise ConfigError(f"{rest[0]}: no such argument of `neuprim {args.command}`{nearest(rest[0], known)}")
@@ -134,11 +132,13 @@ def _parsers(with_tasks: bool) -> tuple[Parser, dict[str, argparse.ArgumentParse
     )
     render.add_argument("run_dir", type=Path, metavar="RUN_DIR")
     render.add_argument("--camera", required=True, metavar="orbit|test|FILE.json", help="which cameras")
-    render.add_argument("--size", type=_size, metavar="WxH", help="pixels (default: the data set's)")
+    render.add_argument("--size", type=arguments.size, metavar="WxH", help="pixels (default: the data set's)")
     render.add_argument("--format", choices=("png", "exr", "webp", "gif", "mp4"), help="default: png, or webp for an animation")
-    render.add_argument("--fps", type=_rate, metavar="F", help="frames per second of an animation (default: about four seconds in all)")
+    render.add_argument(
+        "--fps", type=arguments.rate, metavar="F", help="frames per second of an animation (default: about four seconds in all)"
+    )
     render.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
-    render.add_argument("--frames", type=_count, default=60, metavar="N", help="frames of an orbit (default: 60)")
+    render.add_argument("--frames", type=arguments.count, default=60, metavar="N", help="frames of an orbit (default: 60)")
     add_environment_flags(render)
 
     export = command("export", _export, "write a run's model in another format", "Formats and their options: docs/export.md.")
@@ -152,6 +152,33 @@ def _parsers(with_tasks: bool) -> tuple[Parser, dict[str, argparse.ArgumentParse
     back = command("import", _import, "make a run directory of an exported .ply or .npz")
     back.add_argument("file", type=Path, metavar="FILE")
     back.add_argument("--out", type=Path, required=True, metavar="RUN_DIR", help="new directory")
+
+    inspect = command(
+        "inspect",
+        _inspect,
+        "look inside a run's density",
+        "Each condition of the run's task is a flag, given after RUN_DIR: --time 0.5, or several frames: --time 0:1:20, --time 0.2,0.8.",
+    )
+    inspect.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    inspect.add_argument(
+        "--show", default="", metavar="NAME,...", help="volume, isosurface, slices, primitives, primitive, difference, ..."
+    )
+    inspect.add_argument("--primitives", action="store_true", help="the ellipsoids in their own colours; as --show primitives")
+    inspect.add_argument("--primitive", type=arguments.row, metavar="INDEX", help="look into this one; as --show primitive")
+    inspect.add_argument("--against", metavar="FILE.vdb|DIR|scene", help="ground truth to compare with")
+    inspect.add_argument(
+        "--grid", type=arguments.count, default=128, metavar="N", help="points along the box's longest side (default: 128)"
+    )
+    inspect.add_argument(
+        "--box",
+        type=arguments.numbers,
+        metavar="X,Y,Z,X,Y,Z",
+        help="two corners, scene units, as --box=-1,-1,-1,1,1,1 (default: around all matter)",
+    )
+    inspect.add_argument("--level", type=arguments.numbers, default=[], metavar="S,...", help="extinctions of isosurfaces, 1/scene unit")
+    inspect.add_argument("--up", choices=("x", "y", "z"), help="the upward axis (default: the scene's, or z)")
+    inspect.add_argument("--size", type=arguments.size, metavar="WxH", help="pixels of the picture or window")
+    inspect.add_argument("--out", type=Path, metavar="FILE", help=".png, .webp, .gif, .mp4, .html or .vdb (default: a window)")
 
     vdb = command("vdb", _vdb, "look into OpenVDB files", "`info` lists grids: type, transform, bounds, active voxels, values, memory.")
     vdb.add_argument("action", choices=("info",), metavar="info", help="what to do")
@@ -249,6 +276,19 @@ def _import(args: argparse.Namespace) -> int:
     return 0
 
 
+def _inspect(args: argparse.Namespace) -> int:
+    run_dir = _run_directory(args.run_dir)
+    from neuprim.plugins.inspect import Request, ViewOptions, corners, inspect_run
+
+    names = [name.strip() for name in args.show.split(",") if name.strip()]
+    names += ["primitives"] * args.primitives + ["primitive"] * (args.primitive is not None)
+    options, box = ViewOptions(tuple(args.level), args.primitive), None if args.box is None else corners(args.box)
+    more = {"options": options, "against": args.against, "out": args.out, "size": args.size, "up": args.up}
+    for path in inspect_run(Request(run_dir, names or ["volume"], args.conditions, args.grid, box, **more)):
+        print(path)
+    return 0
+
+
 def _vdb(args: argparse.Namespace) -> int:
     from neuprim.vdb_info import vdb_info
 
@@ -278,24 +318,21 @@ def _doctor(args: argparse.Namespace) -> int:
 # ---------------------------------------------------------------- arguments
 
 
-def _conditions(run_dir: Path, words: list[str], own: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """Condition name -> text, from the flags that the run's task defines, and the words that are none of them.
-
-    ``own``: flags of the command itself, to suggest where a word is none of either.
-    """
+def _conditions(run_dir: Path, words: list[str], command: str, known: argparse.ArgumentParser) -> tuple[dict[str, str], list[str]]:
+    """Condition name -> text, from the flags that the run's task defines, and the words that are none of them."""
     if not words:
         return {}, []
     from neuprim.config import RunConfig
     from neuprim.plugins.registry import load_task
 
     spec = load_task(RunConfig.from_yaml(_run_directory(run_dir)).task)
-    parser = Parser(prog="neuprim render", add_help=False, allow_abbrev=False)
+    parser = Parser(prog=f"neuprim {command}", add_help=False, allow_abbrev=False)
     for condition in spec.conditions:
         parser.add_argument("--" + condition.name.replace("_", "-"), dest=condition.name)
     args, rest = parser.parse_known_args(words)
     if rest:
-        flags = [*own, *parser._option_string_actions]
-        raise ConfigError(f"{rest[0]}: no such argument of `neuprim render` for task {spec.name!r}{nearest(rest[0], flags)}")
+        flags = [flag for flag in (*known._option_string_actions, *parser._option_string_actions) if flag.startswith("--")]
+        raise ConfigError(f"{rest[0]}: no such argument of `neuprim {command}` for task {spec.name!r}{nearest(rest[0], flags)}")
     return {name: text for name, text in vars(args).items() if text is not None}, []
 
 
@@ -303,29 +340,6 @@ def _run_directory(path: Path) -> Path:
     if not path.is_dir():
         raise ConfigError(f"{path}: no such run directory")
     return path
-
-
-def _size(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"([1-9]\d{0,5})[xX]([1-9]\d{0,5})", text)
-    if not match:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected WIDTHxHEIGHT, for example 640x480")
-    return int(match.group(1)), int(match.group(2))
-
-
-def _count(text: str) -> int:
-    if not re.fullmatch(r"[1-9]\d{0,6}", text):
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a positive count")
-    return int(text)
-
-
-def _rate(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.1 <= value <= 240.0:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected 0.1 to 240 frames per second")
-    return value
 
 
 def _task_names() -> str:

@@ -10,6 +10,7 @@ from neuprim.core.files import cache_directory
 from neuprim.core.task import SceneContext
 from neuprim.core.volume_source import VolumeSource
 from neuprim.evaluate import load_dataset, load_run
+from neuprim.plugins.registry import find_scene
 
 __all__ = ["trained_model"]
 
@@ -27,7 +28,7 @@ def trained_model(run_dir: Path, progress: Progress = lambda text, fraction: Non
         field.set_progress(1.0)
 
     def volume() -> VolumeSource | None:
-        load = task.scene(config.scene_name).volume
+        load = find_scene(task, config.scene_name).spec.volume
         return load(config.scene, SceneContext(config.seed, cache_directory() / "scenes", progress)) if load else None
 
     return TrainedModel(run_dir, task, model, header, config.scene, config.renderer, lambda: load_dataset(config, task, progress), volume)

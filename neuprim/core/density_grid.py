@@ -1,10 +1,14 @@
 """The model's extinction on a regular grid: sigma(x) = sum over primitives of max(0, f(x~)) / m, inside their ellipsoids.
 
 A primitive's f may be negative in places, where it is clamped at 0; a renderer clamps the integral along a ray instead.
+
+Along an axis of the grid a neuron's phase is linear in the index, so its cosine at a grid point is a product of one complex number per
+axis: a primitive that spans n^3 points costs 3 n sines and cosines per neuron, and two multiplications per neuron and point.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,48 +16,23 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.fields import Conditions, Cosine
+from neuprim.core.fields import Conditions, Cosine, DensityField
+from neuprim.core.geometry import Geometry
 from neuprim.core.primitives import Primitives
 from neuprim.core.render.cpu.compile import exact_kernel
 from neuprim.core.render.cpu.threads import parallel_for
 
-__all__ = ["RESOLUTION", "agreement", "density_grid", "lattice"]
+__all__ = ["POINTS_LIMIT", "agreement", "density_at", "density_grid", "lattice"]
 
-RESOLUTION = 96
-"""Points along the longest side of the box that a model's extinction is compared on."""
+_SLAB = 8  # planes per unit of work; fixed, and the result does not depend on it
+_PAIRS = 1 << 17  # of points and primitives that a density in torch code is asked for at once
 
-_SLAB = 4  # planes per unit of work; fixed, and the result does not depend on it
-
-
-def density_grid(
-    model: Primitives, conditions: Conditions, scene_from_index: Tensor, shape: tuple[int, int, int], threads: int = 0
-) -> Tensor:
-    """(X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``.
-
-    Args:
-        conditions: of the frame, e.g. ``{"time": tensor(0.5)}``.
-        scene_from_index: (4, 4) float64 affine map.
-        threads: 0 for all cores; the result does not depend on it.
-
-    Raises:
-        ConfigError: the density is not a cosine network.
-    """
-    with torch.no_grad():
-        geometry, form = model.lower_density(conditions)
-        if not isinstance(form, Cosine):
-            raise ConfigError(f"a {type(form).__name__} density cannot be put on a grid; expected Cosine")
-        wide = [x.detach().double().numpy() for x in (geometry.means, geometry.scales, geometry.rotations, form.W1, form.b1, form.w2)]
-        offset = form.b2.detach().double().reshape(-1).numpy()
-    forward = scene_from_index.detach().double().numpy()
-    back = np.linalg.inv(forward)
-    grid = np.zeros(shape, np.float32)
-    arguments = [np.ascontiguousarray(x) for x in (*wide, offset, forward[:3], back[:3])]
-    parallel_for(_fill, shape[0], _SLAB, threads, *arguments, form.omega0, grid)
-    return torch.from_numpy(grid)
+POINTS_LIMIT = 2**30
+"""Most points of a grid, 4 GiB of float32."""
 
 
-def lattice(bounds: np.ndarray, resolution: int = RESOLUTION) -> tuple[Tensor, tuple[int, int, int]]:
-    """(4, 4) scene_from_index and shape of a regular grid of cell centres that fills a (2, 3) box."""
+def lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, tuple[int, int, int]]:
+    """(4, 4) scene_from_index and shape of a regular grid of cell centres that fills a (2, 3) box, ``resolution`` along its longest side."""
     low, high = np.asarray(bounds, np.float64)
     step = float((high - low).max()) / resolution
     x, y, z = (max(1, round(float(side) / step)) for side in high - low)
@@ -63,13 +42,98 @@ def lattice(bounds: np.ndarray, resolution: int = RESOLUTION) -> tuple[Tensor, t
     return matrix, (x, y, z)
 
 
-def agreement(truth: np.ndarray, found: np.ndarray) -> tuple[float, float] | None:
-    """Pearson correlation and relative L2 error of ``found`` against ``truth``, of one shape; None where the truth is all the same."""
-    truth, found = truth.astype(np.float64), found.astype(np.float64)
-    if truth.std() == 0:
+def agreement(truth: np.ndarray, found: np.ndarray) -> dict[str, float] | None:
+    """Pearson ``correlation`` and ``relative_l2`` = |found - truth| / |truth| of two grids; None where the truth is the same everywhere."""
+    a, b = truth.astype(np.float64), found.astype(np.float64)
+    if a.std() == 0:
         return None
-    correlation = float(np.corrcoef(truth.ravel(), found.ravel())[0, 1]) if found.std() > 0 else 0.0
-    return correlation, float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
+    correlation = float(np.corrcoef(a.ravel(), b.ravel())[0, 1]) if b.std() > 0 else 0.0
+    return {"correlation": correlation, "relative_l2": float(np.linalg.norm(b - a) / np.linalg.norm(a))}
+
+
+def density_grid(
+    model: Primitives, conditions: Conditions, scene_from_index: Tensor, shape: tuple[int, int, int], threads: int = 0
+) -> Tensor:
+    """(X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``.
+
+    What lowers to a :class:`~neuprim.core.fields.Cosine` runs in compiled code on all cores; any other density is asked point by
+    point, in blocks. Beside the grid it takes a few MB.
+
+    Args:
+        conditions: of the frame, e.g. ``{"time": tensor(0.5)}``.
+        scene_from_index: (4, 4) float64 affine map, invertible.
+        threads: 0 for all cores; the result does not depend on it.
+
+    Raises:
+        ConfigError: more than :data:`POINTS_LIMIT` points, or a map that is singular or not finite.
+    """
+    forward = scene_from_index.detach().double().numpy()
+    count = int(np.prod(np.array(shape, np.float64)))
+    if count > POINTS_LIMIT:
+        raise ConfigError(f"a grid of {' x '.join(map(str, shape))} points: expected at most {POINTS_LIMIT}")
+    if not np.isfinite(forward).all() or abs(np.linalg.det(forward[:3, :3])) == 0:
+        raise ConfigError(f"scene_from_index {forward.tolist()}: expected a finite, invertible affine map")
+    back = np.linalg.inv(forward)
+    grid = np.zeros(shape, np.float32)
+    with torch.no_grad():
+        geometry, form = model.lower_density(conditions)
+        wide = [x.detach().double().numpy() for x in (geometry.means, geometry.scales, geometry.rotations)]
+        if not isinstance(form, Cosine):
+            _ask(model, conditions, wide, forward, back, grid)
+            return torch.from_numpy(grid)
+        wide += [x.detach().double().numpy() for x in (form.W1, form.b1, form.w2, form.b2.reshape(-1))]
+    arguments = [np.ascontiguousarray(x) for x in (*wide, forward[:3], back[:3])]
+    parallel_for(_fill, shape[0], _SLAB, threads, *arguments, form.omega0, grid)
+    return torch.from_numpy(grid)
+
+
+def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Tensor:
+    """(M,) float64 extinction, 1/scene unit, at (M, 3) points: every primitive at every point, in float64. Slow, short, and the oracle."""
+    with torch.no_grad():
+        sigma, geometry = _double(model, conditions)
+        total = torch.zeros(len(points), dtype=torch.float64)
+        whiten = geometry.rotations / geometry.scales[:, None, :]
+        for part in torch.arange(len(points)).split(max(1, _PAIRS // max(geometry.count, 1))):
+            x = points[part].double()
+            y = torch.einsum("mna,nab->mnb", x[:, None, :] - geometry.means, whiten)
+            row, prim = (y.square().sum(-1) < 1.0).nonzero(as_tuple=True)
+            total.index_add_(0, part[row], sigma(prim, x[row]).clamp_min(0))
+    return total
+
+
+def _double(model: Primitives, conditions: Conditions) -> tuple[Callable[[Tensor, Tensor], Tensor], Geometry]:
+    """(primitives, points) -> unclamped sigma, and where the ellipsoids are, of those that live in a frame, in float64."""
+    density: DensityField = model.density
+    rows = density.alive(model.of(density), conditions)
+    params = {name: (p if rows is None else p.index_select(0, rows)).detach().double() for name, p in model.params.items()}
+    own = {s.name: params[s.name] for s in density.parameters()}
+    wide = {name: value.double() for name, value in conditions.items()}
+    stored = Geometry(params["means"], params["log_scales"], params["quats"])
+    return lambda prim, x: density.density(own, stored, prim, x, wide), density.move(own, stored, wide)
+
+
+def _ask(model: Primitives, conditions: Conditions, wide: list[Any], P: np.ndarray, Q: np.ndarray, grid: np.ndarray) -> None:
+    """Adds a density in torch code, primitive by primitive in a fixed order, so that the sums are the same every time."""
+    sigma, _ = _double(model, conditions)
+    means, scales, R = wide
+    limit = np.array(grid.shape)
+    for n in range(len(means)):
+        center = Q[:3, :3] @ means[n] + Q[:3, 3]
+        reach = np.linalg.norm((Q[:3, :3] @ R[n]) * scales[n], axis=1)
+        low = np.clip(np.ceil(np.clip(center - reach, -1e9, 1e9)), 0, limit).astype(int)
+        high = np.clip(np.floor(np.clip(center + reach, -1e9, 1e9)) + 1, 0, limit).astype(int)
+        size = high - low
+        if (size <= 0).any():
+            continue
+        planes = max(1, _PAIRS // int(size[1] * size[2]))
+        for start in range(low[0], high[0], planes):
+            block = (slice(start, min(start + planes, high[0])), slice(low[1], high[1]), slice(low[2], high[2]))
+            index = np.stack(np.meshgrid(*(np.arange(s.start, s.stop) for s in block), indexing="ij"), -1)
+            x = index @ P[:3, :3].T + P[:3, 3]
+            inside = (np.square(((x - means[n]) @ R[n]) / scales[n]).sum(-1) < 1.0).nonzero()
+            points = torch.from_numpy(x[inside])
+            found = sigma(torch.full((len(points),), n), points).clamp_min(0).numpy()
+            grid[block][inside] += found.astype(np.float32)
 
 
 @exact_kernel
@@ -78,8 +142,11 @@ def _fill(
 ) -> None:
     """Planes start:stop. P (3, 4) maps indices to the scene, Q (3, 4) back."""
     K = W1.shape[1]
-    x, y, low, high = np.empty(3), np.empty(3), np.empty(3, np.int64), np.empty(3, np.int64)
+    longest = max(grid.shape[1], grid.shape[2], stop - start)
+    low, high, steps, y = np.empty(3, np.int64), np.empty(3, np.int64), np.empty((3, 3)), np.empty(3)
+    cosines, sines, row, origin = np.empty((3, K, longest)), np.empty((3, K, longest)), np.empty(grid.shape[2]), np.empty(3)
     for n in range(means.shape[0]):
+        empty = False
         for a in range(3):  # the ellipsoid's box in indices
             center, reach = Q[a, 3], 0.0
             for j in range(3):
@@ -89,21 +156,53 @@ def _fill(
             reach = np.sqrt(reach)
             low[a] = max(int(np.ceil(max(center - reach, -1e9))), 0)
             high[a] = min(int(np.floor(min(center + reach, 1e9))) + 1, grid.shape[a])
-        low[0], high[0] = max(low[0], start), min(high[0], stop)
+            if a == 0:
+                low[0], high[0] = max(low[0], start), min(high[0], stop)
+            empty = empty or low[a] >= high[a]
+        if empty:
+            continue
         m = max(scales[n, 0], scales[n, 1], scales[n, 2])
-        for i in range(low[0], high[0]):
-            for j in range(low[1], high[1]):
-                for k in range(low[2], high[2]):
-                    radius = 0.0
-                    for a in range(3):
-                        x[a] = P[a, 0] * i + P[a, 1] * j + P[a, 2] * k + P[a, 3] - means[n, a]
-                    for a in range(3):
-                        y[a] = (R[n, 0, a] * x[0] + R[n, 1, a] * x[1] + R[n, 2, a] * x[2]) / scales[n, a]
-                        radius += y[a] * y[a]
-                    if radius >= 1.0:
-                        continue
-                    f = b2[n]
-                    for q in range(K):
-                        f += w2[n, q] * np.cos(omega0 * ((W1[n, q, 0] * x[0] + W1[n, q, 1] * x[1] + W1[n, q, 2] * x[2]) / m + b1[n, q]))
-                    if f > 0.0:
-                        grid[i, j, k] += np.float32(f / m)
+        for a in range(3):
+            origin[a] = P[a, 0] * low[0] + P[a, 1] * low[1] + P[a, 2] * low[2] + P[a, 3] - means[n, a]
+            for j in range(3):  # a step along grid axis a, on the whitened axes j
+                steps[a, j] = (R[n, 0, j] * P[0, a] + R[n, 1, j] * P[1, a] + R[n, 2, j] * P[2, a]) / scales[n, j]
+        for q in range(K):
+            for a in range(3):
+                rate = omega0 * (W1[n, q, 0] * P[0, a] + W1[n, q, 1] * P[1, a] + W1[n, q, 2] * P[2, a]) / m
+                first = 0.0
+                if a == 0:
+                    first = omega0 * ((W1[n, q, 0] * origin[0] + W1[n, q, 1] * origin[1] + W1[n, q, 2] * origin[2]) / m + b1[n, q])
+                for i in range(high[a] - low[a]):
+                    cosines[a, q, i] = np.cos(first + rate * i)
+                    sines[a, q, i] = np.sin(first + rate * i)
+        length = high[2] - low[2]
+        square = steps[2, 0] ** 2 + steps[2, 1] ** 2 + steps[2, 2] ** 2
+        for i in range(high[0] - low[0]):
+            for j in range(high[1] - low[1]):
+                half, rest = 0.0, -1.0  # |y + k step|^2 = 1 at the ends of the row inside the ellipsoid
+                for a in range(3):
+                    y[a] = (R[n, 0, a] * origin[0] + R[n, 1, a] * origin[1] + R[n, 2, a] * origin[2]) / scales[n, a]
+                    y[a] += steps[0, a] * i + steps[1, a] * j
+                    half -= y[a] * steps[2, a]
+                    rest += y[a] * y[a]
+                inner = half * half - square * rest
+                if not inner > 0.0:
+                    continue
+                root = np.sqrt(inner)
+                first_k = max(int(np.ceil(max((half - root) / square, -1.0))), 0)
+                last_k = min(int(np.ceil(min((half + root) / square, 1e9))), length)
+                if first_k >= last_k:
+                    continue
+                f = row[: last_k - first_k]  # slices, as the compiler makes vector code of them only
+                f[:] = b2[n]
+                for q in range(K):
+                    c = cosines[0, q, i] * cosines[1, q, j] - sines[0, q, i] * sines[1, q, j]
+                    s = sines[0, q, i] * cosines[1, q, j] + cosines[0, q, i] * sines[1, q, j]
+                    c, s = c * w2[n, q], s * w2[n, q]
+                    cos_k, sin_k = cosines[2, q, first_k:last_k], sines[2, q, first_k:last_k]
+                    for k in range(len(f)):
+                        f[k] += c * cos_k[k] - s * sin_k[k]
+                sums = grid[low[0] + i, low[1] + j, low[2] + first_k : low[2] + last_k]
+                for k in range(len(f)):
+                    if f[k] > 0.0:
+                        sums[k] += np.float32(f[k] / m)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -125,12 +125,15 @@ class Inspector:
     Attributes:
         add: (pyvista plotter, :class:`~neuprim.plugins.inspect.field.FieldFrame`) draws one frame into the plotter; called again with
             the next frame after the plotter's actors of the last one were removed.
+        shows: "sigma" for the extinction on the frame's grid, drawn a second time from the ground truth where there is one; "model"
+            for the primitives themselves; "primitive" for a single one, with a camera of its own; "both" for what needs the truth.
     """
 
     api: int
     name: str
     summary: str
     add: Callable[[Any, Any], None]
+    shows: Literal["sigma", "model", "primitive", "both"] = "sigma"
 
 
 @dataclass(frozen=True)

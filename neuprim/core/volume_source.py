@@ -78,10 +78,12 @@ class VolumeSource(ABC):
     Attributes:
         placement: see :class:`Placement`.
         bounds: (2, 3) box around all matter of all frames, scene units.
+        resolution: points along the box's longest side on which the data set itself compares models with the files.
     """
 
     placement: Placement
     bounds: np.ndarray
+    resolution: int
 
     @abstractmethod
     def conditions(self, index: int) -> Conditions:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from neuprim.core.cosine import CosineDensity
-from neuprim.core.density_grid import density_grid
+from neuprim.core.density_grid import agreement, density_at, density_grid
 from neuprim.core.errors import ConfigError
 from neuprim.core.gaussian import GaussianDensity
+from neuprim.core.geometry import Geometry
 from neuprim.core.primitives import Primitives
 from neuprim.core.schema import InitContext
+from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
 
@@ -28,16 +31,21 @@ def model(neurons: int = 5) -> Primitives:
 def oracle(m: Primitives, matrix: Tensor) -> Tensor:
     """Every primitive at every point, each clamped at zero inside its ellipsoid."""
     index = torch.cartesian_prod(*(torch.arange(n, dtype=torch.float64) for n in SHAPE))
-    points = index @ matrix[:3, :3].T + matrix[:3, 3]
-    params = {k: v.double() for k, v in m.of(m.density).items()}
-    wide = Primitives(m.density, m.colour, {k: v.double() for k, v in m.params.items()})
-    total = torch.zeros(len(points), dtype=torch.float64)
+    return density_at(m, {}, index @ matrix[:3, :3].T + matrix[:3, 3]).reshape(SHAPE)
+
+
+def test_the_oracle_is_the_sum_over_primitives_one_by_one() -> None:
+    m, points = model(), torch.rand(50, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 0.5
+    params, total = {k: v.double() for k, v in m.params.items()}, torch.zeros(50, dtype=torch.float64)
+    g = Geometry(params["means"], params["log_scales"], params["quats"])
     for n in range(m.count):
-        prim = torch.full((len(points),), n)
-        y = ((points - wide.geometry.means[n]) @ wide.geometry.rotations[n]) / wide.geometry.scales[n]
-        sigma = m.density.density(params, wide.geometry, prim, points, {}).clamp_min(0)
-        total += torch.where(y.square().sum(1) < 1, sigma, 0.0)
-    return total.reshape(SHAPE)
+        for i, x in enumerate(points):
+            local = x - g.means[n]
+            y, u = (local @ g.rotations[n]) / g.scales[n], local / g.scales[n].max()
+            f = (params["w2"][n] * (30 * (params["W1"][n] @ u + params["b1"][n])).cos()).sum() + params["b2"][n, 0]
+            total[i] += f.clamp_min(0) / g.scales[n].max() * (y.norm() < 1)
+    assert float(total.max()) > 0.5
+    assert torch.allclose(density_at(m, {}, points), total, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("sheared", [False, True])
@@ -67,8 +75,49 @@ def test_primitives_far_away_or_huge_are_no_trouble() -> None:
     assert bool(torch.isfinite(grid).all())
 
 
-def test_other_densities_are_refused() -> None:
+def gaussians() -> Primitives:
     generator = torch.Generator().manual_seed(0)
-    context = InitContext(torch.zeros(2, 3), torch.ones(2), torch.zeros(2, 3), generator)
-    with pytest.raises(ConfigError, match="Opaque density cannot be put on a grid"):
-        density_grid(Primitives.initialise(GaussianDensity(), SphericalHarmonics(0), context), {}, torch.eye(4).double(), SHAPE)
+    means = 0.3 * torch.rand(5, 3, generator=generator)
+    return Primitives.initialise(
+        GaussianDensity(), SphericalHarmonics(0), InitContext(means, torch.full((5,), 0.4), torch.zeros(5, 3), generator)
+    )
+
+
+def test_a_density_in_torch_code_is_asked_point_by_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    m, matrix = gaussians(), torch.diag(torch.tensor([0.1, 0.1, 0.1, 1.0], dtype=torch.float64))
+    expected = oracle(m, matrix)
+    assert float(expected.max()) > 0.1
+    whole = density_grid(m, {}, matrix, SHAPE)
+    assert torch.allclose(whole.double(), expected, rtol=1e-5, atol=1e-6)
+    monkeypatch.setattr("neuprim.core.density_grid._PAIRS", 20)  # blocks of single planes
+    assert torch.equal(density_grid(m, {}, matrix, SHAPE, threads=2), whole)
+
+
+def test_a_moving_density_is_where_it_has_moved_to() -> None:
+    density = TimeDensity(2, "window+motion")
+    generator = torch.Generator().manual_seed(3)
+    context = InitContext(
+        torch.zeros(3, 3), torch.full((3,), 0.4), torch.zeros(3, 3), generator, conditions={"time": torch.full((3,), 0.5)}
+    )
+    m = Primitives.initialise(density, SphericalHarmonics(0), context)
+    m.params["velocity"][:] = torch.tensor([1.0, 0.5, 0.0])
+    matrix, frame = torch.diag(torch.tensor([0.1, 0.1, 0.1, 1.0], dtype=torch.float64)), {"time": torch.tensor(0.6)}
+    index = torch.cartesian_prod(*(torch.arange(n, dtype=torch.float64) for n in SHAPE))
+    expected = density_at(m, frame, index @ matrix[:3, :3].T).reshape(SHAPE)
+    assert float(expected.max()) > 0.1 and not torch.allclose(
+        expected, density_at(m, {"time": torch.tensor(0.5)}, index @ matrix[:3, :3].T).reshape(SHAPE)
+    )
+    assert torch.allclose(density_grid(m, frame, matrix, SHAPE).double(), expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(("scale", "shape"), [(0.0, SHAPE), (float("nan"), SHAPE), (0.1, (1 << 12, 1 << 12, 1 << 12))])
+def test_impossible_grids_are_refused(scale: float, shape: tuple[int, int, int]) -> None:
+    with pytest.raises(ConfigError, match="expected"):
+        density_grid(model(0), {}, torch.diag(torch.tensor([scale] * 3 + [1.0], dtype=torch.float64)), shape)
+
+
+def test_agreement_of_two_grids() -> None:
+    a = np.array([0.0, 1.0, 2.0, 5.0], np.float32)
+    assert agreement(a, 2 * a) == pytest.approx({"correlation": 1.0, "relative_l2": 1.0})
+    assert agreement(a, np.zeros(4)) == {"correlation": 0.0, "relative_l2": 1.0}
+    assert agreement(np.ones(4), a) is None

@@ -235,7 +235,7 @@ def _errors(
 ) -> dict[str, float]:
     """The model and the written file, each against the source, on the lattice of ``metrics.json``."""
     assert frame.source is not None
-    matrix, shape = lattice(source.bounds)
+    matrix, shape = lattice(source.bounds, source.resolution)
     truth = source.sigma(frame.source, matrix, shape)
     both = agreement(truth, density_grid(job.run.model, frame.conditions, matrix, shape, job.run.settings.threads).numpy())
     if both is None:
@@ -243,7 +243,7 @@ def _errors(
     from scipy import ndimage
 
     name = f"frame_{source.placement.numbers[frame.source]:04d}"
-    result = {f"{name}.correlation": both[0], f"{name}.relative_l2": both[1]}
+    result = {f"{name}.correlation": both["correlation"], f"{name}.relative_l2": both["relative_l2"]}
     grid = read_grid(path, str(job.options.get("name", "density")))
     if grid.bounds is None:
         return result
@@ -252,7 +252,7 @@ def _errors(
     found = ndimage.map_coordinates(grid.to_dense(), points, order=1, mode="grid-constant", cval=0.0).reshape(shape) / factor
     written = agreement(truth, found)
     assert written is not None
-    return {**result, f"{name}.file_correlation": written[0], f"{name}.file_relative_l2": written[1]}
+    return {**result, f"{name}.file_correlation": written["correlation"], f"{name}.file_relative_l2": written["relative_l2"]}
 
 
 EXPORTER = Exporter(API_VERSION, "vdb", "the density as OpenVDB, one file per frame; lossy (sampled)", _write, OPTIONS, conditions=True)

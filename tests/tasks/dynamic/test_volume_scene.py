@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 import torch
 
+from neuprim.core.density_grid import lattice
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.task import SceneContext
 from neuprim.core.vdb import Grid, scale_transform, write_vdb
 from neuprim.tasks.dynamic.volume import shoot as shooting
-from neuprim.tasks.dynamic.volume.compare import extinction_on, lattice
+from neuprim.tasks.dynamic.volume.compare import extinction_on
 from neuprim.tasks.dynamic.volume.dataset import FrameViews, VolumeDataset
 from neuprim.tasks.dynamic.volume.scene import load
 from neuprim.tasks.dynamic.volume.settings import choose_frames

@@ -16,7 +16,10 @@ from neuprim.tasks.dynamic.volume.medium import Medium
 if TYPE_CHECKING:
     from neuprim.tasks.dynamic.volume.shoot import Shoot
 
-__all__ = ["compare_with_truth", "extinction_on"]
+__all__ = ["RESOLUTION", "compare_with_truth", "extinction_on"]
+
+RESOLUTION = 96
+"""Points along the longest side of the box that both are compared on."""
 
 THIRDS = ("early", "middle", "late")
 
@@ -40,16 +43,13 @@ def compare_with_truth(model: Primitives, shoot: Shoot, times: list[float], per_
     """
     count = len(shoot.frames)
     chosen = sorted({int((i + 0.5) * count / (3 * per_third)) for i in range(3 * per_third)})
-    matrix, shape = lattice(shoot.bounds)
+    matrix, shape = lattice(shoot.bounds, RESOLUTION)
     entries: list[dict[str, Any]] = []
     for t in chosen:
         truth = extinction_on(shoot.medium(shoot.frames[t]), matrix, shape)
-        both = agreement(truth, density_grid(model, {"time": torch.tensor(times[t])}, matrix, shape).numpy())
-        if both is None:
-            continue
-        correlation, error = both
-        third = THIRDS[min(3 * t // count, 2)]
-        entries.append({"frame": shoot.frames[t].number, "third": third, "correlation": correlation, "relative_l2": error})
+        numbers = agreement(truth, density_grid(model, {"time": torch.tensor(times[t])}, matrix, shape).numpy())
+        if numbers is not None:
+            entries.append({"frame": shoot.frames[t].number, "third": THIRDS[min(3 * t // count, 2)], **numbers})
     result: dict[str, Any] = {"sigma_frames": entries}
     for key in ("correlation", "relative_l2"):
         for third in THIRDS:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neuprim.core.fields import Conditions
 from neuprim.core.volume_source import Placement, VolumeSource
-from neuprim.tasks.dynamic.volume.compare import extinction_on
+from neuprim.tasks.dynamic.volume.compare import RESOLUTION, extinction_on
 from neuprim.tasks.dynamic.volume.shoot import Shoot
 
 __all__ = ["ShootSource", "placement_of"]
@@ -31,6 +31,8 @@ def placement_of(shoot: Shoot) -> Placement:
 
 class ShootSource(VolumeSource):
     """The frames of a :class:`~neuprim.tasks.dynamic.volume.shoot.Shoot`."""
+
+    resolution = RESOLUTION
 
     def __init__(self, shoot: Shoot) -> None:
         self.shoot, self.bounds, self.placement = shoot, np.asarray(shoot.bounds, np.float64), placement_of(shoot)

@@ -22,7 +22,9 @@ INCLUDES = {"changelog.md": "CHANGELOG.md", "contributing.md": "CONTRIBUTING.md"
 """Pages that are files of the repository's root, whose links are relative to it."""
 OUTWARD = re.compile(r"\]\(((?:\.\./)+)([^)#\s]+)\)")
 ROLE = re.compile(r":(?:class|func|meth|mod|data|attr|exc):<code[^>]*>(~?)([\w.]+)(?:\(\))?</code>")
-LOADED = re.compile(r"<(?:script|link|img|iframe|source|video|audio|embed|object)\b[^>]*?\b(?:src|href|data)=[\"']?((?:https?:)?//[^\"'>\s]+)", re.I)
+LOADED = re.compile(
+    r"<(?:script|link|img|iframe|source|video|audio|embed|object)\b[^>]*?\b(?:src|href|data)=[\"']?((?:https?:)?//[^\"'>\s]+)", re.I
+)
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:

@@ -72,7 +72,7 @@ def main(target: Path) -> None:
     left.plot(*ends[:, :2].T, color="black", lw=2)
     left.plot(*(origin + t_m * d)[:2], "o", color="black", ms=5)
     left.annotate("x$_m$", (origin + t_m * d)[:2], (6, -12), textcoords="offset points")
-    for label, end, shift in (("t$_0$", ends[0], (-14, 4)), ("t$_1$", ends[1], (6, -2))):
+    for label, end, shift in (("t$_0$", ends[0], (-14, 5)), ("t$_1$", ends[1], (2, 9))):
         left.annotate(label, end[:2], shift, textcoords="offset points")
     left.set(xlim=(-1.3, 1.3), ylim=(-0.85, 0.85), title="density of one primitive, a ray, their chord", xticks=[], yticks=[])
     left.spines[:].set_visible(False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import tomllib
@@ -15,6 +16,7 @@ from rich.console import Console
 
 from neuprim.cli import _parsers
 from neuprim.config import compose, compose_all
+from neuprim.core.camera_file import read_cameras
 from neuprim.core.errors import NeuprimError
 from neuprim.core.fields import ConditionSpec
 from neuprim.core.vdb import Grid, scale_transform, write_vdb
@@ -109,6 +111,18 @@ def test_blocks_that_do_not_run_are_few_and_known() -> None:
 
 def test_tables_of_this_test_name_pages_that_have_blocks() -> None:
     assert {*PREPARE, *AFTER} <= {name_of(page) for page in PYTHON}
+
+
+def test_json_blocks_are_json_and_the_cameras_are_cameras(tmp_path: Path) -> None:
+    texts = [b.text for b in EVERY if b.language == "json"]
+    (cameras,) = [text for text in texts if "frames" in json.loads(text)]
+    path = tmp_path / "cameras.json"
+    path.write_text(cameras)
+    first, second = [camera for _, camera in read_cameras(path)]
+    for camera in (first, second):  # both look at the middle of the scene
+        x, y, z, _ = camera.viewmat @ torch.tensor([0.0, 0.0, 0.5, 1.0], dtype=torch.float64)
+        assert z == 4 and abs(x) < 1e-12 and abs(y) < 1e-12
+    assert (second.fx, second.cx, second.cy) == (900, 300, 240)
 
 
 # ---------------------------------------------------------------- commands

@@ -44,7 +44,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
             if uri == source:
                 return f"]({'../' * len(folder.parts)}{name})"
         if files.get_file_from_path(uri) is None:
-            files.append(File.generated(config, uri, abs_src_path=str(path), inclusion=InclusionLevel.INCLUDED))
+            files.append(File(uri, str(ROOT), config.site_dir, config.use_directory_urls, inclusion=InclusionLevel.INCLUDED))
         return f"]({'../' * len(folder.parts)}{uri})"
 
     return OUTWARD.sub(inside, markdown)

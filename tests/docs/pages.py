@@ -42,14 +42,18 @@ def blocks(page: Path) -> list[Block]:
 
 
 def commands(block: Block, program: str) -> Iterator[list[str]]:
-    """The words after ``program`` in every command of a shell block; comments and ellipses are left out."""
+    """The words after ``program`` in every command of a shell block; comments, ellipses and the brackets of ``[--optional X]`` are left out."""
     for line in block.text.replace("\\\n", " ").splitlines():
         part: list[str] = []
+        optional = False
         lexer = shlex.shlex(line, posix=True, punctuation_chars="&;|")
         lexer.whitespace_split, lexer.commenters = True, "#"
         for word in [*lexer, ";"]:
             if not re.fullmatch(r"[&;|]+", word):
-                part += [word] * (word != "…")
+                optional = optional or word.startswith("[--")
+                plain = word.removeprefix("[").removesuffix("]") if optional else word
+                optional = optional and not word.endswith("]")
+                part += [plain] * (plain != "…")
                 continue
             at = next((i for i, w in enumerate(part) if w == program or w.endswith("/" + program)), None)
             if at is not None:

@@ -1,0 +1,209 @@
+"""What the documentation shows runs: Python blocks as they stand, commands as far as their words go."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from rich.console import Console
+
+from neuprim.cli import _parsers
+from neuprim.config import compose, compose_all
+from neuprim.core.camera_file import read_cameras
+from neuprim.core.errors import NeuprimError
+from neuprim.core.fields import ConditionSpec
+from neuprim.core.vdb import Grid, scale_transform, write_vdb
+from neuprim.plugins.registry import survey
+from neuprim.run import run
+from tests.docs.pages import PAGES, ROOT, Block, blocks, commands, name_of
+
+NOT_RUN: dict[str, int] = {}
+"""Page -> how many of its Python and shell blocks carry a comment ``<!-- not run: reason -->``."""
+
+EVERY = [block for page in PAGES for block in blocks(page)]
+PYTHON = [page for page in PAGES if any(b.language == "python" and b.skipped is None for b in blocks(page))]
+SHELL = [block for block in EVERY if block.language == "sh" and block.skipped is None]
+OF_THE_READER = {"docs/plugins.md": {"task=glow", "scene=ball", "train.loss=charbonnier"}}
+"""Page -> words of its commands that name what its reader writes; they are left out, the rest of the command is checked."""
+
+STAND_INS = {"DEG": "30", "N": "3", "F": "12", "WxH": "64x48"}
+"""Placeholders whose values the command line reads as numbers."""
+
+PLACEHOLDER = re.compile(r"[A-Z]{2,}")
+
+
+def place(block: Block) -> str:
+    return f"{name_of(block.page)}:{block.line}"
+
+
+# ---------------------------------------------------------------- Python
+
+
+@pytest.fixture(scope="module")
+def static_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny run of the built-in static scene."""
+    out = tmp_path_factory.mktemp("documented") / "static-solids"
+    small = ["scene.size=48", "scene.train_views=6", "scene.test_views=2", "model.primitives=50", "model.neurons=2"]
+    words = ["task=static", "scene=solids", f"output_dir='{out}'", *small, "train.iterations=5", "train.max_seconds=null"]
+    return run(compose(words), Console(quiet=True))
+
+
+def with_run(static_run: Path) -> None:
+    shutil.copytree(static_run, Path("outputs/static-solids"))
+
+
+def with_volumes(static_run: Path) -> None:
+    values = torch.rand(10, 10, 10).numpy()
+    grid = Grid.from_dense("density", values, lower=(0, 0, 0), transform=scale_transform(0.1))
+    Path("frames").mkdir()
+    for path in ("smoke.vdb", "frames/smoke_001.vdb", "frames/smoke_002.vdb"):
+        write_vdb(path, [grid])
+
+
+def has_frame(names: dict[str, Any]) -> None:
+    frame = names["frame"]
+    assert frame.rgb.shape == (48, 48, 3) and frame.alpha.shape == frame.depth.shape == (48, 48)
+    assert frame.alpha.max() > 0.1
+
+
+def has_copy(names: dict[str, Any]) -> None:
+    assert Path("copy.vdb").stat().st_size > 1000 and names["dense"].shape == (64, 64, 64) and len(names["frames"]) == 2
+
+
+def has_frames(names: dict[str, Any]) -> None:
+    assert names["frames"].rgb.shape == (2, 32, 48, 3) and names["frames"].alpha.max() > 0.1
+
+
+def has_same_metrics(names: dict[str, Any]) -> None:
+    assert names["metrics"]["psnr"] == names["again"]["psnr"] and len(names["files"]) == 3
+
+
+PREPARE: dict[str, Callable[[Path], None]] = {"README.md": with_run, "docs/data_formats.md": with_run, "docs/vdb.md": with_volumes}
+"""Page -> puts the files that its blocks talk about into the working directory."""
+
+AFTER: dict[str, Callable[[dict[str, Any]], None]] = {
+    "README.md": has_frame,
+    "docs/vdb.md": has_copy,
+    "docs/rasterize.md": has_frames,
+    "docs/getting_started.md": has_same_metrics,
+}
+"""Page -> checks what its blocks left behind."""
+
+
+@pytest.mark.parametrize("page", PYTHON, ids=name_of)
+def test_python_blocks(page: Path, static_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All blocks of a page in their order, in one namespace and an empty directory."""
+    monkeypatch.chdir(tmp_path)
+    torch.manual_seed(0)
+    PREPARE.get(name_of(page), lambda run: None)(static_run)
+    names: dict[str, Any] = {"__name__": "documentation"}
+    for block in blocks(page):
+        if block.language == "python" and block.skipped is None:
+            exec(compile("\n" * (block.line - 1) + block.text, str(page), "exec"), names)
+    AFTER.get(name_of(page), lambda names: None)(names)
+
+
+def test_blocks_that_do_not_run_are_few_and_known() -> None:
+    skipped = [name_of(b.page) for b in EVERY if b.skipped is not None]
+    assert {page: skipped.count(page) for page in skipped} == NOT_RUN
+
+
+def test_tables_of_this_test_name_pages_that_have_blocks() -> None:
+    assert {*PREPARE, *AFTER} <= {name_of(page) for page in PYTHON}
+    for page, words in OF_THE_READER.items():
+        text = (ROOT / page).read_text(encoding="utf-8") if (ROOT / page).exists() else " ".join(words)
+        assert [word for word in words if word not in text] == []
+
+
+def test_json_blocks_are_json_and_the_cameras_are_cameras(tmp_path: Path) -> None:
+    texts = [b.text for b in EVERY if b.language == "json"]
+    (cameras,) = [text for text in texts if "frames" in json.loads(text)]
+    path = tmp_path / "cameras.json"
+    path.write_text(cameras)
+    first, second = [camera for _, camera in read_cameras(path)]
+    for camera in (first, second):  # both look at the middle of the scene
+        x, y, z, _ = camera.viewmat @ torch.tensor([0.0, 0.0, 0.5, 1.0], dtype=torch.float64)
+        assert z == 4 and abs(x) < 1e-12 and abs(y) < 1e-12
+    assert (second.fx, second.cx, second.cy) == (900, 300, 240)
+
+
+# ---------------------------------------------------------------- commands
+
+
+@pytest.fixture(scope="module")
+def conditions() -> dict[str, ConditionSpec]:
+    """Flag of ``neuprim render`` and ``inspect`` -> the condition that defines it."""
+    specs = [report.spec for report in survey()]
+    return {"--" + c.name.replace("_", "-"): c for spec in specs if spec is not None for c in spec.conditions}
+
+
+def check(words: list[str], conditions: dict[str, ConditionSpec]) -> None:
+    """Raises where the command line or the configuration would refuse ``neuprim WORDS``."""
+    parser, known = _parsers(with_tasks=False)
+    args, rest = parser.parse_known_args(words)
+    if args.command == "run":
+        rest += args.overrides
+        settings = [word for word in rest if not word.startswith("-")]
+        rest = [word for word in rest if word.startswith("-")]
+        (compose_all if args.multirun else compose)(settings, False)
+    if args.command in ("render", "inspect"):
+        while rest and rest[0] in conditions:
+            if not PLACEHOLDER.search(rest[1]):
+                assert conditions[rest[0]].parse(rest[1])
+            rest = rest[2:]
+    assert rest == [], f"{rest} is no argument of neuprim {args.command}"
+    assert args.command in known
+
+
+@pytest.mark.parametrize("block", [b for b in SHELL if any(commands(b, "neuprim"))], ids=place)
+def test_commands(block: Block, conditions: dict[str, ConditionSpec], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    unknown = OF_THE_READER.get(name_of(block.page), set())
+    for words in commands(block, "neuprim"):
+        check([STAND_INS.get(word, word) for word in words if word not in unknown], conditions)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "neuprim run task=static model.primitive=3",
+        "neuprim run task=static scene=solid",
+        "neuprim run -m task=static model.neurons=0,99",
+        "neuprim run task=static --cgf",
+        "neuprim render RUN_DIR --camera orbit --sise 3x3",
+        "neuprim render RUN_DIR --camera orbit --time 2",
+        "neuprim evla RUN_DIR",
+    ],
+)
+def test_a_wrong_command_is_noticed(line: str, conditions: dict[str, ConditionSpec]) -> None:
+    (words,) = commands(Block(ROOT / "x.md", 1, "sh", f"cd x && .venv/bin/{line}  # text\n", None), "neuprim")
+    with pytest.raises((AssertionError, NeuprimError)):
+        check(words, conditions)
+
+
+def test_scripts_that_commands_name_exist() -> None:
+    text = {name_of(page): page.read_text(encoding="utf-8") for page in PAGES}
+    named = {
+        (page, path) for page, words in text.items() for path in re.findall(r"python3? ((?:benchmarks|docs|examples)/[\w/]+\.py)", words)
+    }
+    assert len(named) > 5
+    assert [(page, path) for page, path in named if not (ROOT / path).is_file()] == []
+
+
+def test_extras_that_pages_name_exist() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    found = [
+        (name_of(page), extra)
+        for page in PAGES
+        for names in re.findall(r"(?:neuprim|'\.)\[([a-z,]+)\]", page.read_text(encoding="utf-8"))
+        for extra in names.split(",")
+    ]
+    assert len(found) > 5
+    assert [pair for pair in found if pair[1] not in extras] == []

@@ -1,0 +1,59 @@
+"""What the site's hooks do to links, docstrings and pages that load from the network. Needs mkdocs (``neuprim[docs]``)."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from tests.docs.pages import ROOT
+
+for package in ("mkdocs", "material", "mkdocstrings"):
+    pytest.importorskip(package)
+
+
+@pytest.fixture(scope="module")
+def hooks() -> Any:
+    spec = importlib.util.spec_from_file_location("documentation_hooks", ROOT / "docs" / "hooks.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def page(uri: str) -> Any:
+    return SimpleNamespace(file=SimpleNamespace(src_uri=uri))
+
+
+def test_files_beside_the_pages_come_along(hooks: Any) -> None:
+    from mkdocs.config import load_config
+    from mkdocs.structure.files import Files
+
+    config = load_config(str(ROOT / "mkdocs.yml"))
+    files = Files([])
+    text = "[a](../examples/train_your_own.py) [b](../CONTRIBUTING.md) [c](../no.md) [d](vdb.md)"
+    changed = hooks.on_page_markdown(text, page("rasterize.md"), config, files)
+    assert changed == "[a](examples/train_your_own.py) [b](contributing.md) [c](../no.md) [d](vdb.md)"
+    assert [file.src_uri for file in files] == ["examples/train_your_own.py"]
+    assert hooks.on_page_markdown("[d](../vdb.md)", page("api/vdb.md"), config, files) == "[d](../vdb.md)"
+    changes = hooks.on_page_markdown("", page("changelog.md"), config, files)
+    assert "](relighting.md)" in changes and "](docs/" not in changes
+
+
+def test_roles_become_links(hooks: Any) -> None:
+    made = hooks.on_page_content("see :class:<code>~neuprim.core.errors.DataError</code>.")
+    assert made == 'see <autoref identifier="neuprim.core.errors.DataError" optional><code>DataError</code></autoref>.'
+
+
+@pytest.mark.parametrize(
+    "tag", ['<script src="https://a.b/c.js">', "<link rel=stylesheet href=//fonts.x/y>", '<img alt="x" src="http://a.b/c.png">']
+)
+def test_a_page_that_loads_from_the_network_is_a_warning(hooks: Any, caplog: pytest.LogCaptureFixture, tag: str) -> None:
+    with caplog.at_level(logging.WARNING):
+        hooks.on_post_page('<a href="https://arxiv.org/x">x</a> <img src="pictures/a.png">', page("a.md"))
+        assert caplog.messages == []
+        hooks.on_post_page(tag, page("a.md"))
+    assert len(caplog.messages) == 1 and "a.md would load" in caplog.messages[0]

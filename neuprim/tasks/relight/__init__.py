@@ -14,7 +14,7 @@ from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.tasks.relight.colour import FORMS, VISIBILITY, LightNetwork
 from neuprim.tasks.relight.environment import illuminate
 from neuprim.tasks.relight.harmonics import LightHarmonics
-from neuprim.tasks.relight.lights import parse_intensities, parse_lights
+from neuprim.tasks.relight.lights import parse_intensities, parse_lights, typical_light
 from neuprim.tasks.relight.loss import hdr_loss
 
 __all__ = ["TASK"]
@@ -28,12 +28,12 @@ _SETTINGS: dict[str, tuple[Any, ...] | type] = {
 }
 
 
-def _colour(model: Mapping[str, Any], channels: int = 3, falloff: bool = False) -> ColourField:
+def _colour(model: Mapping[str, Any], channels: int = 3, falloff: bool = False, typical: float = 1.0) -> ColourField:
     chosen = dict(model["colour"])
     if chosen.get("form") == "harmonics":
-        return LightHarmonics(chosen.get("degree", 5), channels, falloff)
+        return LightHarmonics(chosen.get("degree", 5), channels, falloff, typical)
     chosen.pop("degree", None)
-    return LightNetwork(channels=channels, falloff=falloff, **chosen)
+    return LightNetwork(channels=channels, falloff=falloff, typical=typical, **chosen)
 
 
 def _check(model: Mapping[str, Any]) -> None:
@@ -47,7 +47,7 @@ def _check(model: Mapping[str, Any]) -> None:
 
 def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
     falloff = getattr(dataset, "falloff", "none") == "inverse_square"
-    return CosineDensity(model["neurons"]), _colour(model, dataset.channels, falloff)
+    return CosineDensity(model["neurons"]), _colour(model, dataset.channels, falloff, typical_light(dataset, falloff))
 
 
 # Loaders are imported when used: each pulls in modules of its own.

@@ -5,7 +5,8 @@
     additive         c = V E max(0, c_dc + W_out h)                         equation 14: 9 -> H -> 3, 107 parameters at H = 8
     multiplicative   c = V E max(0, albedo (1 + w_out . h))                 no tinting: 86 parameters
 
-E is the light's intensity, divided by the squared distance where the data set says so; V the visibility of the light from the
+E is the light's intensity, divided by the squared distance where the data set says so, over that of a typical training light, so that
+learning rates do not depend on the data's unit of light; V the visibility of the light from the
 primitive (:mod:`neuprim.tasks.relight.visibility`) or 1. Everything but W_x x~ is constant over a primitive, so it folds into the
 closed form :class:`~neuprim.core.fields.RayNet`, which the renderer evaluates per pixel.
 """
@@ -41,6 +42,7 @@ class LightNetwork(ColourField):
             the centres of primitives ("primitive"), or at the point that each pixel shows ("pixel").
         boost: beta. 1 starts flat in the light's direction, 30 overfits (method: relighting).
         falloff: whether the light's intensity is divided by the squared distance, in scene units.
+        typical: E of a typical training light, in the data's units.
     """
 
     init_settings = ("output",)
@@ -53,6 +55,7 @@ class LightNetwork(ColourField):
         visibility: str = "pixel",
         boost: float = 3.0,
         falloff: bool = False,
+        typical: float = 1.0,
     ) -> None:
         if not isinstance(hidden, int) or not 0 <= hidden <= 16:
             raise ValueError(f"{hidden!r} hidden units; expected 0..16")
@@ -64,11 +67,14 @@ class LightNetwork(ColourField):
             raise ValueError(f"visibility {visibility!r}; expected {', '.join(VISIBILITY[:-1])} or {VISIBILITY[-1]}")
         if not 0 < boost <= 100:
             raise ValueError(f"boost {boost!r}; expected a number in (0, 100]")
+        if not 0 < typical < math.inf:
+            raise ValueError(f"typical light {typical!r}; expected a number above 0")
+        self.typical = float(typical)
         self.hidden, self.channels, self.form = hidden, channels, form
         self.visibility, self.boost, self.falloff = visibility, float(boost), bool(falloff)
 
     def settings(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in ("hidden", "channels", "form", "visibility", "boost", "falloff")}
+        return {name: getattr(self, name) for name in ("hidden", "channels", "form", "visibility", "boost", "falloff", "typical")}
 
     def parameters(self) -> list[ParameterSpec]:
         H, C = self.hidden, self.channels
@@ -94,7 +100,7 @@ class LightNetwork(ColourField):
         means = geometry.means
         view = unit(means - camera.position.to(means))
         to_light = conditions["light"].to(means) - means
-        strength = conditions["light_intensity"].to(means).expand(self.channels)
+        strength = conditions["light_intensity"].to(means).expand(self.channels) / self.typical
         factor = strength.expand(means.shape[0], -1)
         if self.falloff:
             factor = factor / to_light.square().sum(-1, keepdim=True).clamp_min(1e-12)

@@ -23,13 +23,15 @@ class LightHarmonics(ColourField):
     It knows neither the view (no highlights move) nor what stands between (no shadows move).
     """
 
-    def __init__(self, degree: int = 5, channels: int = 3, falloff: bool = False) -> None:
+    def __init__(self, degree: int = 5, channels: int = 3, falloff: bool = False, typical: float = 1.0) -> None:
         if not isinstance(degree, int) or not 0 <= degree <= 8:
             raise ValueError(f"spherical-harmonics degree {degree!r}; expected 0..8")
-        self.degree, self.channels, self.falloff = degree, channels, bool(falloff)
+        if not 0 < typical < math.inf:
+            raise ValueError(f"typical light {typical!r}; expected a number above 0")
+        self.degree, self.channels, self.falloff, self.typical = degree, channels, bool(falloff), float(typical)
 
     def settings(self) -> dict[str, Any]:
-        return {"degree": self.degree, "channels": self.channels, "falloff": self.falloff}
+        return {name: getattr(self, name) for name in ("degree", "channels", "falloff", "typical")}
 
     def parameters(self) -> list[ParameterSpec]:
         C, rest = self.channels, (self.degree + 1) ** 2 - 1
@@ -45,7 +47,7 @@ class LightHarmonics(ColourField):
         if self.degree:
             bands = real_harmonics(unit(to_light), self.degree)[:, 1:]
             color = color + (bands[:, :, None] * params["light_sh"]).sum(1)
-        strength = conditions["light_intensity"].to(color) / (squared if self.falloff else 1.0)
+        strength = conditions["light_intensity"].to(color) / self.typical / (squared if self.falloff else 1.0)
         return Constant(color.clamp_min(0.0) * strength)
 
 

@@ -7,9 +7,10 @@ import math
 import torch
 from torch import Tensor
 
+from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 
-__all__ = ["ORBIT", "parse_intensities", "parse_lights"]
+__all__ = ["ORBIT", "parse_intensities", "parse_lights", "typical_light"]
 
 ORBIT = (4.5, 40.0, 60)
 """Distance in scene units, polar angle in degrees and frames of ``--light orbit``."""
@@ -58,3 +59,17 @@ def _numbers(text: str, name: str, expected: str) -> Tensor:
     if len(values) != 3 or not all(math.isfinite(v) for v in values):
         raise ConfigError(f"--{name} {text}: {expected}")
     return torch.tensor(values)
+
+
+def typical_light(dataset: Dataset, falloff: bool) -> float:
+    """Median over the training views of the light's mean intensity, over its squared distance from the scene's centre with ``falloff``.
+
+    1 where that is zero: a data set in the dark has no unit of light.
+    """
+    values = []
+    for i in range(len(dataset.train)):
+        conditions = dataset.train.view(i).conditions
+        squared = (conditions["light"].double() - dataset.center.double()).square().sum().clamp_min(1e-12)
+        values.append(conditions["light_intensity"].double().mean() / (squared if falloff else 1.0))
+    found = float(torch.stack(values).median())
+    return found if 0 < found < math.inf else 1.0

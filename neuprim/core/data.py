@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
@@ -16,7 +15,6 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.fields import Conditions
 
 if TYPE_CHECKING:
-    from neuprim.core.density_truth import DensityTruth
     from neuprim.core.primitives import Primitives
     from neuprim.core.volume_source import Placement
 
@@ -195,17 +193,6 @@ class Dataset(ABC):
     def facts(self) -> dict[str, Any]:
         """JSON-able facts that drawing the model may need when the data are gone; kept in the model's header under "data"."""
         return {"up": [float(x) for x in self.up], "center": [float(x) for x in self.center]}
-
-    def density_truth(self, path: Path | None = None) -> DensityTruth | None:
-        """The extinction that the scene was made from, or None where that is not known.
-
-        Args:
-            path: an OpenVDB file, or a folder of frames, to take in its place, read by the scene's own rules.
-
-        Raises:
-            DataError: nothing in ``path`` fits.
-        """
-        return None
 
     def orbit(self, frames: int) -> list[View]:
         """Views circling the scene at the training cameras' mean distance and elevation."""

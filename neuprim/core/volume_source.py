@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
+from neuprim.core.density_truth import DensityTruth
 from neuprim.core.errors import DataError
-from neuprim.core.fields import Conditions
 
 __all__ = ["Placement", "VolumeSource"]
 
@@ -72,27 +72,23 @@ class Placement:
         return made
 
 
-class VolumeSource(ABC):
-    """The files themselves, one frame at a time.
+class VolumeSource(DensityTruth):
+    """The files themselves, one frame at a time; ``frames`` are those of the placement.
 
     Attributes:
         placement: see :class:`Placement`.
-        bounds: (2, 3) box around all matter of all frames, scene units.
-        resolution: points along the box's longest side on which the data set itself compares models with the files.
     """
 
     placement: Placement
-    bounds: np.ndarray
-    resolution: int
 
     @abstractmethod
-    def conditions(self, index: int) -> Conditions:
-        """Of a frame."""
-
-    @abstractmethod
-    def transform(self, index: int) -> np.ndarray | None:
+    def transform(self, frame: int) -> np.ndarray | None:
         """(4, 4) float64, index to world, of the absorbing grid of a frame; None where the frame lacks it."""
 
     @abstractmethod
-    def sigma(self, index: int, scene_from_index: Tensor, shape: tuple[int, int, int]) -> np.ndarray:
-        """(X, Y, Z) float32 extinction, 1/scene unit, of a frame at a lattice's points, trilinear."""
+    def of(self, path: Path) -> DensityTruth:
+        """Another file, or folder of frames, read by the same rules and placed as these are.
+
+        Raises:
+            DataError: nothing in ``path`` fits.
+        """

@@ -138,7 +138,7 @@ def _same(conditions: Conditions, source: VolumeSource | None) -> int | None:
     """The frame of the source with these conditions."""
     for i in range(len(source.placement.numbers) if source else 0):
         assert source is not None
-        known = source.conditions(i)
+        known = source.frames[i].conditions
         if known.keys() == conditions.keys() and all(torch.allclose(known[k].float(), v.float(), atol=1e-6) for k, v in conditions.items()):
             return i
     return None
@@ -236,7 +236,7 @@ def _errors(
     """The model and the written file, each against the source, on the lattice of ``metrics.json``."""
     assert frame.source is not None
     matrix, shape = lattice(source.bounds, source.resolution)
-    truth = source.sigma(frame.source, matrix, shape)
+    truth = source.grid(frame.source, matrix, shape).numpy()
     both = agreement(truth, density_grid(job.run.model, frame.conditions, matrix, shape, job.run.settings.threads).numpy())
     if both is None:
         return {}

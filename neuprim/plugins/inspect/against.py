@@ -11,11 +11,11 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from neuprim.core.data import Dataset
 from neuprim.core.density_truth import DensityTruth, TruthFrame
 from neuprim.core.errors import DataError
 from neuprim.core.fields import Conditions
 from neuprim.core.vdb import Frame, Grid, read_grid, read_header, sequence, write_vdb
+from neuprim.core.volume_source import VolumeSource
 from neuprim.plugins.inspect.field import FieldFrame
 
 __all__ = ["SceneUnits", "open_truth", "pair", "write_volume"]
@@ -24,19 +24,19 @@ _GRID, _MARK, _CONDITION = "extinction", "neuprim_units", "neuprim_condition_"
 _USUAL = (_GRID, "density", "sigma")
 
 
-def open_truth(path: str, dataset: Callable[[], Dataset]) -> tuple[DensityTruth, str]:
+def open_truth(path: str, volume: Callable[[], VolumeSource | None]) -> tuple[DensityTruth, str]:
     """The truth that the user named, and a line that says how it was read.
 
     Args:
         path: an OpenVDB file or a folder of them, or "scene" for what the run's scene itself was made from.
-        dataset: loads the run's scene; called unless the files are in scene units by their own word.
+        volume: opens the files of the run's scene, None if it has none; called unless ``path`` is in scene units by its own word.
 
     Raises:
         DataError: no such file, or the scene has no truth of its own.
     """
     place = Path(path)
     if path == "scene" and not place.exists():
-        truth = dataset().density_truth()
+        truth = volume()
         if truth is None:
             raise DataError("--against scene: the run's scene has no volumes; give an OpenVDB file or folder")
         return truth, "ground truth: the scene's own volumes"
@@ -45,9 +45,9 @@ def open_truth(path: str, dataset: Callable[[], Dataset]) -> tuple[DensityTruth,
     frames = list(sequence(place).frames) if place.is_dir() else [Frame(0, place)]
     if _is_ours(frames[0].path):
         return SceneUnits(frames), f"ground truth: {path}, written by neuprim in scene units"
-    truth = dataset().density_truth(place)
-    if truth is not None:
-        return truth, f"ground truth: {path}, placed and scaled by the rules of the run's scene"
+    scene = volume()
+    if scene is not None:
+        return scene.of(place), f"ground truth: {path}, placed and scaled by the rules of the run's scene"
     return SceneUnits(frames), f"ground truth: {path}, taken as extinction in 1/scene unit, its world as the scene"
 
 

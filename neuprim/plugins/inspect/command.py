@@ -17,7 +17,6 @@ from neuprim.core.density_truth import DensityTruth
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.fields import Conditions
 from neuprim.core.film import write_film
-from neuprim.evaluate import load_dataset, load_run
 from neuprim.plugins.inspect.against import open_truth, pair, write_volume
 from neuprim.plugins.inspect.field import FieldFrame, ViewOptions
 from neuprim.plugins.inspect.frames import box_of, condition_frames, in_words, round_up
@@ -25,6 +24,7 @@ from neuprim.plugins.inspect.headless import has_display, prepare_headless, requ
 from neuprim.plugins.inspect.page import write_page
 from neuprim.plugins.inspect.window import Window, panels_of
 from neuprim.plugins.registry import load_inspector
+from neuprim.trained import trained_model
 
 __all__ = ["OUTPUTS", "Request", "inspect_run"]
 
@@ -128,16 +128,17 @@ class _Film:
     """The frames that were asked for, made one at a time; box and scale are the same for all."""
 
     def __init__(self, request: Request) -> None:
-        config, task, self.model, header = load_run(request.run_dir)
+        run = trained_model(request.run_dir)
+        self.model = run.model
         self.truth: DensityTruth | None = None
-        self.color_space, self.needed = str(header.get("color_space", "srgb")), tuple(spec.name for spec in task.conditions)
-        self.up = request.up or str(config.scene.get("up", "z"))
+        self.color_space, self.needed = str(run.header.get("color_space", "srgb")), tuple(c.name for c in run.task.conditions)
+        self.up = request.up or str(run.scene.get("up", "z"))
         self.up = self.up if self.up in ("x", "y", "z") else "z"
         self.options, self.name = request.options, request.run_dir.resolve().name
-        wanted = condition_frames(task.conditions, request.conditions)
+        wanted = condition_frames(run.task.conditions, request.conditions)
         pairs: list[tuple[Conditions, int]] = [(conditions, -1) for conditions in wanted]
         if request.against is not None:
-            self.truth, words = open_truth(request.against, lambda: load_dataset(config, task))
+            self.truth, words = open_truth(request.against, run.volume)
             request.say(words)
             pairs = pair(wanted, self.truth, bool(request.conditions))
         self.pairs = pairs

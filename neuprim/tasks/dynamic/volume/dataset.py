@@ -21,7 +21,6 @@ from neuprim.tasks.dynamic.dead import dead_fraction
 from neuprim.tasks.dynamic.volume.compare import compare_with_truth
 from neuprim.tasks.dynamic.volume.shoot import Shoot
 from neuprim.tasks.dynamic.volume.source import placement_of
-from neuprim.tasks.dynamic.volume.truth import VolumeTruth
 
 __all__ = ["MEMORY", "MEMORY_TEST", "FrameViews", "VolumeDataset"]
 
@@ -161,9 +160,6 @@ class VolumeDataset(Dataset):
             "dead_fraction": dead_fraction(model, self.test.times),
             **compare_with_truth(model, self.shoot, [float(t) for t in self.test.times]),
         }
-
-    def density_truth(self, path: Path | None = None) -> VolumeTruth:
-        return VolumeTruth(self.shoot, path)
 
 
 def _stored(path: Path) -> dict[str, Any]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
-import torch
-from torch import Tensor
+from pathlib import Path
 
-from neuprim.core.fields import Conditions
+import numpy as np
+
 from neuprim.core.volume_source import Placement, VolumeSource
-from neuprim.tasks.dynamic.volume.compare import RESOLUTION, extinction_on
 from neuprim.tasks.dynamic.volume.shoot import Shoot
+from neuprim.tasks.dynamic.volume.truth import VolumeTruth
 
 __all__ = ["ShootSource", "placement_of"]
 
@@ -29,21 +28,17 @@ def placement_of(shoot: Shoot) -> Placement:
     )
 
 
-class ShootSource(VolumeSource):
+class ShootSource(VolumeTruth, VolumeSource):
     """The frames of a :class:`~neuprim.tasks.dynamic.volume.shoot.Shoot`."""
 
-    resolution = RESOLUTION
-
     def __init__(self, shoot: Shoot) -> None:
-        self.shoot, self.bounds, self.placement = shoot, np.asarray(shoot.bounds, np.float64), placement_of(shoot)
+        super().__init__(shoot)
+        self.placement = placement_of(shoot)
 
-    def conditions(self, index: int) -> Conditions:
-        return {name: torch.tensor(values[index]) for name, values in self.placement.times.items()}
-
-    def transform(self, index: int) -> np.ndarray | None:
-        grids = self.shoot.reader.read(self.shoot.frames[index].path)
+    def transform(self, frame: int) -> np.ndarray | None:
+        grids = self.shoot.reader.read(self.shoot.frames[frame].path)
         absorbing = grids.get(self.shoot.reader.extinction)
         return None if absorbing is None else absorbing.transform
 
-    def sigma(self, index: int, scene_from_index: Tensor, shape: tuple[int, int, int]) -> np.ndarray:
-        return extinction_on(self.shoot.medium(self.shoot.frames[index]), scene_from_index, shape)
+    def of(self, path: Path) -> VolumeTruth:
+        return VolumeTruth(self.shoot, path)

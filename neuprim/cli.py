@@ -278,7 +278,8 @@ def _import(args: argparse.Namespace) -> int:
 
 def _inspect(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
-    from neuprim.plugins.inspect import Request, ViewOptions, corners, inspect_run
+    from neuprim.inspecting import Request, inspect_run
+    from neuprim.plugins.inspect import ViewOptions, corners
 
     names = [name.strip() for name in args.show.split(",") if name.strip()]
     names += ["primitives"] * args.primitives + ["primitive"] * (args.primitive is not None)

@@ -69,6 +69,20 @@ def test_tasks_know_no_command_plugin_or_other_task() -> None:
         assert offences(f"tasks/{task}", (*above, *others)) == []
 
 
+def test_formats_and_inspectors_know_no_command() -> None:
+    above = (
+        "neuprim.cli",
+        "neuprim.run",
+        "neuprim.evaluate",
+        "neuprim.report",
+        "neuprim.exporting",
+        "neuprim.inspecting",
+        "neuprim.trained",
+    )
+    for folder in ("plugins/export", "plugins/inspect"):
+        assert offences(folder, above) == []
+
+
 def test_nothing_imports_a_built_in_task_by_name() -> None:
     """Built-in tasks are found through the entry-point group, like anybody's."""
     wrong = [

@@ -14,13 +14,15 @@ import numpy as np
 import pytest
 import torch
 
+from neuprim import inspecting
 from neuprim.cli import main
 from neuprim.core.density_grid import density_at, density_grid, lattice
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
 from neuprim.core.extensions import Inspector
 from neuprim.core.vdb import read_grid
 from neuprim.evaluate import load_dataset, load_run
-from neuprim.plugins.inspect import Request, ViewOptions, command, headless, inspect_run, views
+from neuprim.inspecting import Request, inspect_run
+from neuprim.plugins.inspect import ViewOptions, headless, views
 from neuprim.plugins.inspect.field import FieldFrame
 from neuprim.plugins.inspect.frames import box_of, condition_frames, corners, in_words, round_up
 from neuprim.plugins.inspect.page import encoded
@@ -259,4 +261,4 @@ def test_a_vtk_that_dies_is_named_with_its_cure(
 
 def test_the_built_in_inspectors_are_registered() -> None:
     for name, expected in BUILT_IN.items():
-        assert command.load_inspector(name) is expected and isinstance(expected, Inspector)
+        assert inspecting.load_inspector(name) is expected and isinstance(expected, Inspector)

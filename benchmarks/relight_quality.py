@@ -1,6 +1,6 @@
 """Quality of the relighting task on `lit_solids`: ways of colouring at equal training time, where shadows come from, and losses.
 
-    python benchmarks/relight_quality.py [--seconds 300] [--seeds 3] [--parts forms losses] [--variants ...] [--once ...] [--tune] [--readme] [--docs]
+    python benchmarks/relight_quality.py [--seconds 300] [--seeds 3] [--parts forms losses] [--variants ...] [--once ...] [--continue] [--tune] [--readme] [--docs]
 
 Parts:
 
@@ -45,7 +45,7 @@ FORMS = {
     "equation 14": (PLAIN,),
     "equation 14, visibility per primitive": ("model.colour.visibility=primitive",),
     "equation 14, visibility per pixel": ("model.colour.visibility=pixel",),
-    "multiplicative, visibility per pixel": ("model.colour.form=multiplicative", "model.colour.visibility=pixel"),
+    "multiplicative, visibility per primitive": ("model.colour.form=multiplicative", "model.colour.visibility=primitive"),
 }
 LOSSES = {loss: (f"task.options.loss={loss}",) for loss in ("l1", "compressed", "relative")}
 CLASSES = ("lit", "cast_shadow", "attached_shadow", "highlight")
@@ -101,6 +101,7 @@ def main() -> None:
     parser.add_argument("--variants", nargs="*", default=list(FORMS))
     parser.add_argument("--once", nargs="*", default=[], help="variants that run with the first seed only")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="further settings of every run")
+    parser.add_argument("--continue", dest="go_on", action="store_true", help="keep recorded runs and paces; add what is missing")
     parser.add_argument("--tune", action="store_true", help="held-out training views; nothing is recorded")
     parser.add_argument("--readme", action="store_true")
     parser.add_argument("--docs", action="store_true")
@@ -116,13 +117,16 @@ def main() -> None:
     if wanted:
         dataset = prepared(common, None)[1].dataset
         everything = {(part, name): words for part, own in wanted.items() for name, words in own.items()}
-        paces = pace({f"{part}: {name}": words for (part, name), words in everything.items()}, dataset)
+        known = {f"{part}: {e['name']}": e["ms_a_step"] / 1e3 for part in wanted for e in recorded.get(part, [])} if args.go_on else {}
+        names = {f"{part}: {name}": words for (part, name), words in everything.items()}
+        paces = {**pace({name: words for name, words in names.items() if name not in known}, dataset), **known}
         recorded |= {"cpu": cpu_name(), "cores": core_count(), "seconds": args.seconds, "baselines": dataset.baselines()}  # type: ignore[attr-defined]
         for part, own in wanted.items():
-            recorded[part] = [e for e in recorded.get(part, []) if e["name"] not in own]
+            recorded[part] = [e for e in recorded.get(part, []) if args.go_on or e["name"] not in own]
         for seed in range(args.seeds):
             for (part, name), words in everything.items():
-                if seed and (name in args.once or part in args.once):
+                there = any((e["name"], e["seed"]) == (name, seed) for e in recorded[part])
+                if there or (seed and (name in args.once or part in args.once)):
                     continue
                 each = paces[f"{part}: {name}"]
                 found = fit([*words, f"train.iterations={round(args.seconds / each)}", f"seed={seed}"], dataset)

@@ -52,7 +52,7 @@ class LightNetwork(ColourField):
         hidden: int = 8,
         channels: int = 3,
         form: str = "additive",
-        visibility: str = "pixel",
+        visibility: str = "primitive",
         boost: float = 3.0,
         falloff: bool = False,
         typical: float = 1.0,

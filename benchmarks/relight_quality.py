@@ -45,6 +45,7 @@ FORMS = {
     "equation 14": (PLAIN,),
     "equation 14, visibility per primitive": ("model.colour.visibility=primitive",),
     "equation 14, visibility per pixel": ("model.colour.visibility=pixel",),
+    "multiplicative, visibility per pixel": ("model.colour.form=multiplicative", "model.colour.visibility=pixel"),
     "multiplicative, visibility per primitive": ("model.colour.form=multiplicative", "model.colour.visibility=primitive"),
 }
 LOSSES = {loss: (f"task.options.loss={loss}",) for loss in ("l1", "compressed", "relative")}

@@ -52,7 +52,7 @@ HEAD = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nend_header\n"
         ("", "end_header"),
         ("obj\n", "expected a PLY file"),
         ("ply\nformat binary_little_endian 1.0\n", "end_header"),
-        ("ply\n" + "comment x\n" * 600_000, "end_header in"),
+        ("ply\n" + ("comment " + "x" * 100 + "\n") * 60_000, "end_header in"),
         (HEAD.format("binary_little_endian", 999_999_999_999), "bytes follow"),
         (HEAD.format("ascii", 999_999_999_999), "bytes follow"),
         (HEAD.format("ascii", -1), "expected a count"),

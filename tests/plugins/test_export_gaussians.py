@@ -167,7 +167,7 @@ def test_a_relit_model_takes_a_light_and_fits_its_colours(tmp_path: Path) -> Non
     assert task.fields is not None
     from neuprim.core.schema import InitContext
 
-    colour = task.fields["LightNetwork"](hidden=4, visibility=False)
+    colour = task.fields["LightNetwork"](hidden=4, visibility="none")
     context = InitContext(marked.PLACES, marked.RADII, marked.COLOURS, torch.Generator().manual_seed(1))
     model = Primitives.initialise(CosineDensity(2), colour, context)  # type: ignore[arg-type]
     model.params["net_out"] *= 2

@@ -153,12 +153,12 @@ BASELINES = {
 def quality_table(recorded: dict[str, Any]) -> str:
     """One row per baseline, form and loss."""
     lines = [
-        f"| `lit_solids`, {recorded['seconds']:.0f} s of training | numbers per primitive | PSNR | cast shadow | lit | highlight | PSNR display | steps |",
-        "| --- |" + " --- |" * 7,
+        f"| `lit_solids`, {recorded['seconds']:.0f} s of training | numbers per primitive | PSNR | lit | cast shadow | attached shadow | highlight | PSNR display | steps |",
+        "| --- |" + " --- |" * 8,
     ]
     for key, name in BASELINES.items():
         b = recorded["baselines"][key]
-        pooled = " | ".join(f"{b[f'psnr_pooled_{c}']:.1f}" for c in ("cast_shadow", "lit", "highlight"))
+        pooled = " | ".join(f"{b[f'psnr_pooled_{c}']:.1f}" for c in CLASSES)
         lines.append(f"| *{name}* |  | {b['psnr_linear_clamped']:.1f} | {pooled} | {b['psnr_display']:.1f} |  |")
     for part, prefix in (("forms", ""), ("losses", "default form, loss ")):
         for name in dict.fromkeys(e["name"] for e in recorded.get(part, [])):
@@ -167,14 +167,16 @@ def quality_table(recorded: dict[str, Any]) -> str:
             def cell(key: str, digits: int, own: list[dict[str, Any]] = own) -> str:
                 return spread([e[key] for e in own], digits)
 
-            pooled = " | ".join(cell(f"psnr_pooled_{c}", 1) for c in ("cast_shadow", "lit", "highlight"))
+            pooled = " | ".join(cell(f"psnr_pooled_{c}", 1) for c in CLASSES)
             lines.append(
                 f"| {prefix}{name} | {own[0]['parameters_per_primitive']} | {cell('psnr_linear_clamped', 2)} | {pooled} "
                 f"| {cell('psnr_display', 2)} | {own[0]['iterations']:,} |"
             )
     seeds = len({e["seed"] for e in recorded.get("forms", recorded.get("losses", []))})
     primitives = next((e["primitives"] for e in recorded.get("forms", [])), 0)
-    lines.append(f"\n{primitives:,} primitives, {seeds} seeds; {recorded['cores']} cores of {recorded['cpu']}.")
+    lines.append(
+        f"\n{primitives:,} primitives; rows with ± are means over {seeds} seeds, others one run; {recorded['cores']} cores of {recorded['cpu']}."
+    )
     return "\n".join(lines)
 
 

@@ -3,7 +3,7 @@
     h = cos(beta (W_x x~ + W_d d + W_l l + b))         x~ the local middle of the chord, d and l unit vectors at the centre:
                                                        from the camera, and to the light
     additive         c = V E max(0, c_dc + W_out h)                         equation 14: 9 -> H -> 3, 107 parameters at H = 8
-    multiplicative   c = V E max(0, albedo (1 + w_out . h))                 no tinting: 86 parameters
+    multiplicative   c = V E max(0, albedo (1 + w_out . h))                 no tinting: 91 parameters
 
 E is the light's intensity, divided by the squared distance where the data set says so, over that of a typical training light, so that
 learning rates do not depend on the data's unit of light; V the visibility of the light from the

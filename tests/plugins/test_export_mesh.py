@@ -31,7 +31,7 @@ def srgb(linear: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("suffix", ["glb", "ply", "obj"])
 def test_balls_are_in_their_places_sizes_and_colours(run_dir: Path, tmp_path: Path, suffix: str) -> None:
-    pytest.importorskip("pyvista")
+    pytest.importorskip("pyvista", exc_type=ImportError)
     import trimesh
 
     report = export_run(run_dir, "mesh", tmp_path / f"m.{suffix}", ["grid=128"])
@@ -52,7 +52,7 @@ def test_balls_are_in_their_places_sizes_and_colours(run_dir: Path, tmp_path: Pa
 
 
 def test_small_pieces_can_be_kept_or_dropped(run_dir: Path, tmp_path: Path) -> None:
-    pytest.importorskip("pyvista")
+    pytest.importorskip("pyvista", exc_type=ImportError)
     import trimesh
 
     pieces = {}
@@ -63,7 +63,7 @@ def test_small_pieces_can_be_kept_or_dropped(run_dir: Path, tmp_path: Path) -> N
 
 
 def test_a_level_above_everything_is_refused(run_dir: Path, tmp_path: Path) -> None:
-    pytest.importorskip("pyvista")
+    pytest.importorskip("pyvista", exc_type=ImportError)
     with pytest.raises(ConfigError, match="no surface; the densest"):
         export_run(run_dir, "mesh", tmp_path / "m.glb", ["grid=16", "level=1e6"])
     assert not (tmp_path / "m.glb").exists()
@@ -85,7 +85,7 @@ def test_the_best_level_tells_opaque_columns_from_faint_ones() -> None:
 
 
 def test_a_dynamic_model_is_cut_at_a_time(tmp_path: Path) -> None:
-    pytest.importorskip("pyvista")
+    pytest.importorskip("pyvista", exc_type=ImportError)
     import trimesh
 
     run = marked.dynamic_run(tmp_path / "run", marked.write_sequence(tmp_path / "files"))

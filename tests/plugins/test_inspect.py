@@ -250,7 +250,7 @@ def test_a_missing_pyvista_is_said(run_dir: Path, tmp_path: Path, monkeypatch: p
 def test_a_vtk_that_dies_is_named_with_its_cure(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, probe: str, text: str
 ) -> None:
-    pytest.importorskip("pyvista")
+    pytest.importorskip("pyvista", exc_type=ImportError)
     headless.prepare_headless.cache_clear()
     monkeypatch.delenv("VTK_DEFAULT_OPENGL_WINDOW", raising=False)
     monkeypatch.setattr(headless, "_PROBE", probe)

@@ -17,7 +17,7 @@ from neuprim.plugins.inspect import window
 from neuprim.plugins.inspect.headless import prepare_headless
 from tests.plugins import runs
 
-pytest.importorskip("pyvista")
+pytest.importorskip("pyvista", exc_type=ImportError)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -113,7 +113,7 @@ def test_the_default_place_is_in_the_run(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_words_are_refused(run_dir: Path, tmp_path: Path, form: str, words: tuple[str, ...], reason: str) -> None:
-    if run_dir == "mesh":
+    if form == "mesh":
         pytest.importorskip("pyvista", exc_type=ImportError)
     with pytest.raises(ConfigError, match=reason):
         export_run(run_dir, form, None, words)

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from fitting import finish
 from static_quality import cpu_name, spread
 from tables import ROOT, between_markers
 
@@ -34,7 +35,7 @@ from neuprim.config import compose
 from neuprim.core.render.cpu.threads import core_count
 from neuprim.core.train.trainer import Trainer
 from neuprim.evaluate import load_dataset
-from neuprim.measure import draw, measure, summary
+from neuprim.measure import draw
 from neuprim.plugins.registry import load_task
 from neuprim.run import make_trainer, warm_up
 
@@ -61,14 +62,7 @@ def fit(words: list[str], change: Callable[[Trainer], None] = lambda trainer: No
     trainer = make_trainer(config, task, load_dataset(config, task))
     change(trainer)
     warm_up(trainer)
-    for _ in trainer.run():
-        pass
-    for field in (trainer.model.density, trainer.model.colour):
-        field.set_progress(1.0)
-    size = 4 * sum(v.numel() for v in trainer.model.params.values())
-    training = {"iterations": trainer.step, "train_seconds": trainer.elapsed}
-    views = measure(trainer.model, trainer.dataset, config.renderer)
-    return trainer, summary(config, trainer.model, trainer.dataset, views, size, training)
+    return trainer, finish(config, trainer)
 
 
 def shuffled_times(trainer: Trainer) -> None:

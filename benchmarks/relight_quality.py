@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from fitting import finish
 from static_quality import cpu_name, spread
 from tables import ROOT, between_markers
 
@@ -33,7 +34,6 @@ from neuprim.core.data import Dataset
 from neuprim.core.render.cpu.threads import core_count
 from neuprim.core.train.trainer import Trainer
 from neuprim.evaluate import load_dataset
-from neuprim.measure import measure, summary
 from neuprim.plugins.registry import load_task
 from neuprim.run import make_trainer, warm_up
 
@@ -84,13 +84,7 @@ def pace(variants: dict[str, list[str]], dataset: Dataset) -> dict[str, float]:
 
 def fit(words: list[str], dataset: Dataset) -> dict[str, Any]:
     config, trainer = prepared(words, dataset)
-    for _ in trainer.run():
-        pass
-    for field in (trainer.model.density, trainer.model.colour):
-        field.set_progress(1.0)
-    size = 4 * sum(v.numel() for v in trainer.model.params.values())
-    training = {"iterations": trainer.step, "train_seconds": trainer.elapsed}
-    found = summary(config, trainer.model, dataset, measure(trainer.model, dataset, config.renderer), size, training)
+    found = finish(config, trainer)
     return {k: found[k] for k in KEYS if k in found}
 
 

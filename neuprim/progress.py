@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from types import TracebackType
+from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -13,7 +14,20 @@ from neuprim.core.train.trainer import StepReport
 __all__ = ["DrawProgress", "RunProgress"]
 
 
-class RunProgress:
+class _Shown:
+    """Context manager: the bar is there inside."""
+
+    bar: Progress
+
+    def __enter__(self) -> Self:
+        self.bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.bar.stop()
+
+
+class RunProgress(_Shown):
     """Context manager around one run."""
 
     def __init__(self, console: Console, title: str) -> None:
@@ -35,13 +49,6 @@ class RunProgress:
         self._printed = -1.0
         self._smooth: float | None = None
         self._held_out = ""
-
-    def __enter__(self) -> RunProgress:
-        self.bar.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.bar.stop()
 
     def note(self, text: str) -> None:
         """A line that stays."""
@@ -78,7 +85,7 @@ class RunProgress:
             self.note(text)
 
 
-class DrawProgress:
+class DrawProgress(_Shown):
     """Context manager around the drawing of images: a bar on a terminal that is gone afterwards, a line now and then elsewhere."""
 
     def __init__(self, console: Console) -> None:
@@ -94,13 +101,6 @@ class DrawProgress:
         self.bar = Progress(*columns, console=console, transient=True, disable=not self.live)
         self.task: TaskID = self.bar.add_task("", total=1.0)
         self._started = time.monotonic()
-
-    def __enter__(self) -> DrawProgress:
-        self.bar.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.bar.stop()
 
     def note(self, text: str) -> None:
         """A line that stays."""

@@ -24,8 +24,6 @@ def trained_model(run_dir: Path, progress: Progress = lambda text, fraction: Non
         CheckpointError, ConfigError: naming the file that is missing or damaged.
     """
     config, task, model, header = load_run(run_dir)
-    for field in (model.density, model.colour):
-        field.set_progress(1.0)
 
     def volume() -> VolumeSource | None:
         load = find_scene(task, config.scene_name).spec.volume

@@ -8,7 +8,6 @@ axis: a primitive that spans n^3 points costs 3 n sines and cosines per neuron, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.fields import Conditions, Cosine, DensityField
-from neuprim.core.geometry import Geometry
+from neuprim.core.fields import Conditions, Cosine
 from neuprim.core.primitives import Primitives
 from neuprim.core.render.cpu.compile import exact_kernel
 from neuprim.core.render.cpu.threads import parallel_for
@@ -90,31 +88,21 @@ def density_grid(
 def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Tensor:
     """(M,) float64 extinction, 1/scene unit, at (M, 3) points: every primitive at every point, in float64. Slow, short, and the oracle."""
     with torch.no_grad():
-        sigma, geometry = _double(model, conditions)
+        living = model.living(conditions, torch.float64)
+        geometry = living.geometry
         total = torch.zeros(len(points), dtype=torch.float64)
         whiten = geometry.rotations / geometry.scales[:, None, :]
         for part in torch.arange(len(points)).split(max(1, _PAIRS // max(geometry.count, 1))):
             x = points[part].double()
             y = torch.einsum("mna,nab->mnb", x[:, None, :] - geometry.means, whiten)
             row, prim = (y.square().sum(-1) < 1.0).nonzero(as_tuple=True)
-            total.index_add_(0, part[row], sigma(prim, x[row]).clamp_min(0))
+            total.index_add_(0, part[row], living.sigma(prim, x[row]).clamp_min(0))
     return total
-
-
-def _double(model: Primitives, conditions: Conditions) -> tuple[Callable[[Tensor, Tensor], Tensor], Geometry]:
-    """(primitives, points) -> unclamped sigma, and where the ellipsoids are, of those that live in a frame, in float64."""
-    density: DensityField = model.density
-    rows = density.alive(model.of(density), conditions)
-    params = {name: (p if rows is None else p.index_select(0, rows)).detach().double() for name, p in model.params.items()}
-    own = {s.name: params[s.name] for s in density.parameters()}
-    wide = {name: value.double() for name, value in conditions.items()}
-    stored = Geometry(params["means"], params["log_scales"], params["quats"])
-    return lambda prim, x: density.density(own, stored, prim, x, wide), density.move(own, stored, wide)
 
 
 def _ask(model: Primitives, conditions: Conditions, wide: list[Any], P: np.ndarray, Q: np.ndarray, grid: np.ndarray) -> None:
     """Adds a density in torch code, primitive by primitive in a fixed order, so that the sums are the same every time."""
-    sigma, _ = _double(model, conditions)
+    living = model.living(conditions, torch.float64)
     means, scales, R = wide
     limit = np.array(grid.shape)
     for n in range(len(means)):
@@ -132,7 +120,7 @@ def _ask(model: Primitives, conditions: Conditions, wide: list[Any], P: np.ndarr
             x = index @ P[:3, :3].T + P[:3, 3]
             inside = (np.square(((x - means[n]) @ R[n]) / scales[n]).sum(-1) < 1.0).nonzero()
             points = torch.from_numpy(x[inside])
-            found = sigma(torch.full((len(points),), n), points).clamp_min(0).numpy()
+            found = living.sigma(torch.full((len(points),), n), points).clamp_min(0).numpy()
             grid[block][inside] += found.astype(np.float32)
 
 

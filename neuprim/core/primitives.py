@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.fields import ColourField, Conditions, DensityField, LoweredColour, LoweredDensity, Shade
+from neuprim.core.fields import ColourField, Conditions, Constant, DensityField, LoweredColour, LoweredDensity, RayNet, Shade
 from neuprim.core.geometry import GEOMETRY_SPECS, Geometry
 from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import InitContext, ParameterSpec
 
-__all__ = ["Lowered", "Primitives"]
+__all__ = ["Living", "Lowered", "Primitives"]
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,40 @@ class Lowered:
     colour: LoweredColour
     rows: Tensor | None = None
     shade: Shade | None = None
+
+    def center_colors(self, position: Tensor) -> Tensor:
+        """(M, C) colours at the primitives' centres, seen from ``position`` (3,)."""
+        count = self.geometry.count
+        if isinstance(self.colour, Constant):
+            return self.colour.rgb
+        if isinstance(self.colour, RayNet):
+            return self.colour.radiance(torch.arange(count), torch.zeros(count, 3, dtype=torch.float64))
+        means = self.geometry.means
+        directions = torch.nn.functional.normalize(means - position.to(means), dim=1)
+        return self.colour.radiance(torch.arange(count), means, directions)
+
+
+@dataclass(frozen=True)
+class Living:
+    """The M primitives that can absorb anything under some conditions.
+
+    Attributes:
+        rows: (M,) int64 ascending rows of the model; None where all are.
+        params: all their tensors; own: those of the density field.
+        stored: their ellipsoids as stored, which :meth:`~neuprim.core.fields.DensityField.density` takes; geometry: where they are.
+    """
+
+    field: DensityField
+    conditions: Conditions
+    rows: Tensor | None
+    params: dict[str, Tensor]
+    own: dict[str, Tensor]
+    stored: Geometry
+    geometry: Geometry
+
+    def sigma(self, prim: Tensor, x: Tensor) -> Tensor:
+        """World density (P,), 1/scene unit, unclamped, of the living primitives ``prim`` (P,), 0..M-1, at points ``x`` (P, 3)."""
+        return self.field.density(self.own, self.stored, prim, x, self.conditions)
 
 
 class Primitives:
@@ -82,23 +116,29 @@ class Primitives:
 
     def lower(self, camera: AnyCamera, conditions: Conditions) -> Lowered:
         """Fold a frame's conditions into closed forms; differentiable. Primitives that are not alive in it are left out."""
-        params, geometry, density, rows = self._lower_density(conditions)
+        living = self.living(conditions)
+        geometry = living.geometry
+        density = self.density.lower(living.own, geometry, conditions)
         conditions = self.colour.derive(geometry, density, conditions)
-        tint = {s.name: params[s.name] for s in self.colour.parameters()}
+        tint = {s.name: living.params[s.name] for s in self.colour.parameters()}
         colour = self.colour.lower(tint, geometry, camera, conditions)
-        return Lowered(geometry, density, colour, rows, self.colour.shade(geometry, density, conditions))
+        return Lowered(geometry, density, colour, living.rows, self.colour.shade(geometry, density, conditions))
 
     def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:
         """Where the primitives that live in a frame are, and their density; no camera needed."""
-        _, geometry, density, _ = self._lower_density(conditions)
-        return geometry, density
+        living = self.living(conditions)
+        return living.geometry, self.density.lower(living.own, living.geometry, conditions)
 
-    def _lower_density(self, conditions: Conditions) -> tuple[dict[str, Tensor], Geometry, LoweredDensity, Tensor | None]:
+    def living(self, conditions: Conditions, dtype: torch.dtype | None = None) -> Living:
+        """Which primitives live in a frame, and where; differentiable. With ``dtype``, everything is detached and of that type."""
         rows = self.density.alive(self.of(self.density), conditions)
         params = self.params if rows is None else {name: value.index_select(0, rows) for name, value in self.params.items()}
+        if dtype is not None:
+            params = {name: value.detach().to(dtype) for name, value in params.items()}
+            conditions = {name: value.to(dtype) for name, value in conditions.items()}
         own = {s.name: params[s.name] for s in self.density.parameters()}
-        geometry = self.density.move(own, Geometry(params["means"], params["log_scales"], params["quats"]), conditions)
-        return params, geometry, self.density.lower(own, geometry, conditions), rows
+        stored = Geometry(params["means"], params["log_scales"], params["quats"])
+        return Living(self.density, conditions, rows, params, own, stored, self.density.move(own, stored, conditions))
 
     def rows(self, index: Tensor) -> dict[str, Tensor]:
         """Detached copies of some rows of every parameter."""

@@ -19,7 +19,6 @@ if TYPE_CHECKING:  # importing the interfaces imports torch, which listing does 
 __all__ = [
     "ALL",
     "EXPORTERS",
-    "GROUP",
     "INSPECTORS",
     "LOSSES",
     "SCENES",
@@ -29,8 +28,6 @@ __all__ = [
     "PluginError",
     "PluginInfo",
     "PluginReport",
-    "TaskInfo",
-    "TaskReport",
     "find_scene",
     "list_exporters",
     "list_inspectors",
@@ -53,9 +50,6 @@ SCENES: Group[SceneExtension] = Group(
 LOSSES: Group[LossExtension] = Group("neuprim.losses", "loss", "train.loss={}", "neuprim.core.extensions:LossExtension")
 EXPORTERS: Group[Exporter] = Group("neuprim.exporters", "exporter", "--format {}", "neuprim.core.extensions:Exporter")
 INSPECTORS: Group[Inspector] = Group("neuprim.inspectors", "inspector", "--show {}", "neuprim.core.extensions:Inspector")
-
-GROUP = TASKS.entry_points
-TaskInfo, TaskReport = PluginInfo, PluginReport
 
 # ---------------------------------------------------------------- tasks
 

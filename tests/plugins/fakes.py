@@ -43,7 +43,7 @@ def install(
     tasks: Mapping[str, str],
     files: Mapping[str, str],
     version: str = "0.3",
-    group: str = registry.GROUP,
+    group: str = registry.TASKS.entry_points,
 ) -> None:
     """Puts a distribution with entry points ``tasks`` of a group and source ``files`` under ``root``."""
     info = root / f"{distribution.replace('-', '_')}-{version}.dist-info"

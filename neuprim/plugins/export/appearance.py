@@ -13,7 +13,7 @@ from neuprim.core.cameras import Camera, look_at, orbit
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import ExportJob, TrainedModel
-from neuprim.core.fields import Conditions, Constant, RayNet
+from neuprim.core.fields import Conditions, OpaqueColour
 
 __all__ = ["Harmonics", "comparison_views", "harmonics_of", "sphere"]
 
@@ -55,9 +55,8 @@ def harmonics_of(run: TrainedModel, conditions: Conditions) -> Harmonics:
     if model.colour.channels != 3:
         raise ConfigError(f"{run.directory}: {model.colour.channels} colour channels; this format has red, green and blue")
     with torch.no_grad():
-        rows = model.density.alive(model.of(model.density), conditions)
-        tint = {name: value if rows is None else value[rows] for name, value in model.of(model.colour).items()}
-        exact = model.colour.harmonics(tint, conditions)
+        params = model.living(conditions).params
+        exact = model.colour.harmonics({spec.name: params[spec.name] for spec in model.colour.parameters()}, conditions)
         if exact is not None:
             return Harmonics(exact[0], exact[1], 0.0)
         directions = sphere(_DIRECTIONS)
@@ -75,13 +74,10 @@ def _from_afar(run: TrainedModel, conditions: Conditions, direction: Tensor) -> 
     reach = float((means - middle).norm(dim=-1).max()) + 1.0
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     camera = Camera(look_at(middle - 1e4 * reach * direction, middle, up), 1e4, 1e4, 32, 32, 64, 64)
-    colour = run.model.lower(camera, conditions).colour
-    if isinstance(colour, Constant):
-        return colour.rgb.double()
-    if isinstance(colour, RayNet):
-        every = torch.arange(len(colour.base))
-        return colour.radiance(every, torch.zeros(len(every), 3, dtype=torch.float64))
-    raise ConfigError(f"{run.directory}: colours of the form {type(colour).__name__} have no value per primitive")
+    lowered = run.model.lower(camera, conditions)
+    if isinstance(lowered.colour, OpaqueColour):
+        raise ConfigError(f"{run.directory}: colours of the form OpaqueColour have no value per primitive")
+    return lowered.center_colors(camera.position).double()
 
 
 def sphere(count: int) -> Tensor:

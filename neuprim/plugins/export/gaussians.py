@@ -56,11 +56,8 @@ def fit_gaussians(run: TrainedModel, conditions: Conditions, footprint: bool) ->
     """
     model = run.model
     with torch.no_grad():
-        rows = model.density.alive(model.of(model.density), conditions)
-        params = model.params if rows is None else {name: value[rows] for name, value in model.params.items()}
-        still = Geometry(params["means"], params["log_scales"], params["quats"])
-        own = {spec.name: params[spec.name] for spec in model.density.parameters()}
-        moved = model.density.move(own, still, conditions)
+        living = model.living(conditions)
+        own, still, moved = living.own, living.stored, living.geometry
         parts = [
             _fit(model.density.density, {n: v[i : i + _CHUNK] for n, v in own.items()}, still[i : i + _CHUNK], moved[i : i + _CHUNK], conditions, footprint)
             for i in range(0, still.count, _CHUNK)

@@ -31,7 +31,6 @@ from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
 from neuprim.core.fields import Conditions
 from neuprim.core.files import atomic_path
-from neuprim.core.geometry import Geometry
 from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
 from neuprim.plugins.export.appearance import Harmonics, comparison_views, harmonics_of
@@ -159,13 +158,9 @@ def _larger_pieces(mesh: Any, keep: float) -> tuple[Any, int]:
 
 def _colours(job: ExportJob, conditions: Conditions, colours: Harmonics, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(V, 3) of the primitives around each point, weighted by density; of the nearest one where none reaches."""
-    model = job.run.model
     with torch.no_grad():
-        rows = model.density.alive(model.of(model.density), conditions)
-        params = model.params if rows is None else {name: value[rows] for name, value in model.params.items()}
-        still = Geometry(params["means"], params["log_scales"], params["quats"])
-        own = {spec.name: params[spec.name] for spec in model.density.parameters()}
-        moved = model.density.move(own, still, conditions)
+        living = job.run.model.living(conditions)
+        moved = living.geometry
         whiten = moved.rotations.double().transpose(1, 2) / moved.scales.double()[:, :, None]
         total, weight = torch.zeros(len(points), 3, dtype=torch.float64), torch.zeros(len(points), dtype=torch.float64)
         tree = cKDTree(points)
@@ -178,7 +173,7 @@ def _colours(job: ExportJob, conditions: Conditions, colours: Harmonics, points:
             y = (whiten[prim] @ (x - moved.means.double()[prim])[:, :, None])[..., 0]
             inside = y.square().sum(-1) < 1
             prim, vertex, x = prim[inside], vertex[inside], x[inside]
-            rho = model.density.density(own, still, prim, x.float(), conditions).double().clamp_min(0)
+            rho = living.sigma(prim, x.float()).double().clamp_min(0)
             seen = colours.towards(prim, -torch.from_numpy(normals)[vertex])
             total.index_add_(0, vertex, rho[:, None] * seen)
             weight.index_add_(0, vertex, rho)

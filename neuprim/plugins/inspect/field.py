@@ -13,10 +13,10 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.density_grid import density_grid
 from neuprim.core.errors import ConfigError
-from neuprim.core.fields import Conditions, Constant, RayNet
+from neuprim.core.fields import Conditions
 from neuprim.core.geometry import Geometry
 from neuprim.core.images import linear_to_srgb
-from neuprim.core.primitives import Primitives
+from neuprim.core.primitives import Living, Primitives
 
 __all__ = ["UNIT", "FieldFrame", "ViewOptions"]
 
@@ -116,16 +116,20 @@ class FieldFrame:
         return self.in_panel(0, "model").sigma - self.in_panel(0, "truth").sigma
 
     @cached_property
-    def alive(self) -> np.ndarray:
-        """(M,) int64 rows of the model that live in this frame, in the order of :attr:`geometry`."""
-        rows = self.model.density.alive(self.model.of(self.model.density), self.conditions)
-        return np.arange(self.model.count) if rows is None else rows.numpy()
+    def living(self) -> Living:
+        """The primitives that live in this frame, without gradients."""
+        with torch.no_grad():
+            return self.model.living(self.conditions)
 
     @cached_property
+    def alive(self) -> np.ndarray:
+        """(M,) int64 rows of the model that live in this frame, in the order of :attr:`geometry`."""
+        return np.arange(self.model.count) if self.living.rows is None else self.living.rows.numpy()
+
+    @property
     def geometry(self) -> Geometry:
         """Where the M primitives of :attr:`alive` are, float32."""
-        with torch.no_grad():
-            return self.model.lower_density(self.conditions)[0]
+        return self.living.geometry
 
     def density(self, row: int, points: Tensor) -> np.ndarray:
         """(P,) float64 unclamped extinction of one primitive of the model at (P, 3) points inside it."""
@@ -140,15 +144,13 @@ class FieldFrame:
     @cached_property
     def masses(self) -> np.ndarray:
         """(M,) float64 what each living primitive absorbs in all: its clamped extinction times its volume, from 33 points inside."""
-        geometry, rows = self.geometry, torch.from_numpy(self.alive)
-        params = {s.name: self.model.params[s.name].detach()[rows] for s in self.model.density.parameters()}
-        kept = self.model.params
-        stored = Geometry(*(kept[name].detach()[rows] for name in ("means", "log_scales", "quats")))
-        total = torch.zeros(len(rows))
+        geometry = self.geometry
+        every = torch.arange(geometry.count)
+        total = torch.zeros(len(every))
         with torch.no_grad():
             for u in _ball():
                 x = geometry.means + (geometry.rotations @ (geometry.scales * u)[..., None])[..., 0]
-                total += self.model.density.density(params, stored, torch.arange(len(rows)), x, self.conditions).clamp_min(0)
+                total += self.living.sigma(every, x).clamp_min(0)
         return np.asarray((total / len(_ball()) * geometry.scales.prod(1) * 4.18879).double().numpy())
 
     @cached_property
@@ -166,15 +168,7 @@ class FieldFrame:
         eye = center + torch.tensor([1.0, -1.6, 0.7]) * float(np.linalg.norm(high - low))
         camera = Camera(look_at(eye, center, torch.tensor([0.0, 0.0, 1.0])), 64.0, 64.0, 32.0, 32.0, 64, 64)
         with torch.no_grad():
-            lowered = self.model.lower(camera, self.conditions)
-            means = lowered.geometry.means
-            prim = torch.arange(len(means))
-            if isinstance(lowered.colour, Constant):
-                rgb = lowered.colour.rgb
-            elif isinstance(lowered.colour, RayNet):
-                rgb = lowered.colour.radiance(prim, torch.zeros(len(means), 3, dtype=torch.float64))
-            else:
-                rgb = lowered.colour.radiance(prim, means, torch.nn.functional.normalize(means - eye, dim=1))
+            rgb = self.model.lower(camera, self.conditions).center_colors(eye)
         rgb = rgb.float().clamp_min(0)
         rgb = rgb.expand(-1, 3) if rgb.shape[1] == 1 else torch.nn.functional.pad(rgb[:, :3], (0, max(0, 3 - rgb.shape[1])))
         return np.asarray((linear_to_srgb(rgb) if self.color_space == "linear" else rgb).clamp(0, 1).numpy())

@@ -31,9 +31,7 @@ what distance light fades."""
 _FAR = 1e3  # scene radii
 
 
-def light_visibility(
-    geometry: Geometry, density: LoweredDensity, light: Tensor, size: int = SIZE, bias: float = BIAS, softness: float = SOFTNESS
-) -> Shade:
+def light_visibility(geometry: Geometry, density: LoweredDensity, light: Tensor, bias: float = BIAS, softness: float = SOFTNESS) -> Shade:
     """The function (M, 3) scene points -> (M,) visibility 0..1, float32, of a point light (3,).
 
     The light's camera looks at the middle of all centres and sees all of them; a light among them looks the way most of them lie,
@@ -50,9 +48,9 @@ def light_visibility(
         if distance > _FAR * radius:  # from there all rays are parallel, and a float32 depth image keeps no digits
             light, distance = center + (light - center) * (_FAR * radius / distance), _FAR * radius
         half = math.asin(min(radius / distance, 0.94))
-        focal = 0.5 * size / math.tan(half)
+        focal = 0.5 * SIZE / math.tan(half)
         up = torch.tensor([0.0, 0.0, 1.0] if abs(float(light[2] - center[2])) < 0.9 * distance else [0.0, 1.0, 0.0], dtype=torch.float64)
-        camera = Camera(look_at(light, center, up), focal, focal, size / 2, size / 2, size, size)
+        camera = Camera(look_at(light, center, up), focal, focal, SIZE / 2, SIZE / 2, SIZE, SIZE)
         near = max(1e-4 * radius, distance - 1.5 * radius, 1e-6)
         flat = Lowered(
             Geometry(geometry.means.detach(), geometry.log_scales.detach(), geometry.quats.detach()),
@@ -68,7 +66,7 @@ def light_visibility(
         with torch.no_grad():
             x, y, z = (points.detach().double() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).unbind(-1)
             front = z > near
-            spread = focal / (0.5 * size) / z.clamp_min(near)
+            spread = focal / (0.5 * SIZE) / z.clamp_min(near)
             where = torch.stack([x * spread, y * spread], -1).clamp(-2.0, 2.0)
             found = F.grid_sample(nearness[None, None], where[None, None], align_corners=False)[0, 0, 0]
             behind = z - 1.0 / found.clamp_min(1e-12)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -13,11 +12,14 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, check_viewmat
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, NonFiniteError, nearest
 from neuprim.core.fields import Constant, Cosine
+from neuprim.core.forms import Sizes, misfit, tensor_fault
 from neuprim.core.geometry import Geometry
 from neuprim.core.primitives import Lowered
 from neuprim.core.render import RenderSettings, RenderStats, render_lowered
 
 __all__ = ["Rasterized", "rasterize"]
+
+_PLACE, _NEURONS = ("means", "log_scales", "quats"), ("W1", "b1", "w2", "b2")
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ def rasterize(
         means: (N, 3) centres, scene units.
         log_scales: (N, 3) natural logarithms of the semi-axes, scene units.
         quats: (N, 4) wxyz, any non-zero norm.
-        W1: (N, K, 3) frequencies, as stored: before the factor omega0. K = 0 is an ellipsoid of constant density.
+        W1: (N, K, 3) frequencies, as stored: before the factor omega0. K = 0 to 256; 0 is an ellipsoid of constant density.
         b1: (N, K) phases, before the factor omega0.
         w2: (N, K) amplitudes.
         b2: (N, 1) or (N,) offsets.
@@ -105,14 +107,12 @@ def rasterize(
     """
     primitives = {"means": means, "log_scales": log_scales, "quats": quats, "W1": W1, "b1": b1, "w2": w2, "b2": b2, "colors": colors}
     knobs = _settings(settings)
-    count, channels = _check_primitives(primitives)
+    count, channels = _check_primitives(primitives, omega0)
     cameras = _check_cameras(viewmats, Ks, width, height)
     views = len(viewmats)
     if colors.dim() == 3 and len(colors) != views:
         raise _wrong("colors", f"shape {tuple(colors.shape)}", f"({views}, {count}, channels), one set per camera of viewmats")
     backdrop = _check_backgrounds(backgrounds, views, channels)
-    if isinstance(omega0, bool) or not isinstance(omega0, int | float) or not math.isfinite(omega0):
-        raise _wrong("omega0", f"value {omega0!r}", "a finite number")
     if Ks.requires_grad and knobs.backend != "reference":
         raise BackendUnavailable(
             f'rasterize: Ks requires a gradient, which backend="{knobs.backend}" does not compute; pass backend="reference" or Ks.detach()'
@@ -157,39 +157,23 @@ def _settings(settings: dict[str, Any]) -> RenderSettings:
 
 def _check_tensor(name: str, value: Any) -> None:
     """A float32 or float64 tensor on the CPU."""
-    if not isinstance(value, Tensor):
-        raise _wrong(name, f"type {type(value).__name__}", "a torch tensor")
-    if value.device.type != "cpu":
-        raise _wrong(name, f"device {value.device}", "cpu, where both backends compute")
-    if value.dtype not in (torch.float32, torch.float64):
-        raise _wrong(name, f"dtype {value.dtype}", "torch.float32 or torch.float64")
+    fault = tensor_fault(value)
+    if fault is not None:
+        raise DataError(f"rasterize: {name} has {fault}")
 
 
-def _check_primitives(tensors: dict[str, Tensor]) -> tuple[int, int]:
+def _check_primitives(tensors: dict[str, Tensor], omega0: float) -> tuple[int, int]:
     """(N, channels) of tensors that fit together."""
     for name, value in tensors.items():
         _check_tensor(name, value)
         if value.dtype != tensors["means"].dtype:
             raise _wrong(name, f"dtype {value.dtype}", f"{tensors['means'].dtype}, as means has")
-    if tensors["means"].dim() != 2 or tensors["means"].shape[1] != 3:
-        raise _wrong("means", f"shape {tuple(tensors['means'].shape)}", "(N, 3)")
-    n = len(tensors["means"])
-    W1 = tuple(tensors["W1"].shape)
-    if len(W1) != 3 or W1[0] != n or W1[2] != 3:
-        raise _wrong("W1", f"shape {W1}", f"(N, K, 3) with N={n} as in means")
-    k = W1[1]
-    shapes: dict[str, list[tuple[int, ...]]] = {
-        "log_scales": [(n, 3)],
-        "quats": [(n, 4)],
-        "b1": [(n, k)],
-        "w2": [(n, k)],
-        "b2": [(n, 1), (n,)],
-    }
-    for name, allowed in shapes.items():
-        if tuple(tensors[name].shape) not in allowed:
-            wanted = " or ".join(str(s) for s in allowed)
-            raise _wrong(name, f"shape {tuple(tensors[name].shape)}", f"{wanted}, as means has N={n} and W1 has K={k}")
-    colors = tuple(tensors["colors"].shape)
+    sizes: Sizes = {}
+    for form in (Geometry(*(tensors[k] for k in _PLACE)), Cosine(*(tensors[k] for k in _NEURONS), omega0)):
+        fault = misfit(form, sizes)
+        if fault is not None:
+            raise DataError(f"rasterize: {fault}")
+    n, colors = sizes["N"][0], tuple(tensors["colors"].shape)
     if len(colors) not in (2, 3) or colors[-2] != n or colors[-1] < 1:
         raise _wrong("colors", f"shape {colors}", f"(N, channels) or (C, N, channels) with N={n} as in means and channels >= 1")
     for name, row, numbers in _non_finite(tensors):

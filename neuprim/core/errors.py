@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-__all__ = ["BackendUnavailable", "CheckpointError", "ConfigError", "DataError", "NeuprimError", "NonFiniteError", "nearest"]
+__all__ = ["BackendUnavailable", "CheckpointError", "ConfigError", "DataError", "FormError", "NeuprimError", "NonFiniteError", "nearest"]
 
 
 class NeuprimError(Exception):
@@ -33,6 +33,10 @@ class BackendUnavailable(NeuprimError):
 
 class NonFiniteError(NeuprimError):
     """A parameter, gradient or loss became NaN or infinite; the message names parameter and primitive."""
+
+
+class FormError(NeuprimError):
+    """A field handed over tensors that the renderer or the training cannot take; the message names field, method and tensor."""
 
 
 def nearest(name: str, choices: Iterable[str], limit: int = 3) -> str:

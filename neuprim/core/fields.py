@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from neuprim.core.geometry import Geometry
@@ -18,6 +19,7 @@ from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import ParameterSpec, Params
 
 __all__ = [
+    "MOST_UNITS",
     "ColourField",
     "ConditionSpec",
     "Conditions",
@@ -54,13 +56,19 @@ class ConditionSpec:
 # ---------------------------------------------------------------- closed forms of density
 
 
+MOST_UNITS = 256
+"""Most neurons of a density and units of a colour network: the fast kernels number a primitive's neurons in a byte."""
+
+
 @dataclass(frozen=True)
 class Cosine:
     """f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2, world density f/m (method: equation 10 of the paper).
 
     Attributes:
-        W1: (N, K, 3), b1: (N, K), w2: (N, K), b2: (N,) or (N, 1); K = 0 is a constant density.
+        W1: (N, K, 3), b1: (N, K), w2: (N, K), b2: (N,) or (N, 1); K = 0 to :data:`MOST_UNITS`, and K = 0 is a constant density.
         omega0: multiplies the whole phase.
+
+    ``first + second`` is the sum of two densities of the same primitives, see :meth:`__add__`.
     """
 
     W1: Tensor
@@ -68,6 +76,25 @@ class Cosine:
     w2: Tensor
     b2: Tensor
     omega0: float = 30.0
+
+    def __add__(self, other: Cosine) -> Cosine:
+        """f + g, exactly: the neurons of both side by side. Differentiable.
+
+        Both have the first one's omega0 (the second one's if that is 0); frequencies and phases of the other are scaled to it.
+
+        Raises:
+            FormError: they are not of the same primitives, or have more than :data:`MOST_UNITS` neurons together.
+        """
+        if not isinstance(other, Cosine):
+            return NotImplemented
+        from neuprim.core.forms import check_sum  # which knows the forms of this file
+
+        check_sum(self, other)
+        omega0 = self.omega0 or other.omega0
+        parts = [(f, f.omega0 / omega0 if f.omega0 != omega0 else 1.0) for f in (self, other)]
+        W1 = torch.cat([f.W1 * scale for f, scale in parts], 1)
+        b1 = torch.cat([f.b1 * scale for f, scale in parts], 1)
+        return Cosine(W1, b1, torch.cat([self.w2, other.w2], 1), self.b2 + other.b2.reshape(self.b2.shape), omega0)
 
 
 @dataclass(frozen=True)
@@ -113,7 +140,7 @@ class RayNet:
         c(pixel) = max(0, base + Wout cos(Wx . x~_m + bias)),   x~_m = (x_m - mu)/m
 
     with x_m the middle of the ray's chord, after the cut by the near plane if there is one: the point that the closed form of the
-    density is anchored at. One hidden layer of H cosine units, H = 0 to 16, phases in radians; H = 0 is the constant colour
+    density is anchored at. One hidden layer of H cosine units, H = 0 to :data:`MOST_UNITS`, phases in radians; H = 0 is the constant colour
     max(0, base). Whatever does not change within a primitive (view direction at its centre, light) a field folds into ``bias``,
     ``Wout`` and ``base``. A colour of exactly 0 still passes its gradient, as ``clamp_min`` does.
 

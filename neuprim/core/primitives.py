@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.fields import ColourField, Conditions, Constant, DensityField, LoweredColour, LoweredDensity, RayNet, Shade
+from neuprim.core.forms import check_colour, check_density, check_geometry, check_result, check_rows, method, source
 from neuprim.core.geometry import GEOMETRY_SPECS, Geometry
 from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import InitContext, ParameterSpec
@@ -22,7 +24,8 @@ class Lowered:
     """What one frame hands to the renderer, whatever the task.
 
     ``rows`` (M,) int64 says which primitives these are where a field left some out; None for all. ``shade``, if any, is a factor on
-    each pixel (see :meth:`~neuprim.core.fields.ColourField.shade`).
+    each pixel (see :meth:`~neuprim.core.fields.ColourField.shade`). ``fields`` are the class names of density and colour field, for
+    messages; None for forms that no field made.
     """
 
     geometry: Geometry
@@ -30,6 +33,15 @@ class Lowered:
     colour: LoweredColour
     rows: Tensor | None = None
     shade: Shade | None = None
+    fields: tuple[str, str] | None = None
+
+    def owner(self, kind: Literal["density", "colour"]) -> str:
+        """Whose form it is, for messages: ``"density field Waves"``."""
+        return source(kind, None if self.fields is None else self.fields[kind == "colour"])
+
+    def source(self, kind: Literal["density", "colour"]) -> str:
+        """The same with the form: ``"density field Waves lowered to Cosine"``."""
+        return f"{self.owner(kind)} lowered to {type(getattr(self, kind)).__name__}"
 
     def center_colors(self, position: Tensor) -> Tensor:
         """(M, C) colours at the primitives' centres, seen from ``position`` (3,)."""
@@ -40,7 +52,8 @@ class Lowered:
             return self.colour.radiance(torch.arange(count), torch.zeros(count, 3, dtype=torch.float64))
         means = self.geometry.means
         directions = torch.nn.functional.normalize(means - position.to(means), dim=1)
-        return self.colour.radiance(torch.arange(count), means, directions)
+        found = self.colour.radiance(torch.arange(count), means, directions)
+        return check_result(found, (count, self.colour.channels), f"{self.source('colour')}: radiance")
 
 
 @dataclass(frozen=True)
@@ -63,7 +76,8 @@ class Living:
 
     def sigma(self, prim: Tensor, x: Tensor) -> Tensor:
         """World density (P,), 1/scene unit, unclamped, of the living primitives ``prim`` (P,), 0..M-1, at points ``x`` (P, 3)."""
-        return self.field.density(self.own, self.stored, prim, x, self.conditions)
+        found = self.field.density(self.own, self.stored, prim, x, self.conditions)
+        return check_result(found, (len(prim),), method(self.field, "density"))
 
 
 class Primitives:
@@ -115,30 +129,45 @@ class Primitives:
         return {s.name: self.params[s.name] for s in field.parameters()}
 
     def lower(self, camera: AnyCamera, conditions: Conditions) -> Lowered:
-        """Fold a frame's conditions into closed forms; differentiable. Primitives that are not alive in it are left out."""
+        """Fold a frame's conditions into closed forms; differentiable. Primitives that are not alive in it are left out.
+
+        Raises:
+            FormError: a field hands over tensors that do not fit.
+        """
         living = self.living(conditions)
         geometry = living.geometry
+        names = (type(self.density).__name__, type(self.colour).__name__)
+        sizes = check_geometry(geometry, "geometry")
         density = self.density.lower(living.own, geometry, conditions)
+        check_density(density, sizes, names[0])  # before the colour looks at it, which may draw it
         conditions = self.colour.derive(geometry, density, conditions)
         tint = {s.name: living.params[s.name] for s in self.colour.parameters()}
         colour = self.colour.lower(tint, geometry, camera, conditions)
-        return Lowered(geometry, density, colour, living.rows, self.colour.shade(geometry, density, conditions))
+        check_colour(colour, sizes, names[1])
+        return Lowered(geometry, density, colour, living.rows, self.colour.shade(geometry, density, conditions), names)
 
     def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:
         """Where the primitives that live in a frame are, and their density; no camera needed."""
         living = self.living(conditions)
-        return living.geometry, self.density.lower(living.own, living.geometry, conditions)
+        density = self.density.lower(living.own, living.geometry, conditions)
+        check_density(density, check_geometry(living.geometry, "geometry"), type(self.density).__name__)
+        return living.geometry, density
 
     def living(self, conditions: Conditions, dtype: torch.dtype | None = None) -> Living:
         """Which primitives live in a frame, and where; differentiable. With ``dtype``, everything is detached and of that type."""
         rows = self.density.alive(self.of(self.density), conditions)
+        if rows is not None:
+            check_rows(rows, self.count, method(self.density, "alive"))
         params = self.params if rows is None else {name: value.index_select(0, rows) for name, value in self.params.items()}
         if dtype is not None:
             params = {name: value.detach().to(dtype) for name, value in params.items()}
             conditions = {name: value.to(dtype) for name, value in conditions.items()}
         own = {s.name: params[s.name] for s in self.density.parameters()}
         stored = Geometry(params["means"], params["log_scales"], params["quats"])
-        return Living(self.density, conditions, rows, params, own, stored, self.density.move(own, stored, conditions))
+        moved = self.density.move(own, stored, conditions)
+        if moved is not stored:
+            check_geometry(moved, method(self.density, "move"), stored.count)
+        return Living(self.density, conditions, rows, params, own, stored, moved)
 
     def rows(self, index: Tensor) -> dict[str, Tensor]:
         """Detached copies of some rows of every parameter."""

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
+
+from neuprim.core.errors import FormError
+from neuprim.core.forms import Shape, Sizes, tensors_fault
 
 __all__ = ["C0", "basis", "coefficient_count", "colors", "initial_dc"]
 
@@ -72,10 +76,14 @@ def colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degre
         dc: (N, C) zero-order coefficients.
         rest: (N, at least (degree + 1)^2 - 1, C) of the higher bands; None only at degree 0.
         degree: bands in use, 0..3.
+
+    Raises:
+        FormError: a tensor does not fit; the fused kernel would read beyond its end.
     """
+    _check(means, dc, rest, origin, degree)
     if degree == 0:
         return (dc * C0 + 0.5).clamp_min(0.0)
-    assert rest is not None, "bands above the first need their coefficients"
+    assert rest is not None  # checked above
     if dc.device.type == "cpu" and dc.dtype == means.dtype == torch.float32:
         from neuprim.core.sh_cpu import fused_colors  # numba, loaded when first needed
 
@@ -84,6 +92,23 @@ def colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degre
     direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-30)
     bands = basis(direction, degree)[:, 1:]
     return (dc * C0 + 0.5 + (bands[:, :, None] * rest[:, : bands.shape[1]]).sum(1)).clamp_min(0.0)
+
+
+def _check(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degree: int) -> None:
+    if not isinstance(degree, int) or not 0 <= degree <= 3:
+        raise FormError(f"sh.colors: degree {degree!r}; expected 0..3")
+    needed = coefficient_count(degree) - 1
+    if needed and rest is None:
+        raise FormError(f"sh.colors: rest is None; expected (N, at least {needed}, C) for degree {degree}")
+    tensors: list[tuple[str, Any, tuple[Shape, ...]]] = [("means", means, (("N", 3),)), ("dc", dc, (("N", "C"),))]
+    if needed:
+        tensors += [("rest", rest, (("N", "bands", "C"),)), ("origin", origin, ((3,),))]
+    sizes: Sizes = {}
+    fault = tensors_fault(tensors, sizes)
+    if fault is None and needed and sizes["bands"][0] < needed:
+        fault = f"rest has {sizes['bands'][0]} bands; expected at least {needed} for degree {degree}"
+    if fault is not None:
+        raise FormError(f"sh.colors: {fault}")
 
 
 _DARKEST = 1e-3

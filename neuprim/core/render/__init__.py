@@ -10,6 +10,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.fields import Constant, Cosine, RayNet
+from neuprim.core.forms import check_lowered
 from neuprim.core.primitives import Lowered, Primitives
 from neuprim.core.ray_cameras import AnyCamera, RayCamera
 from neuprim.core.render.output import RenderOutput, RenderStats
@@ -63,6 +64,7 @@ def render(
         background: (C,) colour behind everything; None is black.
 
     Raises:
+        FormError: a field, the camera or the background has a tensor that does not fit (field, tensor, found and expected).
         NonFiniteError: a parameter is NaN or infinite (named, with the primitive).
         BackendUnavailable: the backend asked for cannot draw this model or this camera.
     """
@@ -70,7 +72,8 @@ def render(
 
 
 def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None) -> RenderOutput:
-    """Draw a model whose conditions are already folded in; refuses what is not finite, see :func:`render`."""
+    """Draw a model whose conditions are already folded in; refuses what does not fit or is not finite, see :func:`render`."""
+    check_lowered(lowered, camera.viewmat, background)
     if choose_backend(lowered, settings, camera) == "cpu":  # which checks while it prepares
         from neuprim.core.render.cpu.backend import render as draw
     else:

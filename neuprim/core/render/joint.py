@@ -24,6 +24,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import ConfigError
 from neuprim.core.fields import Constant, Cosine, RayNet
+from neuprim.core.forms import check_lowered, check_result
 from neuprim.core.geometry import quaternion_to_matrix
 from neuprim.core.metrics import psnr
 from neuprim.core.primitives import Lowered
@@ -102,11 +103,14 @@ def joint_volume(
 
     Raises:
         ConfigError: for ``steps`` below 1 or an unknown ``keep``.
+        FormError: as :func:`~neuprim.core.render.render`.
     """
     if steps < 1:
         raise ConfigError(f"steps={steps}: expected at least 1")
     if keep not in ("opacity", "density"):
         raise ConfigError(f"keep={keep!r}: expected opacity or density")
+
+    check_lowered(lowered, camera.viewmat, background)
 
     def draw(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
         return _draw(lowered, camera, background, settings, steps, keep)
@@ -206,7 +210,8 @@ def _march(
         if isinstance(colour, RayNet):
             c = colour.radiance(prim, (x - g.means.double()[prim]) / g.log_length_scale.double().exp()[prim, None])
         else:
-            c = colour.radiance(prim, x, world[ray]).double()
+            c = colour.radiance(prim, x, world[ray])
+            c = check_result(c, (len(prim), channels), f"{lowered.source('colour')}: radiance").double()
     cells = middle.shape[1]
     at = ray[chord] * cells + cell
     depth = torch.zeros(P * cells, dtype=torch.float64).index_add(0, at, tau)
@@ -225,7 +230,7 @@ class _Chords:
 
     def __init__(self, lowered: Lowered, prim: Tensor, origin: Tensor, world: Tensor, t0: Tensor, t1: Tensor) -> None:
         self.density, self.prim, self.world = lowered.density, prim, world
-        self.origin = origin.expand_as(world)
+        self.origin, self.source = origin.expand_as(world), lowered.source("density")
         if isinstance(self.density, Cosine):
             f, g = self.density, lowered.geometry
             self.m = g.log_length_scale.double().exp()[prim]
@@ -239,7 +244,8 @@ class _Chords:
     def optical_depth(self, chord: Tensor, t0: Tensor, t1: Tensor) -> Tensor:
         """(Q,) integrals of sigma, unclamped, from ``t0`` to ``t1`` (scene units) of chords number ``chord``."""
         if not isinstance(self.density, Cosine):
-            return self.density.line_integral(self.prim[chord], self.origin[chord], self.world[chord], t0, t1).double()
+            found = self.density.line_integral(self.prim[chord], self.origin[chord], self.world[chord], t0, t1)
+            return check_result(found, (len(chord),), f"{self.source}: line_integral").double()
         rate = self.rate[chord]
         phase = self.phase[chord] + rate * ((t0 + t1) / 2 - self.middle[chord])[:, None]
         mean = self.b2[chord] + (self.w2[chord] * phase.cos() * torch.sinc(rate * ((t1 - t0) / (2 * torch.pi))[:, None])).sum(-1)

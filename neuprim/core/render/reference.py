@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.fields import Constant, Cosine, RayNet
+from neuprim.core.forms import check_result
 from neuprim.core.geometry import quaternion_to_matrix
 from neuprim.core.primitives import Lowered
 from neuprim.core.ray_cameras import AnyCamera
@@ -169,7 +170,8 @@ def _trace(
         optical_depth = 2 * half * mean_f
     else:
         origin = frame.origin.expand_as(world_d)
-        optical_depth = lowered.density.line_integral(prim, origin, world_d, t0 * m, t1 * m).double()
+        found = lowered.density.line_integral(prim, origin, world_d, t0 * m, t1 * m)
+        optical_depth = check_result(found, (len(prim),), f"{lowered.source('density')}: line_integral").double()
 
     alpha = -torch.expm1(-optical_depth.clamp_min(0))
     alpha = alpha.clamp_max(settings.alpha_max)
@@ -203,7 +205,8 @@ def _trace(
             c = lowered.colour.radiance(prim, local)
         else:
             xw = frame.origin + (mid * m)[:, None] * world_d
-            c = lowered.colour.radiance(prim, xw, world_d).double()
+            c = lowered.colour.radiance(prim, xw, world_d)
+            c = check_result(c, (len(prim), channels), f"{lowered.source('colour')}: radiance").double()
         rgb = torch.zeros(P, channels, dtype=torch.float64).index_add(0, j, weights[i, j][:, None] * c)
     z = torch.zeros(P, dtype=torch.float64).index_add(0, j, weights[i, j] * mid * m * rays.depth[j]) if settings.depth else T[-1] * 0
     return torch.cat([rgb, T[-1][:, None], z[:, None]], -1)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from neuprim.core.forms import check_result
 from neuprim.core.primitives import Lowered
 from neuprim.core.ray_cameras import AnyCamera, RayCamera
 from neuprim.core.render.output import RenderOutput
@@ -41,7 +42,9 @@ def with_shade(draw: Draw) -> Draw:
         assert output.depth is not None
         hit = output.alpha.detach() > 0
         factor = torch.ones_like(output.alpha, requires_grad=False)
-        factor[hit] = lowered.shade(points_seen(output.depth, camera)[hit]).to(factor)
+        points = points_seen(output.depth, camera)[hit]
+        found = lowered.shade(points)
+        factor[hit] = check_result(found, (len(points),), f"{lowered.owner('colour')}: shade").to(factor)
         rgb = output.rgb * factor[..., None]
         if background is not None:
             rgb = rgb + ((1 - factor) * (1 - output.alpha))[..., None] * background.to(rgb)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from neuprim.core.forms import check_halves, check_tensors, method
 from neuprim.core.geometry import Geometry, quaternion_to_matrix
 from neuprim.core.primitives import Primitives
 from neuprim.core.render.output import RenderStats
@@ -67,6 +68,9 @@ def split(model: Primitives, parents: Tensor, shift: float, long_factor: float, 
 
     Children sit at +-shift x the longest semi-axis, inside the parent's support; that axis shrinks by ``long_factor``,
     the others by ``other_factor``. Parents that the density divides along a condition (time) stay where they are.
+
+    Raises:
+        FormError: ``on_split`` or ``divide`` returned something of another shape.
     """
     rows = torch.cat([parents, parents])
     old = {n: v.detach()[rows].clone() for n, v in model.params.items()}
@@ -78,15 +82,16 @@ def split(model: Primitives, parents: Tensor, shift: float, long_factor: float, 
     reach = (before.scales * pick).sum(-1, keepdim=True)
     shrink = torch.where(pick > 0, torch.full_like(pick, long_factor), torch.full_like(pick, other_factor))
     after = Geometry(before.means + sign * shift * reach * direction, before.log_scales + shrink.log(), before.quats)
-    density = model.density.on_split({k: old[k] for k in model.of(model.density)}, before, after)
-    colour = model.colour.on_split({k: old[k] for k in model.of(model.colour)}, before, after)
+    own, tint = ({k: old[k] for k in model.of(field)} for field in (model.density, model.colour))
+    density = check_tensors(model.density.on_split(own, before, after), own, method(model.density, "on_split"))
+    colour = check_tensors(model.colour.on_split(tint, before, after), tint, method(model.colour, "on_split"))
     children = {**old, "means": after.means, "log_scales": after.log_scales, **density, **colour}
     first = slice(len(parents))
-    divided = model.density.divide({k: old[k][first] for k in model.of(model.density)}, before[first])
+    divided = model.density.divide({k: v[first] for k, v in own.items()}, before[first])
     if divided is not None:
-        chosen, halves, place = divided
+        chosen, halves, place = check_halves(divided, own, before, method(model.density, "divide"))
         chosen = torch.cat([chosen, chosen])
-        for name, value in {**old, "means": place.means, "log_scales": place.log_scales, "quats": place.quats, **halves}.items():
+        for name, value in {**old, **place, **halves}.items():
             children[name][chosen] = value[chosen]
     return children
 
@@ -193,9 +198,9 @@ class Gradient(Population):
         kept = keep.nonzero()[:, 0]
 
         params = {n: v.detach()[kept].clone() for n, v in model.params.items()}
-        halved = model.density.scale_density(
-            {k: model.params[k].detach()[clones] for k in model.of(model.density)}, torch.full((len(clones),), 0.5)
-        )
+        own = {k: model.params[k].detach()[clones] for k in model.of(model.density)}
+        halved = model.density.scale_density(own, torch.full((len(clones),), 0.5))
+        halved = check_tensors(halved, own, method(model.density, "scale_density"))
         copies = {**model.rows(clones), **halved}
         place = torch.full((model.count,), -1, dtype=torch.int64)
         place[kept] = torch.arange(len(kept))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.errors import NonFiniteError
+from neuprim.core.errors import FormError, NonFiniteError
 from neuprim.core.fields import Constant, Cosine, RayNet
 from neuprim.core.primitives import Lowered
 from neuprim.core.render.cpu.backward import backward_tiles, sum_rows
@@ -72,7 +72,14 @@ class _Frame:
 
 
 def _array(tensor: Tensor) -> Array:
-    return np.ascontiguousarray(tensor.detach().numpy())
+    return np.ascontiguousarray(tensor.detach().resolve_neg().numpy())
+
+
+def _alike(tensors: dict[str, Array]) -> dict[str, Array]:
+    """One dtype, the widest, so that a mix does not compile kernels of its own; they compute in float64 in any case."""
+    if len({v.dtype for v in tensors.values()}) == 1:
+        return tensors
+    return {name: v.astype(np.float64, copy=False) for name, v in tensors.items()}
 
 
 @lru_cache(maxsize=4)
@@ -172,9 +179,9 @@ class _Rasterize(torch.autograd.Function):
         *net: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         names = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
-        tensors = {n: _array(v) for n, v in zip(names, (means, log_scales, quats, W1, b1, w2, b2), strict=True)}
         tint = _NET if net else ("colors",)
-        tensors |= {n: _array(v) for n, v in zip(tint, (*net, colors), strict=True)}
+        kernels = zip((*names, *tint[:-1]), (means, log_scales, quats, W1, b1, w2, b2, *net), strict=True)
+        tensors = _alike({n: _array(v) for n, v in kernels}) | {tint[-1]: _array(colors)}
         _check_colours(tensors, tint)
         frame = _prepare(tensors, camera, viewmat.detach().double().numpy(), omega0, _array(background.float()), settings, stats)
         h, w, C = camera.height, camera.width, colors.shape[1]
@@ -209,6 +216,8 @@ class _Rasterize(torch.autograd.Function):
         gT = np.ascontiguousarray((g_T + g_rgb @ torch.from_numpy(frame.background)).numpy(), np.float32)
         gz = np.ascontiguousarray(g_z.numpy(), np.float32)
         wanted = frame.stats.pixel_error
+        if wanted is not None and wanted.shape != (h, w):
+            raise FormError(f"stats.pixel_error has shape {tuple(wanted.shape)}; expected {(h, w)}, that of the frame")
         error = np.zeros((h, w), np.float32) if wanted is None else np.ascontiguousarray(wanted.detach().numpy(), np.float32)
         width = gradient_width(frame.neurons, C, frame.net.hidden if frame.net else 0)
         pair_rows = np.empty((frame.lists.pairs, width), np.float32)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.fields import Conditions, Cosine, DensityField
+from neuprim.core.forms import number_fault
 from neuprim.core.geometry import Geometry
 from neuprim.core.schema import InitContext, ParameterSpec, Params
 
@@ -21,24 +22,31 @@ OMEGA0 = 30.0
 class CosineDensity(DensityField):
     """f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2 with x~ = (x - mu)/m, sigma = f/m; 5K + 1 parameters.
 
+    Args:
+        neurons: K, 0 to 16.
+        omega0: a positive number.
+
     ``init.mode`` of the model settings: "opaque" (default) starts every primitive at central opacity ``init.alpha``;
     "paper" draws the offset as the authors do, which leaves half of all chords without a gradient.
     """
 
     init_settings = ("mode", "alpha")
 
-    def __init__(self, neurons: int = 8) -> None:
+    def __init__(self, neurons: int = 8, omega0: float = OMEGA0) -> None:
         if not isinstance(neurons, int) or not 0 <= neurons <= 16:
             raise ValueError(f"{neurons!r} neurons; expected 0..16")
-        self.neurons = neurons
+        if number_fault(omega0) is not None or omega0 <= 0:
+            raise ValueError(f"omega0 {omega0!r}; expected a positive number")
+        self.neurons, self.omega0 = neurons, omega0
 
     def settings(self) -> dict[str, Any]:
-        return {"neurons": self.neurons}
+        own = {"neurons": self.neurons}
+        return own if self.omega0 == OMEGA0 else {**own, "omega0": self.omega0}
 
     def parameters(self) -> list[ParameterSpec]:
         K = self.neurons
         third = 1.0 / 3.0
-        amplitude = math.sqrt(6.0 / K) / OMEGA0 if K else 0.0
+        amplitude = math.sqrt(6.0 / K) / self.omega0 if K else 0.0
         return [
             ParameterSpec("W1", (K, 3), 3e-3, lambda c: c.uniform(K, 3, bound=third)),
             ParameterSpec("b1", (K,), 3e-3, lambda c: c.uniform(K, bound=third)),
@@ -47,13 +55,13 @@ class CosineDensity(DensityField):
         ]
 
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Cosine:
-        return Cosine(params["W1"], params["b1"], params["w2"], params["b2"], OMEGA0)
+        return Cosine(params["W1"], params["b1"], params["w2"], params["b2"], self.omega0)
 
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
         return cosine_density(self.lower(params, geometry, conditions), geometry, prim, x)
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        return split_cosine(params, old, new)
+        return split_cosine(params, old, new, self.omega0)
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         return {**params, "w2": params["w2"] * factor[:, None], "b2": params["b2"] * factor[:, None]}
@@ -81,16 +89,16 @@ def cosine_density(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) ->
     return ((form.w2[prim] * phase.cos()).sum(-1) + form.b2[prim].reshape(-1)) / m
 
 
-def split_cosine(params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
+def split_cosine(params: Params, old: Geometry, new: Geometry, omega0: float = OMEGA0) -> dict[str, Tensor]:
     """Children that carry their parents' sigma unchanged: W1' = r W1, b1' = b1 + W1 (mu'-mu)/m, (w2, b2)' = r (w2, b2), r = m'/m.
 
-    Computed in float64, so the field changes by no more than the final rounding; other tensors pass through.
+    ``omega0`` is that of the form which ``params`` lower to. Computed in float64, so the field changes by no more than the final rounding; other tensors pass through.
     """
     r = (new.log_length_scale.double() - old.log_length_scale.double()).exp()
     shift = (new.means.double() - old.means.double()) / old.length_scale.double()[:, None]
     W1, b1 = params["W1"].double(), params["b1"].double()
     b1 = b1 + (W1 * shift[:, None, :]).sum(-1)
-    turns = 2 * math.pi / OMEGA0
+    turns = 2 * math.pi / omega0
     b1 = b1 - turns * torch.round(b1 / turns)  # a phase is only known modulo one turn; keep it small for float32
     return {
         **params,

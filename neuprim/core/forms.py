@@ -81,7 +81,9 @@ def number_fault(value: Any) -> str | None:
     """The same of what should be a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return f"type {type(value).__name__}; expected a finite number"
-    return None if abs(value) <= sys.float_info.max else f"value {value!r}; expected a finite number"
+    if abs(value) <= sys.float_info.max:
+        return None
+    return f"value {value if isinstance(value, float) else 'beyond the range of float64'}; expected a finite number"
 
 
 def function_fault(value: Any) -> str | None:
@@ -174,14 +176,14 @@ def method(field: Field, name: str) -> str:
 
 
 def check_geometry(geometry: Any, who: str, count: int | None = None) -> Sizes:
-    """The sizes of an ellipsoids' tensors that fit together; ``count`` is their number where it is known.
+    """The sizes that the tensors of ellipsoids share; ``count`` is how many there must be, where that is known.
 
     Raises:
         FormError: they do not; names ``who``, tensor, found and expected.
     """
     if not isinstance(geometry, Geometry):
         raise FormError(f"{who} has type {type(geometry).__name__}; expected Geometry")
-    sizes: Sizes = {} if count is None else {"N": (count, "the model")}
+    sizes: Sizes = {} if count is None else {"N": (count, "the geometry given")}
     fault = misfit(geometry, sizes)
     if fault is not None:
         raise FormError(f"{who}: {fault}")
@@ -231,7 +233,7 @@ def check_lowered(lowered: Lowered, viewmat: Any = None, background: Any = None)
     check_density(lowered.density, sizes, density)
     check_colour(lowered.colour, sizes, colour)
     if lowered.rows is not None:
-        check_rows(lowered.rows, None, "rows", sizes["N"][0])
+        check_rows(lowered.rows, None, "Lowered.rows holds", sizes["N"][0])
     if lowered.shade is not None and (fault := function_fault(lowered.shade)) is not None:
         raise FormError(f"{lowered.owner('colour')}: shade has {fault} or None")
     if background is not None:
@@ -267,7 +269,7 @@ def check_rows(rows: Any, model: int | None, who: str, length: int | None = None
             found = f"rows that do not ascend, {rows[:8].tolist()}{' ...' if len(rows) > 8 else ''}"
     if found is not None:
         limit = "" if model is None else f" from 0 to {model - 1}"
-        raise FormError(f"{who} has {found}; expected ascending int64 rows (M,){limit}")
+        raise FormError(f"{who} {found}; expected ascending int64 rows (M,){limit}")
 
 
 def check_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:

@@ -157,7 +157,7 @@ class Primitives:
         """Which primitives live in a frame, and where; differentiable. With ``dtype``, everything is detached and of that type."""
         rows = self.density.alive(self.of(self.density), conditions)
         if rows is not None:
-            check_rows(rows, self.count, method(self.density, "alive"))
+            check_rows(rows, self.count, f"{method(self.density, 'alive')} returned")
         params = self.params if rows is None else {name: value.index_select(0, rows) for name, value in self.params.items()}
         if dtype is not None:
             params = {name: value.detach().to(dtype) for name, value in params.items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -119,6 +120,34 @@ def test_split_carries_sigma(dtype: torch.dtype, bound: float, neurons: int, fac
     assert torch.allclose(inside[:40], -inside[40:], atol=1e-5)
     copies = {**children, **{k: t[k][parents.repeat(2)] for k in DENSITY}}
     assert ((sigma_at(copies, rows, x) - before).abs() / largest).max() > 0.1
+
+
+@pytest.mark.parametrize("omega0", [0.7, 12.0, 30.0])
+def test_split_wraps_phases_at_the_density_s_own_turn(omega0: float) -> None:
+    """A turn of another omega0 would be part of one: the children would be other waves."""
+    t = scenes.tensors(40, 8, seed=1)
+    t["b1"] = t["b1"] * 40 * 30 / omega0  # tens of turns
+    density = CosineDensity(8, omega0)
+    assert type(density)(**density.settings()).omega0 == omega0 and CosineDensity(8).settings() == {"neurons": 8}
+    old = geometry(t)
+    new = Geometry(old.means + 0.3 * old.length_scale[:, None] * torch.tensor([1.0, 0.0, 0.0]), old.log_scales + math.log(0.6), old.quats)
+    own = {k: t[k] for k in DENSITY}
+    child = density.on_split(own, old, new)
+    assert child["b1"].abs().max() <= math.pi / omega0 * (1 + 1e-6) < t["b1"].abs().max()
+    rows, x = points_inside(new, 20)
+    before, after = (
+        density.density(
+            {k: v.double() for k, v in p.items()}, Geometry(*(y.double() for y in (g.means, g.log_scales, g.quats))), rows, x, {}
+        )
+        for p, g in ((own, old), (child, new))
+    )
+    assert (before - after).abs().max() <= 1e-5 * before.abs().max()
+
+
+@pytest.mark.parametrize("wrong", [0.0, -30.0, math.nan, math.inf, "30", True, None])
+def test_omega0_is_a_positive_number(wrong: Any) -> None:
+    with pytest.raises(ValueError, match=r"omega0 .*; expected a positive number"):
+        CosineDensity(8, wrong)
 
 
 def test_split_follows_the_longest_axis() -> None:

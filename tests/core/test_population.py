@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
 
 from neuprim.core.cosine import CosineDensity
+from neuprim.core.errors import FormError
 from neuprim.core.geometry import Geometry
 from neuprim.core.primitives import Primitives
 from neuprim.core.render.output import RenderStats
@@ -247,3 +250,87 @@ def test_due() -> None:
     population.observe(m, stats(torch.ones(COUNT)))
     assert population.intervene(m, 1.0) is None and population.state() == {}
     assert isinstance(make_population(PopulationSettings(strategy="fixed")), Fixed)
+
+
+# ---------------------------------------------------------------- fields whose methods return something else
+
+
+def of_waves(**methods: Any) -> Primitives:
+    m = model()
+    m.density = type("Waves", (CosineDensity,), methods)(4)
+    return m
+
+
+def splits(m: Primitives) -> None:
+    relocate(m, torch.arange(1.0, COUNT + 1), torch.arange(1.0, COUNT + 1))
+
+
+def clones(m: Primitives) -> None:
+    grown(m, torch.full((COUNT,), 5.0), clone_scale=10.0)
+
+
+def changed(method: str, **to: Any) -> dict[str, Any]:
+    """The method with some tensors put through a function."""
+
+    def wrong(self: CosineDensity, params: Any, *rest: Any) -> dict[str, Tensor]:
+        right = getattr(CosineDensity, method)(self, params, *rest)
+        return {**right, **{name: change(right[name]) for name, change in to.items()}}
+
+    return {method: wrong}
+
+
+def dividing(change: Any) -> dict[str, Any]:
+    def divide(self: CosineDensity, params: Any, geometry: Geometry) -> Any:
+        twice = {k: torch.cat([v, v]) for k, v in params.items()}
+        place = Geometry(*(torch.cat([v, v]) for v in (geometry.means, geometry.log_scales, geometry.quats)))
+        return change(torch.ones(geometry.count, dtype=torch.bool), twice, place)
+
+    return {"divide": divide}
+
+
+@pytest.mark.parametrize(
+    ("act", "methods", "message"),
+    [
+        (splits, changed("on_split", b2=lambda v: v[:, 0]), r"on_split: b2 has shape \(10,\); expected \(10, 1\)"),
+        (splits, changed("on_split", b1=lambda v: v[:3]), r"on_split: b1 has shape \(3, 4\); expected \(10, 4\)"),
+        (splits, changed("on_split", w2=lambda v: v.float()), r"on_split: w2 has dtype torch\.float32; expected torch\.float64"),
+        (splits, changed("on_split", w2=lambda v: v.tolist()), r"on_split: w2 has type list; expected a torch tensor"),
+        (splits, {"on_split": lambda self, p, old, new: {**p, "amplitude": p["w2"]}}, r"on_split returned tensors \['W1', 'amplitude'"),
+        (splits, {"on_split": lambda self, p, old, new: {"W1": p["W1"]}}, r"on_split returned tensors \['W1'\]; expected \['W1', 'b1'"),
+        (splits, {"on_split": lambda self, p, old, new: None}, r"on_split returned type NoneType; expected a dict of tensors"),
+        (clones, changed("scale_density", w2=lambda v: v.T), r"scale_density: w2 has shape \(4, 20\); expected \(20, 4\)"),
+        (clones, {"scale_density": lambda self, p, f: p["w2"] * f[:, None]}, r"scale_density returned type Tensor; expected a dict"),
+        (splits, dividing(lambda mask, halves, place: (mask.float(), halves, place)), r"divide returned a mask of torch\.float32 \(5,\)"),
+        (
+            splits,
+            dividing(lambda mask, halves, place: (mask[:2], halves, place)),
+            r"divide returned a mask of torch\.bool \(2,\) .* \(5,\)",
+        ),
+        (
+            splits,
+            dividing(lambda mask, halves, place: (mask, {k: v[:5] for k, v in halves.items()}, place)),
+            r"divide: W1 has shape \(5, 4, 3\)",
+        ),
+        (splits, dividing(lambda mask, halves, place: (mask, halves, place[:5])), r"divide: means has shape \(5, 3\); expected \(10, 3\)"),
+        (splits, dividing(lambda mask, halves, place: (mask, halves)), r"divide returned type tuple; expected \(mask, tensors, Geometry\)"),
+        (splits, dividing(lambda mask, halves, place: (mask, halves, None)), r"divide returned a geometry of type NoneType"),
+    ],
+)
+def test_what_a_method_returns_is_checked_by_name(act: Any, methods: dict[str, Any], message: str) -> None:
+    with pytest.raises(FormError, match=f"^density field Waves: {message}") as caught:
+        act(of_waves(**methods))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_right_division_is_taken() -> None:
+    m = of_waves(**dividing(lambda mask, halves, place: (mask, halves, place)))
+    change = relocate(m, torch.arange(1.0, COUNT + 1), torch.arange(1.0, COUNT + 1))
+    for name, value in change.params.items():
+        assert torch.equal(value, m.params[name].detach()[change.origin]), name
+
+
+def test_a_colour_s_split_is_checked_too() -> None:
+    m = model()
+    m.colour = type("Paint", (SphericalHarmonics,), {"on_split": lambda self, p, old, new: {"sh_dc": p["sh_dc"][:, :2]}})(0)
+    with pytest.raises(FormError, match=r"^colour field Paint: on_split: sh_dc has shape \(10, 2\); expected \(10, 3\)"):
+        splits(m)

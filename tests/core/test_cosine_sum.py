@@ -1,0 +1,111 @@
+"""The sum of two cosine forms is the sum of their densities, of their line integrals and of their gradients."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import reduce
+from operator import add
+
+import pytest
+import torch
+from torch import Tensor
+
+from neuprim.core.cosine import cosine_density
+from neuprim.core.errors import FormError
+from neuprim.core.fields import MOST_UNITS, Cosine, Opaque
+from neuprim.core.geometry import Geometry
+from neuprim.core.primitives import Lowered
+from neuprim.core.render import RenderSettings, render_lowered
+from neuprim.plugins.conformance.integrals import chords, inside, line_integral
+from tests import scenes
+
+COUNT = 12
+EXACT = RenderSettings(backend="reference", alpha_min=0.0, transmittance_min=0.0)
+
+
+def form(neurons: int, omega0: float, seed: int, flat: bool = False, dtype: torch.dtype = torch.float64) -> Cosine:
+    t = scenes.tensors(COUNT, neurons, seed=seed, dtype=dtype)
+    return Cosine(t["W1"], t["b1"], t["w2"], t["b2"][:, 0] if flat else t["b2"], omega0)
+
+
+def where() -> Geometry:
+    t = scenes.tensors(COUNT, seed=5, dtype=torch.float64)
+    return Geometry(t["means"], t["log_scales"], t["quats"])
+
+
+PAIRS = {
+    "one omega0": (form(3, 30.0, 1), form(5, 30.0, 2)),
+    "two of them": (form(3, 30.0, 1), form(5, 4.5, 2)),
+    "of other signs": (form(3, -2.0, 1), form(2, 30.0, 2)),
+    "the first is constant": (form(3, 0.0, 1), form(5, 4.5, 2)),
+    "the second is constant": (form(3, 7.0, 1), form(5, 0.0, 2)),
+    "both are": (form(3, 0.0, 1), form(2, 0.0, 2)),
+    "no neurons": (form(0, 30.0, 1), form(2, 4.5, 2)),
+    "flat offsets": (form(3, 30.0, 1, flat=True), form(5, 4.5, 2)),
+    "more flat offsets": (form(3, 30.0, 1), form(5, 4.5, 2, flat=True)),
+}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_densities_and_line_integrals_add_up(name: str) -> None:
+    first, second = PAIRS[name]
+    both, geometry = first + second, where()
+    assert both.W1.shape == (COUNT, first.W1.shape[1] + second.W1.shape[1], 3) and both.b2.shape == first.b2.shape
+    generator = torch.Generator().manual_seed(1)
+    prim = torch.arange(COUNT).repeat(8)
+    x = inside(geometry, prim, generator)
+    found, a, b = (cosine_density(f, geometry, prim, x) for f in (both, first, second))
+    assert (found - a - b).abs().max() <= 1e-12 * a.abs().max() and b.abs().max() > 0.1
+    ray = chords(geometry, prim, generator)
+    whole, a, b = (line_integral(f, geometry, prim, *ray) for f in (both, first, second))
+    assert (whole - a - b).abs().max() <= 1e-12 * a.abs().max() and b.abs().max() > 0.01
+
+
+def test_a_sum_is_drawn_as_the_sum_of_the_integrals() -> None:
+    first, second = PAIRS["two of them"]
+    geometry, colour = where(), scenes.colour(scenes.tensors(COUNT, dtype=torch.float64))
+
+    def added(*ray: Tensor) -> Tensor:
+        return sum((line_integral(f, geometry, *ray) for f in (first, second)), torch.zeros(()))
+
+    camera = scenes.camera(20, 15)
+    expected = render_lowered(Lowered(geometry, Opaque(added), colour), camera, EXACT).rgb
+    for backend, bound in (("reference", 1e-12), ("cpu", 2e-5)):
+        found = render_lowered(Lowered(geometry, first + second, colour), camera, replace(EXACT, backend=backend)).rgb
+        assert expected.max() > 0.3 and (found - expected).abs().max() < bound
+
+
+def test_gradients_reach_both() -> None:
+    geometry = where()
+    leaves = [[v.clone().requires_grad_() for v in (f.W1, f.b1, f.w2, f.b2)] for f in PAIRS["two of them"]]
+    first, second = (Cosine(*values, omega0) for values, omega0 in zip(leaves, (30.0, 4.5), strict=True))
+    prim = torch.arange(COUNT)
+    x = inside(geometry, prim, torch.Generator().manual_seed(2))
+    flat = [v for values in leaves for v in values]
+    found = torch.autograd.grad(cosine_density(first + second, geometry, prim, x).square().sum(), flat)
+    apart = cosine_density(first, geometry, prim, x) + cosine_density(second, geometry, prim, x)
+    for a, b in zip(found, torch.autograd.grad(apart.square().sum(), flat), strict=True):
+        assert b.abs().max() > 0 and torch.allclose(a, b, rtol=1e-10, atol=1e-12)
+
+
+def test_many_are_added_one_by_one() -> None:
+    forms = [form(2, omega0, seed) for seed, omega0 in enumerate((30.0, 3.0, 1.0))]
+    assert reduce(add, forms).W1.shape == (COUNT, 6, 3)
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [
+        (replace(form(3, 30.0, 2), W1=torch.ones(COUNT - 1, 3, 3)), r"the second: W1 has shape \(11, 3, 3\); expected .*N=12 as in W1"),
+        (replace(form(3, 30.0, 2), w2=torch.ones(COUNT, 1)), r"the second: w2 has shape \(12, 1\); expected \(12, 3\)"),
+        (form(MOST_UNITS, 30.0, 2), r"3 \+ 256 neurons; expected at most 256"),
+    ],
+)
+def test_what_cannot_be_added_is_refused(second: Cosine, message: str) -> None:
+    with pytest.raises(FormError, match=f"^sum of two Cosine forms: {message}"):
+        form(3, 30.0, 1) + second
+
+
+def test_other_things_are_not_added() -> None:
+    with pytest.raises(TypeError, match="unsupported operand"):
+        form(3, 30.0, 1) + Opaque(lambda *a: a[0])  # type: ignore[operator]

@@ -1,0 +1,217 @@
+"""Forms with one thing wrong, drawn by both backends: each must be refused by name. Run by ``test_forms.py`` in a process of its own.
+
+    python -m tests.numerics.forms_fuzz [COUNT] [SEED]
+
+Between them are forms that only look odd (strides, views, mixed dtypes), which must be drawn, forward and backward, as plain ones are.
+Prints one line of counts; what goes wrong is an exception, or the end of the process.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.core.errors import FormError
+from neuprim.core.primitives import Lowered
+from neuprim.core.render import RenderSettings, render_lowered
+from tests import scenes
+
+CAMERA = scenes.camera(9, 7)
+PARTS = ("geometry", "density", "colour")
+
+
+def tensors_of(lowered: Lowered) -> dict[str, tuple[str, Tensor]]:
+    """Tensor name -> (part of the form that holds it, the tensor)."""
+    found = {}
+    for part in PARTS:
+        form = getattr(lowered, part)
+        found |= {f.name: (part, v) for f in fields(form) if isinstance(v := getattr(form, f.name), Tensor)}
+    return found
+
+
+def with_tensor(lowered: Lowered, name: str, value: Any) -> Lowered:
+    part = next(p for p in PARTS if hasattr(getattr(lowered, p), name))
+    return replace(lowered, **{part: replace(getattr(lowered, part), **{name: value})})
+
+
+def random_form(r: random.Random) -> Lowered:
+    hidden = r.choice([None, None, 0, 3, 4])
+    t = scenes.tensors(r.choice([1, 2, 3, 7, 20]), r.choice([0, 1, 4, 8]), r.choice([1, 3, 3, 5]), seed=r.randrange(1000), hidden=hidden)
+    if r.random() < 0.3:
+        t = {k: v.double() for k, v in t.items()}
+    if r.random() < 0.3:
+        t["b2"] = t["b2"][:, 0]
+    return scenes.lowered(t)
+
+
+# ---------------------------------------------------------------- what is wrong; None where it would be right by chance
+
+
+def _other_size(r: random.Random, v: Tensor) -> Tensor:
+    """One axis shorter, longer or gone."""
+    axis = r.randrange(v.dim())
+    return v.narrow(axis, 0, r.randrange(v.shape[axis])) if v.shape[axis] and r.random() < 0.5 else torch.cat([v, v[: r.choice([1, 1, 5])]])
+
+
+def _numbers(r: random.Random, v: Tensor) -> Tensor:
+    """As many numbers or fewer, in a row."""
+    flat = v.reshape(-1)
+    return flat[: r.randrange(len(flat) + 1)]
+
+
+def _swapped(r: random.Random, v: Tensor) -> Tensor:
+    a, b = (r.randrange(v.dim()) for _ in range(2))
+    return v.transpose(a, b)
+
+
+def _more_axes(r: random.Random, v: Tensor) -> Tensor:
+    return v.unsqueeze(r.randrange(v.dim() + 1))
+
+
+def _fewer_axes(r: random.Random, v: Tensor) -> Tensor:
+    return v.reshape(-1) if r.random() < 0.5 or not v.shape[0] else v[0]
+
+
+def _expanded(r: random.Random, v: Tensor) -> Tensor:
+    """A view of one row or number, of another size than the form's: strides of 0."""
+    size = list(v.shape)
+    size[r.randrange(len(size))] += r.choice([1, 2, 100])
+    return v.reshape(-1)[:1].reshape([1] * v.dim()).expand(size) if v.numel() else v.new_zeros(1).expand(3)
+
+
+def _dtype(r: random.Random, v: Tensor) -> Tensor:
+    return v.to(r.choice([torch.int32, torch.int64, torch.float16, torch.bfloat16, torch.complex64, torch.bool, torch.uint8]))
+
+
+def _elsewhere(r: random.Random, v: Tensor) -> Tensor:
+    return v.to("meta")
+
+
+def _layout(r: random.Random, v: Tensor) -> Tensor:
+    return v.to_sparse()
+
+
+def _type(r: random.Random, v: Tensor) -> Any:
+    return r.choice([None, v.tolist(), v.numpy(), 0.5, "w2"])
+
+
+FAULTS: tuple[Callable[[random.Random, Tensor], Any], ...] = (
+    _other_size, _numbers, _swapped, _more_axes, _fewer_axes, _expanded, _dtype, _elsewhere, _layout, _type,
+)  # fmt: skip
+
+
+def legal(lowered: Lowered, name: str, value: Any) -> bool:
+    """Whether the changed tensor is as good as the one it replaces."""
+    old = tensors_of(lowered)[name][1]
+    if not isinstance(value, Tensor) or value.dtype not in (torch.float32, torch.float64):
+        return False
+    if value.device.type != "cpu" or value.layout != torch.strided:
+        return False
+    n = lowered.geometry.count
+    either = {(n,), (n, 1)} if name == "b2" else {tuple(old.shape)}
+    alone = name == "rgb" and value.dim() == 2 and len(value) == n and value.shape[1] > 0  # nothing else fixes the channels
+    return tuple(value.shape) in either or alone
+
+
+def draw(lowered: Lowered, backend: str) -> tuple[Tensor, dict[str, Tensor | None]]:
+    """The image, and the gradients of all tensors."""
+    leaves = {name: v.detach().requires_grad_() for name, (_, v) in tensors_of(lowered).items()}
+    for name, value in leaves.items():
+        lowered = with_tensor(lowered, name, value)
+    settings = RenderSettings(backend=backend, sort=random.choice(["center", "entry"]))  # type: ignore[arg-type]
+    image = render_lowered(lowered, CAMERA, settings).rgb
+    image.sum().backward()
+    return image.detach(), {name: v.grad for name, v in leaves.items()}
+
+
+def refuse(lowered: Lowered, backend: str, name: str, background: Any = None) -> None:
+    try:
+        image = render_lowered(lowered, CAMERA, RenderSettings(backend=backend), background).rgb  # type: ignore[arg-type]
+    except FormError as error:
+        text = str(error)
+        if name not in text or "expected" not in text or "\n" in text:
+            raise AssertionError(f"{backend}: {name} is wrong, but the message is {text!r}") from error
+        return
+    if image.requires_grad:
+        image.sum().backward()
+    raise AssertionError(f"{backend}: a wrong {name} was drawn: {[(k, tuple(v.shape)) for k, (_, v) in tensors_of(lowered).items()]}")
+
+
+def _strided(r: random.Random, v: Tensor) -> Tensor:
+    """The same numbers in another layout."""
+    kind = r.randrange(3)
+    if kind == 0:
+        return v.transpose(0, -1).contiguous().transpose(0, -1)
+    if kind == 1:
+        return torch.stack([v, v + 1], -1)[..., 0]
+    return torch.complex(torch.zeros_like(v), -v).conj().imag  # a lazily negated view, which numpy does not take
+
+
+def same(r: random.Random, lowered: Lowered, backend: str) -> None:
+    """Odd strides, and some tensors in another dtype: the same picture and gradients."""
+    odd = lowered
+    for name, (_, value) in tensors_of(lowered).items():
+        odd = with_tensor(odd, name, _strided(r, value) if r.random() < 0.7 else value)
+    random.seed(1)
+    a = draw(lowered, backend)
+    random.seed(1)
+    b = draw(odd, backend)
+    assert torch.equal(a[0], b[0]), f"{backend}: strides change the picture"
+    for name, grad in a[1].items():
+        other = b[1][name]
+        assert (grad is None) == (other is None) and (grad is None or other is None or torch.equal(grad, other)), f"{backend}: {name}"
+
+
+def main(count: int, seed: int) -> None:
+    torch.set_num_threads(1)
+    r = random.Random(seed)
+    refused = skipped = drawn = 0
+    while refused < count:
+        lowered, backend = random_form(r), ("cpu", "reference")[refused % 2]
+        name = r.choice([*tensors_of(lowered), "background", "rows", "omega0"])
+        if name == "background":
+            channels = getattr(lowered.colour, "rgb", getattr(lowered.colour, "base", None)).shape[1]  # type: ignore[union-attr]
+            value: Any = r.choice(
+                [torch.ones(channels + 1), torch.ones(channels - 1), torch.ones(1, channels), torch.ones(channels).long(), 1]
+            )
+            refuse(lowered, backend, name, value)
+        elif name == "rows":
+            n = lowered.geometry.count
+            rows = [torch.arange(n + 1), torch.arange(n).float(), torch.arange(n)[:, None], torch.arange(n) - 1, [*range(n)]]
+            refuse(replace(lowered, rows=r.choice(rows)), backend, name)
+        elif name == "omega0":
+            refuse(with_tensor(lowered, name, r.choice([float("nan"), float("inf"), torch.tensor(3.0), "30", None, True])), backend, name)
+        else:
+            value = r.choice(FAULTS)(r, tensors_of(lowered)[name][1])
+            if legal(lowered, name, value):
+                skipped += 1
+                continue
+            changed = with_tensor(lowered, name, value)
+            blamed = {"W1": ("W1", "b1"), "Wx": ("Wx", "bias"), "base": ("base", "Wout"), "means": ("means", "log_scales")}.get(
+                name, (name,)
+            )
+            error: AssertionError | None = None
+            for word in blamed:  # the first tensor of a form says how large the others are
+                try:
+                    refuse(changed, backend, word)
+                    break
+                except AssertionError as found:
+                    error = error or found
+            else:
+                assert error is not None
+                raise error
+        refused += 1
+        if refused % 20 == 0:
+            same(r, lowered, backend)
+            drawn += 1
+    print(f"{refused} wrong forms refused, {skipped} skipped that were right by chance, {drawn} odd but right ones drawn alike")
+
+
+if __name__ == "__main__":
+    main(int((sys.argv[1:] or ["2000"])[0]), int((sys.argv[2:] or ["0"])[0]))

@@ -1,0 +1,282 @@
+"""What does not fit is refused at every entrance, by field, tensor, found and expected; what fits in an odd way is drawn."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from neuprim.core import sh
+from neuprim.core.cosine import CosineDensity
+from neuprim.core.density_grid import density_at, density_grid
+from neuprim.core.errors import FormError
+from neuprim.core.fields import MOST_UNITS, Constant, Cosine, Opaque, OpaqueColour
+from neuprim.core.primitives import Lowered, Primitives
+from neuprim.core.render import RenderSettings, render, render_lowered
+from neuprim.core.render.joint import joint_volume
+from neuprim.tasks.static.fields import SphericalHarmonics
+from tests import scenes
+
+BACKENDS = ["cpu", "reference"]
+CAMERA = scenes.camera(20, 16)
+N, K = 20, 8
+
+
+def settings(backend: str, **more: Any) -> RenderSettings:
+    return RenderSettings(backend=backend, **more)  # type: ignore[arg-type]
+
+
+def model(density: type[CosineDensity] = CosineDensity, colour: type[SphericalHarmonics] = SphericalHarmonics) -> Primitives:
+    t = scenes.tensors(N, K)
+    params = {**{k: v for k, v in t.items() if k != "colors"}, "sh_dc": t["colors"], "sh_rest": torch.zeros(N, 15, 3)}
+    return Primitives(density(K), colour(3), params)
+
+
+def waves(**methods: Callable[..., Any]) -> type[CosineDensity]:
+    return type("Waves", (CosineDensity,), methods)
+
+
+def paint(**methods: Callable[..., Any]) -> type[SphericalHarmonics]:
+    return type("Paint", (SphericalHarmonics,), methods)
+
+
+def lowers(name: str, change: Callable[[Tensor], Any]) -> type[CosineDensity]:
+    def lower(self: CosineDensity, params: Any, geometry: Any, conditions: Any) -> Cosine:
+        form = CosineDensity.lower(self, params, geometry, conditions)
+        return replace(form, **{name: change(getattr(form, name))})
+
+    return waves(lower=lower)
+
+
+# ---------------------------------------------------------------- fuzz
+
+
+def test_no_wrong_form_crashes_or_passes() -> None:
+    """In a process of its own: what this guards against is the end of the process."""
+    words = [sys.executable, "-m", "tests.numerics.forms_fuzz", "2000"]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=Path(__file__).parents[2])
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.startswith("2000 wrong forms refused") and "100 odd but right ones drawn alike" in done.stdout
+
+
+# ---------------------------------------------------------------- what a field's author reads
+
+NAN = float("nan")
+WRONG: dict[str, tuple[type[CosineDensity], str]] = {
+    "w2 too short": (lowers("w2", lambda v: v[:5]), r"Cosine: w2 has shape \(5, 8\); expected \(20, 8\), as means has N=20 and W1 has K=8"),
+    "w2 flat": (lowers("w2", lambda v: v[:, 0]), r"Cosine: w2 has shape \(20,\); expected \(20, 8\)"),
+    "b1 too short": (lowers("b1", lambda v: v[:7]), r"Cosine: b1 has shape \(7, 8\); expected \(20, 8\)"),
+    "b2 wide": (lowers("b2", lambda v: v.expand(-1, 2)), r"Cosine: b2 has shape \(20, 2\); expected \(20, 1\) or \(20,\)"),
+    "no [:, None]": (lowers("W1", lambda v: v[:, 0]), r"Cosine: W1 has shape \(20, 3\); expected \(N, K, 3\) with N=20 as in means"),
+    "too many neurons": (lowers("W1", lambda v: v.repeat(1, 33, 1)), r"Cosine: W1 has shape \(20, 264, 3\); .* K at most 256"),
+    "whole numbers": (lowers("W1", lambda v: v.int()), r"Cosine: W1 has dtype torch\.int32; expected torch\.float32 or torch\.float64"),
+    "another device": (lowers("b1", lambda v: v.to("meta")), r"Cosine: b1 has device meta; expected cpu"),
+    "sparse": (lowers("w2", lambda v: v.to_sparse()), r"Cosine: w2 has layout torch\.sparse_coo; expected a dense tensor"),
+    "nested": (
+        lowers("w2", lambda v: torch.nested.nested_tensor(list(v), layout=torch.jagged)),
+        r"Cosine: w2 has layout nested; expected a dense tensor",
+    ),
+    "no tensor": (lowers("b2", lambda v: 1.0), r"Cosine: b2 has type float; expected a torch tensor"),
+    "omega0": (lowers("omega0", lambda v: NAN), r"Cosine: omega0 has value nan; expected a finite number"),
+    "a huge omega0": (lowers("omega0", lambda v: 10**400), r"Cosine: omega0 has value beyond the range of float64"),
+    "nothing": (waves(lower=lambda *a: None), r"NoneType; expected Cosine or Opaque"),
+}
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_density_names_its_field(name: str, backend: str) -> None:
+    density, message = WRONG[name]
+    with pytest.raises(FormError, match=rf"^density field Waves lowered to {message}") as caught:
+        render(model(density), CAMERA, settings=settings(backend))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_density_does_not_reach_the_grid(name: str) -> None:
+    density, message = WRONG[name]
+    with pytest.raises(FormError, match=rf"^density field Waves lowered to {message}"):
+        density_grid(model(density), {}, torch.eye(4, dtype=torch.float64), (4, 4, 4))
+
+
+@pytest.mark.parametrize(
+    ("colour", "message"),
+    [
+        (Constant(torch.ones(N)), r"Constant: rgb has shape \(20,\); expected \(N, C\) with N=20 as in means, C at least 1"),
+        (Constant(torch.ones(N - 1, 3)), r"Constant: rgb has shape \(19, 3\)"),
+        (Constant(torch.ones(N, 0)), r"Constant: rgb has shape \(20, 0\)"),
+        (torch.ones(N, 3), r"Tensor; expected Constant, RayNet or OpaqueColour"),
+        (scenes.colour({**scenes.tensors(N, hidden=4), "bias": torch.ones(N, 5)}), r"RayNet: bias has shape \(20, 5\); .* Wx has H=4"),
+        (scenes.colour({**scenes.tensors(N, hidden=4), "Wout": torch.ones(N, 4, 3)}), r"RayNet: Wout has .*; expected \(20, 3, 4\)"),
+        (OpaqueColour(lambda prim, x, d: x[:, :2], 3), r"OpaqueColour: radiance returned shape \(\d+, 2\); expected \(\d+, 3\)"),
+        (OpaqueColour(lambda prim, x, d: x.long(), 3), r"OpaqueColour: radiance returned torch\.int64"),
+        (OpaqueColour(lambda prim, x, d: x, 0), r"OpaqueColour: channels has value 0"),
+        (OpaqueColour(None, 3), r"OpaqueColour: radiance has type NoneType; expected a function"),  # type: ignore[arg-type]
+    ],
+)
+def test_a_wrong_colour_names_its_field(colour: Any, message: str) -> None:
+    with pytest.raises(FormError, match=rf"^colour field Paint lowered to {message}"):
+        render(model(colour=paint(lower=lambda *a: colour)), CAMERA)
+
+
+def test_a_wrong_opaque_density_is_named_wherever_it_is_asked() -> None:
+    def column(*a: Tensor) -> Tensor:
+        return a[3][:, None]
+
+    wrong = model(waves(lower=lambda *a: Opaque(column)))
+    message = r"^density field Waves lowered to Opaque: line_integral returned shape \((\d+), 1\); expected \(\1,\)"
+    with pytest.raises(FormError, match=message):
+        render(wrong, CAMERA)
+    with pytest.raises(FormError, match=message):
+        joint_volume(wrong.lower(CAMERA, {}), CAMERA)
+    both = model(waves(lower=lambda *a: Opaque(column), density=lambda self, p, g, prim, x, c: x))
+    for ask in (
+        lambda: density_grid(both, {}, torch.eye(4, dtype=torch.float64) * 0.1, (4, 4, 4)),
+        lambda: density_at(both, {}, torch.zeros(3, 3) + both.params["means"][0]),
+    ):
+        with pytest.raises(FormError, match=r"^density field Waves: density returned shape \(\d+, 3\); expected \(\d+,\)"):
+            ask()
+
+
+@pytest.mark.parametrize(
+    ("methods", "message"),
+    [
+        (
+            {"alive": lambda self, p, c: torch.tensor([3, 99])},
+            r"alive returned rows 3 to 99; expected ascending int64 rows \(M,\) from 0 to 19",
+        ),
+        ({"alive": lambda self, p, c: torch.tensor([-1, 3])}, r"alive returned rows -1 to 3"),
+        ({"alive": lambda self, p, c: torch.tensor([4, 2, 3, 5])}, r"alive returned rows that do not ascend, \[4, 2, 3, 5\]"),
+        (
+            {"alive": lambda self, p, c: torch.ones(N, dtype=torch.bool)},
+            r"alive returned torch\.bool \(20,\) on cpu; expected ascending int64",
+        ),
+        ({"alive": lambda self, p, c: torch.tensor([1.0])}, r"alive returned torch\.float32 \(1,\)"),
+        ({"alive": lambda self, p, c: [1, 2]}, r"alive returned type list"),
+        ({"move": lambda self, p, g, c: g[:3]}, r"move: means has shape \(3, 3\); expected \(20, 3\)"),
+        ({"move": lambda self, p, g, c: replace(g, quats=g.quats.T)}, r"move: quats has shape \(4, 20\); expected \(20, 4\)"),
+        ({"move": lambda self, p, g, c: replace(g, means=g.means.half())}, r"move: means has dtype torch\.float16"),
+        ({"move": lambda self, p, g, c: g.means}, r"move has type Tensor; expected Geometry"),
+    ],
+)
+def test_rows_and_places_name_their_method(methods: dict[str, Any], message: str) -> None:
+    wrong = model(waves(**methods))
+    for ask in (lambda: render(wrong, CAMERA), lambda: wrong.lower_density({}), lambda: density_at(wrong, {}, torch.zeros(1, 3))):
+        with pytest.raises(FormError, match=rf"^density field Waves: {message}"):
+            ask()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_wrong_shade_names_its_field(backend: str) -> None:
+    wrong = model(colour=paint(shade=lambda *a: lambda points: points))
+    with pytest.raises(FormError, match=r"^colour field Paint: shade returned shape \((\d+), 3\); expected \(\1,\)"):
+        render(wrong, CAMERA, settings=settings(backend))
+    with pytest.raises(FormError, match=r"^colour field Paint: shade has type float; expected a function or None"):
+        render(model(colour=paint(shade=lambda *a: 0.5)), CAMERA, settings=settings(backend))
+
+
+def test_the_colour_never_sees_a_wrong_density() -> None:
+    """Shadows draw the density before the frame is drawn."""
+
+    def derive(*a: Any) -> Any:
+        raise AssertionError("asked")
+
+    with pytest.raises(FormError, match="density field Waves"):
+        render(model(lowers("w2", lambda v: v[:5]), paint(derive=derive)), CAMERA)
+
+
+# ---------------------------------------------------------------- what surrounds the forms
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_backgrounds_rows_and_cameras(backend: str, samples: int) -> None:
+    lowered, s = scenes.lowered(scenes.tensors(N)), settings(backend, samples=samples)
+    with pytest.raises(FormError, match=r"^background has shape \(1,\); expected \(3,\), as colour lowered to Constant has C=3"):
+        render_lowered(lowered, CAMERA, s, torch.ones(1))
+    with pytest.raises(FormError, match=r"^viewmat has shape \(2, 2\); expected \(4, 4\)"):
+        render_lowered(lowered, replace(CAMERA, viewmat=torch.eye(2)), s)
+    with pytest.raises(FormError, match=r"^Lowered\.rows holds 19 rows for 20 primitives"):
+        render_lowered(replace(lowered, rows=torch.arange(19)), CAMERA, s)
+    with pytest.raises(FormError, match=r"^geometry has type NoneType; expected Geometry"):
+        render_lowered(replace(lowered, geometry=None), CAMERA, s)  # type: ignore[arg-type]
+    with pytest.raises(FormError, match=r"^background has shape \(2,\)"):
+        joint_volume(lowered, CAMERA, background=torch.ones(2))
+
+
+def test_an_error_map_of_another_size() -> None:
+    t = {k: v.requires_grad_() for k, v in scenes.tensors(N).items()}
+    out = render_lowered(scenes.lowered(t), CAMERA, settings("cpu"))
+    out.stats.pixel_error = torch.ones(3, 4)
+    with pytest.raises(FormError, match=r"^stats\.pixel_error has shape \(3, 4\); expected \(16, 20\)"):
+        out.rgb.sum().backward()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rest": torch.zeros(N, 8, 3)}, r"rest has 8 bands; expected at least 15 for degree 3"),
+        (
+            {"rest": torch.zeros(N - 1, 15, 3)},
+            r"rest has shape \(19, 15, 3\); expected \(N, bands, C\) with N=20 as in means and C=3 as in dc",
+        ),
+        ({"rest": torch.zeros(N, 15, 2)}, r"rest has shape \(20, 15, 2\)"),
+        ({"rest": None}, r"rest is None; expected \(N, at least 15, C\)"),
+        ({"dc": torch.zeros(N)}, r"dc has shape \(20,\); expected \(N, C\) with N=20 as in means"),
+        ({"means": torch.zeros(N, 2)}, r"means has shape \(20, 2\); expected \(N, 3\)"),
+        ({"origin": torch.zeros(2)}, r"origin has shape \(2,\); expected \(3,\)"),
+        ({"degree": 4, "rest": torch.zeros(N, 24, 3)}, r"degree 4; expected 0\.\.3"),
+    ],
+)
+def test_harmonics_do_not_read_beyond_their_tensors(change: dict[str, Any], message: str) -> None:
+    whole = {"means": torch.ones(N, 3), "dc": torch.zeros(N, 3), "rest": torch.zeros(N, 15, 3), "origin": torch.zeros(3), "degree": 3}
+    assert sh.colors(**whole).shape == (N, 3)
+    with pytest.raises(FormError, match=f"^sh.colors: {message}"):
+        sh.colors(**{**whole, **change})
+
+
+# ---------------------------------------------------------------- what is right stays right
+
+
+def drawn(t: dict[str, Tensor], backend: str, **more: Any) -> tuple[Tensor, dict[str, Tensor]]:
+    t = {k: v.detach().clone().requires_grad_() for k, v in t.items()}
+    image = render_lowered(scenes.lowered(t), CAMERA, settings(backend, alpha_min=0.0, transmittance_min=0.0, **more)).rgb
+    image.sum().backward()
+    return image.detach(), {k: v.grad for k, v in t.items() if v.grad is not None}
+
+
+@pytest.mark.parametrize("hidden", [None, 3])
+@pytest.mark.parametrize("names", [["W1"], ["means", "w2"], ["b2"], ["base", "colors"], ["Wx"]])
+def test_dtypes_may_be_mixed(names: list[str], hidden: int | None) -> None:
+    t = scenes.tensors(N, 4, hidden=hidden)
+    mixed = {k: v.double() if k in names else v for k, v in t.items()}
+    (image, grads), (other, found) = drawn(t, "cpu"), drawn(mixed, "cpu")
+    assert torch.equal(image, other.float())
+    for name, grad in grads.items():
+        assert found[name].dtype == mixed[name].dtype and torch.equal(grad, found[name].float()), name
+
+
+@pytest.mark.parametrize("sort", ["center", "entry"])
+@pytest.mark.parametrize(("neurons", "hidden"), [(MOST_UNITS, None), (17, MOST_UNITS)])
+def test_as_many_units_as_the_kernels_know(neurons: int, hidden: int | None, sort: str) -> None:
+    t = scenes.tensors(N, neurons, hidden=hidden)
+    t["w2"] = t["w2"] / neurons**0.5
+    (image, grads), (truth, expected) = drawn(t, "cpu", sort=sort), drawn({k: v.double() for k, v in t.items()}, "reference", sort=sort)
+    assert (image - truth).abs().max() < 2e-6
+    for name, grad in expected.items():
+        assert (grads[name] - grad).norm() <= 1e-4 * grad.norm(), name
+
+
+def test_a_lowered_form_says_where_it_comes_from() -> None:
+    lowered = model(waves()).lower(CAMERA, {})
+    assert lowered.source("density") == "density field Waves lowered to Cosine"
+    assert lowered.owner("colour") == "colour field SphericalHarmonics"
+    plain = Lowered(lowered.geometry, lowered.density, lowered.colour)
+    assert plain.source("colour") == "colour lowered to Constant"

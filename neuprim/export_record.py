@@ -22,9 +22,9 @@ _ENTRIES = 200
 """The newest that are kept."""
 _FILES = 20
 """Names kept of one export's files, which may be a thousand frames."""
-_LONGEST = 1_000
+_LONGEST = 500
 """Characters of one text."""
-_MAX_BYTES = _ENTRIES * (_FILES + 40) * 4 * _LONGEST
+_MAX_BYTES = 1 << 24
 """More is no file of ours."""
 
 

@@ -159,6 +159,16 @@ def test_what_is_listed_says_how_to_choose_it(site: Path, toy: Path, capsys: pyt
     assert "  greedy-task:static  (greedy-task 0.3)" in capsys.readouterr().out
 
 
+def test_a_page_does_not_take_anothers_view_for_its_own(site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, name, source = TAKEN["inspector"]
+    install(site, "my-views", {name: "my_views:PLUGIN"}, {"my_views/__init__.py": source}, group=INSPECTORS.entry_points)
+    run = str(write_run(tmp_path / "run", static_model(), ["task=static", "scene=solids"]))
+    assert main(["inspect", run, "--show", "volume,my-views:slices", "--grid", "8", "--out", str(tmp_path / "x.html")]) == 2
+    assert "--show slices: not in a page" in capsys.readouterr().err
+    assert main(["inspect", run, "--show", "volume,slices", "--grid", "8", "--out", str(tmp_path / "x.html")]) == 0
+    assert "--show my-views:slices chooses the other" in capsys.readouterr().err
+
+
 # ---------------------------------------------------------------- PACKAGE:NAME in the configuration
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from neuprim import __version__, arguments
 from neuprim.core.errors import ConfigError, NeuprimError, nearest
+from neuprim.core.notices import warnings_as_lines
 from neuprim.environment_flags import add_environment_flags, environment_of
 
 if TYPE_CHECKING:
@@ -63,7 +64,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        return _dispatch(words)
+        with warnings_as_lines():
+            return _dispatch(words)
     except NeuprimError as error:
         print(f"neuprim: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -323,10 +325,10 @@ def _conditions(run_dir: Path, words: list[str], command: str, known: argparse.A
     """Condition name -> text, from the flags that the run's task defines, and the words that are none of them."""
     if not words:
         return {}, []
-    from neuprim.config import RunConfig
-    from neuprim.plugins.registry import load_task
+    from neuprim.config import RunConfig, task_of
 
-    spec = load_task(RunConfig.from_yaml(_run_directory(run_dir)).task)
+    file = _run_directory(run_dir) / "config.yaml"
+    spec = task_of(RunConfig.from_yaml(file), file)
     parser = Parser(prog=f"neuprim {command}", add_help=False, allow_abbrev=False)
     for condition in spec.conditions:
         parser.add_argument("--" + condition.name.replace("_", "-"), dest=condition.name)
@@ -344,9 +346,9 @@ def _run_directory(path: Path) -> Path:
 
 
 def _task_names() -> str:
-    from neuprim.plugins.registry import list_tasks
+    from neuprim.plugins.registry import TASKS, list_tasks
 
-    lines = [f"  {info.name}  ({info.origin})" for info in list_tasks()]
+    lines = [f"  {TASKS.word(info)}  ({info.origin})" for info in list_tasks()]
     return "\n".join(["tasks:", *(lines or ["  none is installed"])])
 
 

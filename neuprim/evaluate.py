@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from neuprim.config import RunConfig
+from neuprim.config import RunConfig, scene_of, task_of
 from neuprim.core import images
 from neuprim.core.camera_file import read_cameras
 from neuprim.core.checkpoint import load_model
@@ -25,7 +25,7 @@ from neuprim.core.film import write_film
 from neuprim.core.primitives import Primitives
 from neuprim.core.task import SceneContext, TaskSpec
 from neuprim.measure import display, draw, draw_sum, measure, summary
-from neuprim.plugins.registry import find_scene, load_task
+from neuprim.plugins.provenance import warn_of_neuprim
 
 __all__ = ["FORMATS", "evaluate_run", "load_dataset", "load_run", "read_metrics", "render_run"]
 
@@ -34,20 +34,33 @@ FORMATS = ("png", "exr", *ANIMATIONS)
 """What ``neuprim render`` writes."""
 
 
-def load_dataset(config: RunConfig, task: TaskSpec, progress: Callable[[str, float], None] = lambda text, fraction: None) -> Dataset:
-    """The data set of a run's configuration."""
+def load_dataset(
+    config: RunConfig,
+    task: TaskSpec,
+    progress: Callable[[str, float], None] = lambda text, fraction: None,
+    file: Path | None = None,
+) -> Dataset:
+    """The data set of a run's configuration; ``file`` is where that was read from, for messages."""
     context = SceneContext(config.seed, cache_directory() / "scenes", progress)
-    return find_scene(task, config.scene_name).spec.load(config.scene, context)
+    return scene_of(config, task, file).spec.load(config.scene, context)
 
 
-def load_run(run_dir: Path) -> tuple[RunConfig, TaskSpec, Primitives, dict[str, Any]]:
+def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Primitives, dict[str, Any]]:
     """Configuration, task, model and model header of a run directory.
+
+    Warns where another version of neuprim or of the task's package made the run.
+
+    Args:
+        named: whether what is said about these names the file; not for a directory that the user does not know.
 
     Raises:
         CheckpointError, ConfigError: naming the file that is missing or damaged.
     """
-    config = RunConfig.from_yaml(run_dir / "config.yaml")
-    task = load_task(config.task)
+    file = run_dir / "config.yaml"
+    config, place = RunConfig.from_yaml(file), file if named else None
+    task = task_of(config, place)
+    if config.made_by is not None:
+        warn_of_neuprim(config.made_by, place)
     model, header = load_model(run_dir / "model.safetensors", task)
     return config, task, model, header
 
@@ -55,7 +68,7 @@ def load_run(run_dir: Path) -> tuple[RunConfig, TaskSpec, Primitives, dict[str, 
 def evaluate_run(run_dir: Path) -> dict[str, Any]:
     """The metrics of a run's last checkpoint, measured again from disk alone; the same numbers as the run's own."""
     config, task, model, header = load_run(run_dir)
-    dataset = load_dataset(config, task)
+    dataset = load_dataset(config, task, file=run_dir / "config.yaml")
     path = run_dir / "model.safetensors"
     training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
     views = measure(model, dataset, config.renderer)
@@ -106,7 +119,7 @@ def render_run(
     if camera.endswith(".json"):
         views = [View(name, c) for name, c in read_cameras(Path(camera), size)]
     else:
-        dataset = load_dataset(config, task)
+        dataset = load_dataset(config, task, file=run_dir / "config.yaml")
         views = dataset.orbit(frames) if camera == "orbit" else [dataset.test.view(i) for i in range(len(dataset.test))]
     if size is not None:
         views = [replace(v, camera=v.camera.resized(*size)) for v in views]

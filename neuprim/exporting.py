@@ -18,7 +18,8 @@ from neuprim.core import checkpoint
 from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
 from neuprim.evaluate import load_run
-from neuprim.plugins.registry import list_exporters, load_exporter
+from neuprim.export_record import record_export
+from neuprim.plugins.registry import UnknownPlugin, load_exporter
 from neuprim.trained import trained_model
 
 __all__ = ["export_run", "import_model", "import_run", "print_report"]
@@ -42,7 +43,8 @@ def export_run(
     shown = _Progress(console)
     run = trained_model(run_dir, shown)
     options, conditions = _options(words, exporter, [spec.name for spec in run.task.conditions])
-    return exporter.write(ExportJob(run, out, options, conditions, overwrite, shown))
+    job = ExportJob(run, out, options, conditions, overwrite, shown)
+    return record_export(name, job, exporter.write(job))
 
 
 def _options(words: Sequence[str], exporter: Exporter, offered: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
@@ -126,9 +128,10 @@ def import_run(path: Path, out: Path, name: str | None = None) -> Path:
 
 def _reader(path: Path, name: str | None) -> Exporter:
     name = name or path.suffix.lower().removeprefix(".")
-    if name not in {info.name for info in list_exporters()}:
-        raise ConfigError(f"{path}: no format reads .{name} files; lossless formats are exported by --format ply or npz")
-    exporter = load_exporter(name)
+    try:
+        exporter = load_exporter(name)
+    except UnknownPlugin:
+        raise ConfigError(f"{path}: no format reads .{name} files; lossless formats are exported by --format ply or npz") from None
     if exporter.read is None:
         raise ConfigError(f"{path}: --format {name} is lossy and cannot be imported; ply and npz can")
     return exporter
@@ -146,7 +149,7 @@ def import_model(stored: StoredModel, path: Path, out: Path) -> Path:
         try:
             checkpoint.write(draft / "model.safetensors", "model", tensors, header)
             RunConfig.from_yaml(draft / "config.yaml")
-            load_run(draft)
+            load_run(draft, named=False)
         except (NeuprimError, ValueError, TypeError) as error:  # of a file that is not yet there under this name
             raise DataError(f"{path}: {str(error).replace(str(draft), 'its model')}") from error
         if out.exists():

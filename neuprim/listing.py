@@ -26,15 +26,15 @@ def list_plugins() -> list[str]:
     lines: list[str] = []
     added = SCENES.survey()
     for report in survey():
-        title = f"{report.info.name}  ({report.info.origin})"
+        title, note = f"{report.info.name}  ({report.info.origin})", _note(report)
         try:
             if report.spec is None:
                 raise ConfigError(report.error or "cannot be loaded")
             body = _task(report.spec, added)
-            lines.append(f"{title}  {report.spec.summary}")
+            lines.append(f"{title}  {report.spec.summary}{note}")
         except NeuprimError as broken:
             body = [str(broken)]
-            lines.append(f"{title}  BROKEN")
+            lines.append(f"{title}  BROKEN{note}")
         lines += [*(f"  {line}" for line in body), ""]
     tasks = {info.name for info in list_tasks()}
     homeless = [r for r in added if r.info.name.partition(".")[0] not in tasks]
@@ -50,8 +50,13 @@ def list_plugins() -> list[str]:
 
 def _line(report: PluginReport[Any], name: str) -> str:
     if report.spec is None:
-        return f"{name}  BROKEN  ({report.info.origin})  {report.error}"
-    return f"{name}  ({report.info.origin})  {getattr(report.spec, 'summary', '')}".rstrip()
+        return f"{name}  BROKEN  ({report.info.origin})  {report.error}{_note(report)}"
+    return f"{name}  ({report.info.origin})  {getattr(report.spec, 'summary', '')}".rstrip() + _note(report)
+
+
+def _note(report: PluginReport[Any]) -> str:
+    """How to choose what its name alone does not."""
+    return f"  [{report.note}]" if report.note else ""
 
 
 def _task(spec: TaskSpec, added: list[PluginReport[SceneExtension]]) -> list[str]:
@@ -70,15 +75,13 @@ def _task(spec: TaskSpec, added: list[PluginReport[SceneExtension]]) -> list[str
 def _scene(spec: TaskSpec, report: PluginReport[SceneExtension]) -> tuple[str, str]:
     """(name, summary or error) of a scene that another package adds to a task."""
     name = report.info.name.removeprefix(f"{spec.name}.")
-    problem = report.error
+    problem, note = report.error, _note(report)
+    if any(scene.name == name for scene in spec.scenes):
+        note = f"  [hidden by the task's own; {SCENES.choice(report.info)} chooses it]"
     if report.spec is not None:
-        if any(scene.name == name for scene in spec.scenes):
-            claims = [*(info for info in list_tasks() if info.name == spec.name), report.info]
-            problem = SCENES.clash(report.info.name, claims)
-        else:
-            try:
-                check_scene(spec, name, report.spec.config_package)
-                return name, f"({report.info.origin})  {report.spec.scene.summary}"
-            except ConfigError as error:
-                problem = str(error)
-    return name, f"BROKEN  ({report.info.origin})  {problem}"
+        try:
+            check_scene(spec, name, report.spec.config_package)
+            return name, f"({report.info.origin})  {report.spec.scene.summary}{note}"
+        except ConfigError as error:
+            problem = str(error)
+    return name, f"BROKEN  ({report.info.origin})  {problem}{note}"

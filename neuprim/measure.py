@@ -171,6 +171,7 @@ def summary(
             "torch": torch.__version__,
             "numpy": np.__version__,
         },
+        **({} if config.made_by is None else {"made_by": config.made_by.in_words()}),
     }
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from neuprim.config import RunConfig
+from neuprim.config import RunConfig, made_now, task_of
 from neuprim.core import checkpoint, images
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.errors import CheckpointError, DataError
@@ -27,7 +27,8 @@ from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer, initial_model
 from neuprim.evaluate import load_dataset
 from neuprim.measure import display, draw, measure, summary
-from neuprim.plugins.registry import load_loss, load_task
+from neuprim.plugins.provenance import check_resumed
+from neuprim.plugins.registry import load_loss
 from neuprim.progress import RunProgress
 from neuprim.report import error_map, write_report
 from neuprim.warm import compiled, compiling, mark_compiled
@@ -49,7 +50,8 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
         NeuprimError: the input's fault, or numbers that left the finite; whatever was on disk before is intact.
     """
     console = console or Console(stderr=True)
-    task = load_task(config.task)
+    task = task_of(config)
+    config = replace(config, made_by=made_now(config, task))
     directory = config.output_dir
     with (
         compiling(config.renderer.backend != "reference") as kernels,
@@ -65,6 +67,7 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
             header, tensors = checkpoint.read(saved, "checkpoint")
             if header.get("task") != config.task:
                 raise CheckpointError(f"{saved}: written for task {header.get('task')!r}; this run's task is {config.task!r}")
+            check_resumed(header.get("made_by"), config.made_by, saved)
             trainer.load_state(tensors, header, str(saved))
             progress.note(f"resumed at step {trainer.step}")
         directory.mkdir(parents=True, exist_ok=True)
@@ -138,7 +141,8 @@ def _train(trainer: Trainer, config: RunConfig, dataset: Dataset, progress: RunP
 
 def _save(trainer: Trainer, config: RunConfig, dataset: Dataset) -> None:
     tensors, header = trainer.state()
-    checkpoint.write(config.output_dir / "checkpoint.safetensors", "checkpoint", tensors, {"task": config.task, **header})
+    made_by = {} if config.made_by is None else {"made_by": config.made_by.to_dict()}
+    checkpoint.write(config.output_dir / "checkpoint.safetensors", "checkpoint", tensors, {"task": config.task, **made_by, **header})
     extra: dict[str, Any] = {
         "background": [float(x) for x in dataset.background],
         "color_space": dataset.color_space,

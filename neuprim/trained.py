@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from neuprim.config import scene_of
+from neuprim.core.data import Dataset
 from neuprim.core.extensions import TrainedModel
 from neuprim.core.files import cache_directory
 from neuprim.core.task import SceneContext
 from neuprim.core.volume_source import VolumeSource
 from neuprim.evaluate import load_dataset, load_run
-from neuprim.plugins.registry import find_scene
 
 __all__ = ["trained_model"]
 
@@ -24,9 +25,13 @@ def trained_model(run_dir: Path, progress: Progress = lambda text, fraction: Non
         CheckpointError, ConfigError: naming the file that is missing or damaged.
     """
     config, task, model, header = load_run(run_dir)
+    file = run_dir / "config.yaml"
 
     def volume() -> VolumeSource | None:
-        load = find_scene(task, config.scene_name).spec.volume
+        load = scene_of(config, task, file).spec.volume
         return load(config.scene, SceneContext(config.seed, cache_directory() / "scenes", progress)) if load else None
 
-    return TrainedModel(run_dir, task, model, header, config.scene, config.renderer, lambda: load_dataset(config, task, progress), volume)
+    def dataset() -> Dataset:
+        return load_dataset(config, task, progress, file)
+
+    return TrainedModel(run_dir, task, model, header, config.scene, config.renderer, dataset, volume)

@@ -4,6 +4,7 @@ from neuprim.config.composing import compose, compose_all, preset_settings
 from neuprim.config.groups import check_groups, check_scene, presets, task_choices
 from neuprim.config.overrides import expand_sweep
 from neuprim.config.record import RunConfig, RunSettings
+from neuprim.config.stored import made_now, scene_of, task_of
 
 __all__ = [
     "RunConfig",
@@ -13,7 +14,10 @@ __all__ = [
     "compose",
     "compose_all",
     "expand_sweep",
+    "made_now",
     "preset_settings",
     "presets",
+    "scene_of",
     "task_choices",
+    "task_of",
 ]

@@ -12,13 +12,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuprim import __version__
 from neuprim.config.groups import check_groups, check_scene, presets, task_choices
 from neuprim.config.outputs import output_directory
 from neuprim.config.overrides import Assignment, expand_sweep, parse, sweep_names, swept_keys
 from neuprim.config.record import RunConfig, RunSettings
+from neuprim.config.resuming import not_installed
 from neuprim.config.schema import REQUIRED, build, defaults, is_free, like, setting_names
 from neuprim.core.errors import ConfigError, nearest
-from neuprim.plugins.registry import find_scene, load_loss, load_task
+from neuprim.plugins.names import split
+from neuprim.plugins.provenance import MadeBy, Maker
+from neuprim.plugins.registry import LOSSES, TASKS, UnknownPlugin, find_scene, load_loss, load_task
 
 if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
@@ -32,7 +36,7 @@ PATHS = "_paths_"
 """Key of a scene's YAML that lists which of its settings are paths: ``~`` is expanded and they are made absolute."""
 
 Files = dict[tuple[str, ...], Any]
-"""Hydra's compositions by package and groups, so that a sweep reads each file once."""
+"""Hydra's compositions by packages and group, so that a sweep reads each file once."""
 
 
 def compose(overrides: Sequence[str], check_output: bool = True) -> RunConfig:
@@ -51,13 +55,27 @@ def compose(overrides: Sequence[str], check_output: bool = True) -> RunConfig:
 def _compose(overrides: Sequence[str], check_output: bool, files: Files) -> RunConfig:
     assignments = parse(overrides)
     chosen = {key: _choice(assignments, key) for key in CHOICES}
+    try:
+        return _composed(overrides, assignments, chosen, check_output, files)
+    except UnknownPlugin as error:
+        told = not_installed(assignments, chosen["task"] or DEFAULT_TASK, chosen["scene"])
+        if told is None:
+            raise
+        raise told from error
+
+
+def _composed(
+    overrides: Sequence[str], assignments: Sequence[Assignment], chosen: Mapping[str, str | None], check_output: bool, files: Files
+) -> RunConfig:
     values = [a for a in assignments if a.key not in CHOICES]
-    spec = load_task(chosen["task"] or DEFAULT_TASK)
+    task_word = chosen["task"] or DEFAULT_TASK
+    task_info, spec = TASKS.find(task_word), load_task(task_word)
     check_groups(spec)
     own = task_choices(spec)
-    scene_name = chosen["scene"] or own.scene
     preset = chosen["preset"] or own.preset
-    package = find_scene(spec, scene_name).config_package
+    scene_word = chosen["scene"] or own.scene
+    found = find_scene(spec, scene_word)
+    scene_name, package = found.spec.name, found.config_package
     check_scene(spec, scene_name, package)
     if preset not in presets(spec):
         raise ConfigError(f"preset={preset}: task {spec.name!r} has no such preset{nearest(preset, presets(spec))}")
@@ -68,10 +86,12 @@ def _compose(overrides: Sequence[str], check_output: bool, files: Files) -> RunC
     plain, full = _merge(base, values)
     settings = _settings(full)
     spec.check(vars(settings.model))
+    loss = None
     if settings.train.loss is not None:
         load_loss(settings.train.loss)
+        loss = Maker.of(LOSSES.find(settings.train.loss))
     scene = _scene(full["scene"], base["scene"], declared_paths)
-    directory = output_directory(settings.output_dir, f"{spec.name}-{scene_name}", settings.resume, check_output)
+    directory = output_directory(settings.output_dir, f"{_in_path(task_word)}-{_in_path(scene_word)}", settings.resume, check_output)
     full["scene"] = scene
     changed = {"preset": (own.preset, preset)} if preset != own.preset else {}
     return RunConfig(
@@ -88,6 +108,7 @@ def _compose(overrides: Sequence[str], check_output: bool, files: Files) -> RunC
         options=full["task"]["options"],
         overrides=list(overrides),
         non_default={**changed, **_differences(_typed(plain), _typed(full, settings))},
+        made_by=MadeBy(__version__, Maker.of(task_info), found.added_by and Maker.of(found.added_by, scene_name), loss),
     )
 
 
@@ -100,8 +121,10 @@ def compose_all(overrides: Sequence[str], check_output: bool = True) -> list[Run
     files: Files = {}
     configs = [_compose([*c, "output_dir=null"], False, files) for c in combinations]
     first = configs[0]
-    fixed = [word for key, word in (("task", first.task), ("scene", first.scene_name)) if not swept & {key, "task"}]
-    asked = [a.value for a in parse(combinations[0]) if a.key == "output_dir"]
+    typed = parse(combinations[0])
+    words = [(key, _choice(typed, key) or name) for key, name in (("task", first.task), ("scene", first.scene_name))]
+    fixed = [_in_path(word) for key, word in words if not swept & {key, "task"}]
+    asked = [a.value for a in typed if a.key == "output_dir"]
     explicit = str(_compose(combinations[0], False, files).output_dir) if asked and asked[-1] is not None else None
     base = output_directory(explicit, "-".join([*fixed, "sweep"]), first.resume, check_output)
     names = sweep_names(overrides, combinations)
@@ -124,18 +147,23 @@ def _choice(assignments: Sequence[Assignment], key: str) -> str | None:
     return str(value)
 
 
+def _in_path(word: str) -> str:
+    """``NAME`` or ``PACKAGE:NAME`` as part of a folder's name."""
+    return "-".join(part for part in split(word) if part)
+
+
 # ---------------------------------------------------------------- Hydra
 
 
-def _hydra(spec: TaskSpec, package: str, groups: tuple[str, ...], files: Files) -> Any:
-    key = (spec.config_package, package, *groups)
+def _hydra(spec: TaskSpec, packages: Sequence[str], groups: tuple[str, ...], files: Files) -> Any:
+    key = (*packages, *groups)
     if key not in files:
-        files[key] = _hydra_compose(spec, package, groups)
+        files[key] = _hydra_compose(spec, packages, groups)
     return files[key]
 
 
-def _hydra_compose(spec: TaskSpec, package: str, groups: Sequence[str]) -> Any:
-    """``package`` holds the scene's file; the task's own files come first, so that a scene cannot replace a preset."""
+def _hydra_compose(spec: TaskSpec, packages: Sequence[str], groups: Sequence[str]) -> Any:
+    """``packages`` hold the files; of two with one path the first package's counts."""
     from hydra import compose as hydra_compose
     from hydra import initialize_config_module
     from hydra.errors import HydraException
@@ -144,19 +172,27 @@ def _hydra_compose(spec: TaskSpec, package: str, groups: Sequence[str]) -> Any:
 
     try:
         with initialize_config_module("neuprim.conf", version_base="1.3"):
-            places = ",".join(f"pkg://{p}" for p in dict.fromkeys([spec.config_package, package]))
+            places = ",".join(f"pkg://{p}" for p in dict.fromkeys(packages))
             return hydra_compose("config", [f"hydra.searchpath=[{places}]", *groups])
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise ConfigError(f"task {spec.name!r}: its YAML files do not compose ({' '.join(str(error).split())})") from error
 
 
 def _base(spec: TaskSpec, scene: str, preset: str, options: dict[str, Any], files: Files, package: str) -> tuple[dict[str, Any], list[str]]:
-    """Everything but the user's words, unresolved, and the names of the scene's settings that are paths."""
+    """Everything but the user's words, unresolved, and the names of the scene's settings that are paths.
+
+    ``package`` holds the scene's file. A scene cannot replace a preset of the task, nor the task a scene of that package.
+    """
     from omegaconf import OmegaConf
 
-    composed = _hydra(spec, package, (f"+scene/{spec.name}@from_scene={scene}", f"+preset/{spec.name}@from_preset={preset}"), files)
+    scene_group, preset_group = f"+scene/{spec.name}@from_scene={scene}", f"+preset/{spec.name}@from_preset={preset}"
+    task_first = (spec.config_package, package)
+    if package == spec.config_package:
+        composed = of_scene = _hydra(spec, task_first, (scene_group, preset_group), files)
+    else:
+        composed, of_scene = _hydra(spec, task_first, (preset_group,), files), _hydra(spec, task_first[::-1], (scene_group,), files)
     place, scene_place = f"preset/{spec.name}/{preset}.yaml", f"scene/{spec.name}/{scene}.yaml"
-    scene_node = _plain(composed.get("from_scene"), resolve=False, place=scene_place)
+    scene_node = _plain(of_scene.get("from_scene"), resolve=False, place=scene_place)
     preset_node = _plain(composed.get("from_preset"), resolve=False, place=place)
     for key in preset_node:
         if key not in PRESET_KEYS:

@@ -14,6 +14,8 @@ from neuprim.config.schema import build
 from neuprim.core.errors import CheckpointError, ConfigError, nearest
 from neuprim.core.render.settings import RenderSettings
 from neuprim.core.train.settings import ModelSettings, TrainSettings
+from neuprim.plugins.names import split
+from neuprim.plugins.provenance import MadeBy
 
 __all__ = ["RunConfig", "RunSettings"]
 
@@ -51,6 +53,7 @@ class RunConfig:
         resume: continue from the checkpoint in ``output_dir``, if there is one.
         overrides: what the user typed.
         non_default: dotted key -> (value with the same task, scene and preset and nothing typed, value of this run).
+        made_by: the packages that task, scene and loss come from; None where nobody said, and their names alone decide.
     """
 
     task: str
@@ -66,6 +69,7 @@ class RunConfig:
     options: dict[str, Any] = field(default_factory=dict)
     overrides: list[str] = field(default_factory=list)
     non_default: dict[str, tuple[Any, Any]] = field(default_factory=dict)
+    made_by: MadeBy | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested values, in the layout of the command line's keys."""
@@ -81,6 +85,7 @@ class RunConfig:
             "resume": self.resume,
             "overrides": list(self.overrides),
             "non_default": {key: list(pair) for key, pair in self.non_default.items()},
+            **({} if self.made_by is None else {"made_by": self.made_by.to_dict()}),
         }
 
     def to_yaml(self) -> str:
@@ -108,7 +113,7 @@ class RunConfig:
 
     @classmethod
     def _from_dict(cls, data: Mapping[str, Any]) -> RunConfig:
-        known = ["task", "scene", "preset", *(f.name for f in dataclasses.fields(RunSettings)), "overrides", "non_default"]
+        known = ["task", "scene", "preset", *(f.name for f in dataclasses.fields(RunSettings)), "overrides", "non_default", "made_by"]
         for key in data:
             if key not in known:
                 raise ConfigError(f"{key}: no such setting" + nearest(str(key), known))
@@ -124,7 +129,7 @@ class RunConfig:
         options = task.get("options", {})
         if not isinstance(options, dict):
             raise ConfigError("task.options: expected a mapping")
-        return cls(
+        made = cls(
             task=_text(task.get("name"), "task.name"),
             scene_name=_text(scene.get("name"), "scene.name"),
             scene={str(k): v for k, v in scene.items() if k != "name"},
@@ -138,7 +143,19 @@ class RunConfig:
             options=options,
             overrides=overrides,
             non_default={str(key): (pair[0], pair[1]) for key, pair in non_default.items()},
+            made_by=MadeBy.from_dict(data["made_by"]) if data.get("made_by") is not None else None,
         )
+        made._check_made_by()
+        return made
+
+    def _check_made_by(self) -> None:
+        """Raises ConfigError for a record of makers that is not this run's."""
+        record = self.made_by
+        loss = None if self.train.loss is None else split(self.train.loss)[1]
+        for kind, key, name in (("task", "task.name", self.task), ("scene", "scene.name", self.scene_name), ("loss", "train.loss", loss)):
+            maker = None if record is None else getattr(record, kind)
+            if maker is not None and maker.name != name:
+                raise ConfigError(f"made_by.{kind}.name: found {maker.name!r}; expected {name!r}, as {key} says")
 
 
 class _PlainDumper(yaml.SafeDumper):

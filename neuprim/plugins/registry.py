@@ -1,7 +1,8 @@
 """Plugins by name, from entry points: tasks, and scenes, losses, exporters and inspectors for the tasks of others.
 
 The built-in ones come through the same groups as anybody's. Listing reads package metadata only; a plugin is imported when
-it is asked for, so a broken one stops nothing but itself. See :mod:`neuprim.plugins.mechanism`.
+it is asked for, so a broken one stops nothing but itself. A name is ``NAME``, or ``PACKAGE:NAME`` for the plugin of one package;
+a bare name that a built-in has is the built-in's. See :mod:`neuprim.plugins.mechanism`.
 """
 
 from __future__ import annotations
@@ -9,8 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from neuprim.core.errors import ConfigError, nearest
-from neuprim.plugins.mechanism import Group, PluginError, PluginInfo, PluginReport
+from neuprim.core.errors import nearest
+from neuprim.core.notices import warn_once
+from neuprim.plugins.editable import not_installed_yet
+from neuprim.plugins.mechanism import Group, PluginError, PluginInfo, PluginReport, UnknownPlugin
+from neuprim.plugins.names import normalised, split
 
 if TYPE_CHECKING:  # importing the interfaces imports torch, which listing does not need
     from neuprim.core.extensions import Exporter, Inspector, LossExtension, SceneExtension
@@ -28,6 +32,7 @@ __all__ = [
     "PluginError",
     "PluginInfo",
     "PluginReport",
+    "UnknownPlugin",
     "find_scene",
     "list_exporters",
     "list_inspectors",
@@ -44,7 +49,12 @@ __all__ = [
 
 TASKS: Group[TaskSpec] = Group("neuprim.tasks", "task", "task={}", "neuprim.core.task:TaskSpec")
 SCENES: Group[SceneExtension] = Group(
-    "neuprim.scenes", "scene", "scene {}", "neuprim.core.extensions:SceneExtension", lambda s: f"{s.task}.{s.scene.name}"
+    "neuprim.scenes",
+    "scene",
+    "scene={}",
+    "neuprim.core.extensions:SceneExtension",
+    lambda s: f"{s.task}.{s.scene.name}",
+    lambda name: name.partition(".")[2],
 )
 """Entry points here are called ``TASK.SCENE``, so that metadata alone says what there is for a task."""
 LOSSES: Group[LossExtension] = Group("neuprim.losses", "loss", "train.loss={}", "neuprim.core.extensions:LossExtension")
@@ -60,11 +70,11 @@ def list_tasks() -> list[PluginInfo]:
 
 
 def load_task(name: str) -> TaskSpec:
-    """The task of that name; imports it and no other.
+    """The task that ``NAME`` or ``PACKAGE:NAME`` chooses; imports it and no other.
 
     Raises:
-        ConfigError: no such task.
-        PluginError: the name is claimed twice, or its plugin is broken or was written for another version.
+        UnknownPlugin: no such task.
+        PluginError: two packages claim the bare name, or the plugin is broken or was written for another version.
     """
     return TASKS.load(name)
 
@@ -83,10 +93,12 @@ class FoundScene:
 
     Attributes:
         config_package: the package that holds its ``scene/TASK/NAME.yaml``.
+        added_by: who adds it; None for the task's own.
     """
 
     spec: SceneSpec
     config_package: str
+    added_by: PluginInfo | None = None
 
 
 def list_scenes(task: str | None = None) -> list[PluginInfo]:
@@ -100,25 +112,41 @@ def scene_names(task: TaskSpec) -> list[str]:
     return [*own, *dict.fromkeys(n for n in (i.name.removeprefix(f"{task.name}.") for i in list_scenes(task.name)) if n not in own)]
 
 
-def find_scene(task: TaskSpec, name: str) -> FoundScene:
-    """The scene of that name, the task's own or one that another package adds; imports no other.
+def find_scene(task: TaskSpec, word: str) -> FoundScene:
+    """The scene that ``NAME`` or ``PACKAGE:NAME`` chooses, the task's own or one that another package adds; imports no other.
+
+    A bare name is the task's own scene where it has one; a package that adds another of that name is named in a warning.
 
     Raises:
-        ConfigError: there is none.
-        PluginError: two packages claim the name, or the one that adds it is broken.
+        UnknownPlugin: there is none.
+        PluginError: two packages add the name, or the one that adds it is broken.
     """
+    package, name = split(word)
     own = [scene for scene in task.scenes if scene.name == name]
-    key = f"{task.name}.{name}"
-    added = [info for info in list_scenes(task.name) if info.name == key]
-    if own and added:
-        claims = [*(info for info in list_tasks() if info.name == task.name), *added]
-        raise PluginError(SCENES.clash(key, claims))
-    if own:
+    if own and package is None:
+        for info in list_scenes(task.name):
+            if info.name == f"{task.name}.{name}":
+                warn_once(SCENES.hidden(info, f"one of task {task.name!r} itself"))
+    if own and package in (None, _package_of(task)):
         return FoundScene(own[0], task.config_package)
-    if not added:
-        raise ConfigError(f"scene={name}: task {task.name!r} has no such scene{nearest(name, scene_names(task))}")
-    extension = SCENES.load(key)
-    return FoundScene(extension.scene, extension.config_package)
+    added = f"{task.name}.{name}" if package is None else f"{package}:{task.name}.{name}"
+    try:
+        info = SCENES.find(added)
+    except UnknownPlugin:
+        offered = scene_names(task)
+        if package is not None:
+            offered = [scene.name for scene in task.scenes] if package == _package_of(task) else []
+            offered += [SCENES.typed_name(i.name) for i in list_scenes(task.name) if normalised(i.distribution) == package]
+        whose = f"task {task.name!r} has no such scene" + (f" of {package}" if package else "")
+        late = not_installed_yet(SCENES.entry_points, f"{task.name}.{name}", package)
+        raise UnknownPlugin(f"scene={word}: {whose}{nearest(name, offered)}{late}") from None
+    extension = SCENES.load(f"{normalised(info.distribution)}:{info.name}")
+    return FoundScene(extension.scene, extension.config_package, info)
+
+
+def _package_of(task: TaskSpec) -> str | None:
+    owner = TASKS.owner(task)
+    return None if owner is None else normalised(owner.distribution)
 
 
 # ---------------------------------------------------------------- losses, exporters, inspectors

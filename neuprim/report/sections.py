@@ -289,6 +289,9 @@ def facts(run: RunRecord) -> str:
         pairs += [(escape(name), escape(value)) for name, value in versions.items()]
     else:
         pairs.append(("versions", MISSING))
+    made_by = run.field("made_by")
+    if isinstance(made_by, Mapping):
+        pairs += [(f"{escape(kind)} made by", escape(made_by[kind])) for kind in ("task", "scene", "loss") if kind in made_by]
     return _section("Run", '<dl class="facts">' + "".join(f"<div><dt>{k}</dt><dd>{v}</dd></div>" for k, v in pairs) + "</dl>")
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
+import shutil
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
 
+from neuprim.core import notices
 from neuprim.plugins import registry
 
 TOY = """
@@ -46,20 +49,42 @@ def install(
     group: str = registry.TASKS.entry_points,
 ) -> None:
     """Puts a distribution with entry points ``tasks`` of a group and source ``files`` under ``root``."""
+    install_groups(root, distribution, {group: tasks}, files, version)
+
+
+def install_groups(
+    root: Path, distribution: str, groups: Mapping[str, Mapping[str, str]], files: Mapping[str, str], version: str = "0.3"
+) -> Path:
+    """The same with entry points of several groups; returns the distribution's folder of metadata."""
     info = root / f"{distribution.replace('-', '_')}-{version}.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n")
-    lines = "\n".join(f"{name} = {target}" for name, target in tasks.items())
-    (info / "entry_points.txt").write_text(f"[{group}]\n{lines}\n")
+    sections = [f"[{group}]\n" + "".join(f"{name} = {target}\n" for name, target in entries.items()) for group, entries in groups.items()]
+    (info / "entry_points.txt").write_text("\n".join(sections))
     for name, text in files.items():
         path = root / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
+    return info
+
+
+def uninstall(root: Path, distribution: str) -> None:
+    """Removes a distribution's metadata; its modules are found no longer, and forgotten."""
+    for info in root.glob(f"{distribution.replace('-', '_')}-*.dist-info"):
+        for target in (info / "entry_points.txt").read_text().splitlines():
+            top = target.partition("=")[2].strip().partition(":")[0].partition(".")[0]
+            if top and (root / top).is_dir():
+                shutil.rmtree(root / top)
+            for name in [n for n in sys.modules if top and n.partition(".")[0] == top]:
+                del sys.modules[name]
+        shutil.rmtree(info)
+    importlib.invalidate_caches()
 
 
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """An empty directory on ``sys.path``; what was imported from it is forgotten afterwards."""
+    """An empty directory on ``sys.path``; what was imported from it is forgotten afterwards, and no warning was given before."""
+    monkeypatch.setattr(notices, "_said", set())
     root = tmp_path / "site"
     root.mkdir()
     monkeypatch.syspath_prepend(str(root))

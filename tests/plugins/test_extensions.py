@@ -12,6 +12,7 @@ from rich.console import Console
 from neuprim.cli import main
 from neuprim.config import RunConfig, compose
 from neuprim.core.errors import ConfigError
+from neuprim.core.notices import NeuprimWarning
 from neuprim.evaluate import evaluate_run, load_dataset
 from neuprim.plugins import registry
 from neuprim.plugins.registry import ALL, EXPORTERS, INSPECTORS, LOSSES, SCENES, TASKS, Group, PluginError, find_scene, load_task
@@ -240,11 +241,19 @@ def test_a_clash_names_both(kind: str, site: Path) -> None:
 def test_a_scene_that_takes_the_name_of_a_tasks_own(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = SCENE.replace('"extra"', '"solids"')
     add(site, "scene", source, name="static.solids")
-    with pytest.raises(PluginError, match=r"scene 'static.solids' is registered by fake-extra 0.3 .* and neuprim .*uninstall one"):
-        find_scene(load_task("static"), "solids")
+    task = load_task("static")
+    (site / "fake_extra/conf/scene/static/solids.yaml").write_text("wobble: 2.0\n")
+    told = r"scene 'solids' of fake-extra 0.3 \(fake_extra:PLUGIN\) has the name of one of task 'static' itself, which is used; "
+    with pytest.warns(NeuprimWarning, match=told + "scene=fake-extra:solids chooses the other") as warned:
+        assert find_scene(task, "solids").config_package == "neuprim.tasks.static.conf"
+        assert find_scene(task, "solids").added_by is None
+    assert len(warned) == 1 and "fake_extra" not in sys.modules
+    assert find_scene(task, "Fake_Extra:solids").config_package == "fake_extra.conf"
+    assert find_scene(task, "neuprim:solids").config_package == "neuprim.tasks.static.conf"
     assert find_scene(load_task("static"), "blender").config_package == "neuprim.tasks.static.conf"
     assert main(["tasks"]) == 0
-    assert "BROKEN  (fake-extra 0.3)  scene 'static.solids' is registered by" in capsys.readouterr().out
+    shown = "(fake-extra 0.3)  two ellipsoids  [hidden by the task's own; scene=fake-extra:solids chooses it]"
+    assert shown in capsys.readouterr().out
 
 
 def test_a_scene_without_its_yaml(site: Path, capsys: pytest.CaptureFixture[str]) -> None:

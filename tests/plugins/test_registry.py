@@ -72,7 +72,8 @@ def test_unusable_plugins(site: Path, source: str, text: str) -> None:
 def test_name_clash_names_both_and_stops_nothing_else(toy: Path, site: Path) -> None:
     make(site, "one", TOY, task="same")
     make(site, "two", TOY, task="same")
-    with pytest.raises(PluginError, match=r"'same' is registered by neuprim-one 0.3 .* and neuprim-two 0.3"):
+    expected = r"'same' is registered by neuprim-one 0.3 .* and neuprim-two 0.3 .*; choose task=neuprim-one:same or task=neuprim-two:same$"
+    with pytest.raises(PluginError, match=expected):
         load_task("same")
     assert "fake_one" not in sys.modules, "a clash is seen in metadata"
     assert load_task("toy").name == "toy"
@@ -80,10 +81,12 @@ def test_name_clash_names_both_and_stops_nothing_else(toy: Path, site: Path) -> 
 
 def test_survey_reports_the_broken_ones(toy: Path, site: Path) -> None:
     make(site, "boom", "raise RuntimeError('first line\\nsecond')")
-    make(site, "one", TOY, task="same")
+    make(site, "one", TOY.replace('"toy"', '"same"'), task="same")
     make(site, "two", TOY, task="same")
     reports = {(r.info.name, r.info.distribution): r for r in survey()}
     assert reports["toy", "neuprim-toy"].spec is not None
     assert "RuntimeError: first line second" in (reports["boom", "neuprim-boom"].error or "")
-    assert "registered by" in (reports["same", "neuprim-one"].error or "")
-    assert reports["same", "neuprim-two"].error == reports["same", "neuprim-one"].error
+    assert reports["same", "neuprim-one"].spec is not None, "a clash breaks nobody"
+    assert reports["same", "neuprim-one"].note == "also registered by neuprim-two 0.3; task=neuprim-one:same chooses this one"
+    assert "its TaskSpec is named 'toy'" in (reports["same", "neuprim-two"].error or "")
+    assert reports["toy", "neuprim-toy"].note is None

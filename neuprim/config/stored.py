@@ -1,0 +1,50 @@
+"""Task and scene of a run's configuration, from the packages that made the run and not from whatever has their names by now."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from neuprim import __version__
+from neuprim.config.record import RunConfig
+from neuprim.plugins.names import qualified
+from neuprim.plugins.provenance import MadeBy, Maker, load_recorded
+from neuprim.plugins.registry import LOSSES, SCENES, TASKS, FoundScene, find_scene, load_task
+
+if TYPE_CHECKING:
+    from neuprim.core.task import TaskSpec
+
+__all__ = ["made_now", "scene_of", "task_of"]
+
+
+def task_of(config: RunConfig, file: Path | None = None) -> TaskSpec:
+    """The task of a run's configuration, from the package that made the run.
+
+    Warns of another version of it.
+
+    Raises:
+        ConfigError: the package is not installed; names it and ``file``, where the configuration was read from.
+        PluginError: the task is broken.
+    """
+    if config.made_by is None:
+        return load_task(config.task)
+    return load_recorded(TASKS, config.made_by.task, file)[1]
+
+
+def scene_of(config: RunConfig, task: TaskSpec, file: Path | None = None) -> FoundScene:
+    """The scene of a run's configuration, the task's own or from the package that made the run; raises as :func:`task_of`."""
+    if config.made_by is None:
+        return find_scene(task, config.scene_name)
+    if config.made_by.scene is None:
+        own = [scene for scene in task.scenes if scene.name == config.scene_name]
+        return FoundScene(own[0], task.config_package) if own else find_scene(task, config.scene_name)
+    info, extension = load_recorded(SCENES, config.made_by.scene, file, f"{config.task}.{config.scene_name}")
+    return FoundScene(extension.scene, extension.config_package, info)
+
+
+def made_now(config: RunConfig, task: TaskSpec) -> MadeBy:
+    """The makers of a run that starts or goes on now: the same packages, in the versions that are installed."""
+    made, scene = config.made_by, scene_of(config, task).added_by
+    task_info = TASKS.find(config.task if made is None else qualified(made.task.package, made.task.name))
+    loss = None if config.train.loss is None else Maker.of(LOSSES.find(config.train.loss))
+    return MadeBy(__version__, Maker.of(task_info), None if scene is None else Maker.of(scene, config.scene_name), loss)

@@ -1,0 +1,366 @@
+"""A run says which packages made it, and is read with these; what happens when they are gone, newer, or another's."""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from rich.console import Console
+
+import neuprim
+from neuprim.cli import main
+from neuprim.config import RunConfig, compose
+from neuprim.core import checkpoint, notices
+from neuprim.core.errors import CheckpointError, ConfigError
+from neuprim.core.notices import NeuprimWarning
+from neuprim.evaluate import evaluate_run, load_run
+from neuprim.new_task import new_task
+from neuprim.plugins import provenance
+from neuprim.plugins.provenance import MadeBy, Maker
+from neuprim.run import run
+from tests.plugins.fakes import install, install_groups, site, uninstall
+from tests.plugins.marked import static_run
+from tests.plugins.test_extensions import LOSS, add
+
+__all__ = ["site"]
+
+SMALL = ["scene.size=12", "scene.train_views=3", "scene.test_views=1", "model.primitives=12"]
+QUICK = ["train.iterations=2", "train.max_seconds=null", "renderer.backend=reference"]
+
+
+def glow(site: Path, distribution: str = "neuprim-glow", version: str = "0.1", package: str = "neuprim_glow") -> None:
+    """A working task ``glow``."""
+    draft = site.parent / "draft"
+    if not draft.exists():
+        new_task("glow", draft)
+    files = {}
+    for path in (draft / "neuprim_glow").rglob("*"):
+        if path.is_file():
+            name = str(path.relative_to(draft)).replace("neuprim_glow", package)
+            files[name] = path.read_text().replace("neuprim_glow", package)
+    install(site, distribution, {"glow": f"{package}:TASK"}, files, version=version)
+
+
+@pytest.fixture
+def made(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run of ``task=glow`` of neuprim-glow 0.1, in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    glow(site)
+    run(compose(["task=glow", *SMALL, *QUICK, "output_dir=r"]), Console(quiet=True))
+    return Path("r")
+
+
+def error(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    capsys.readouterr()
+    assert main(words) == 2
+    return capsys.readouterr().err.strip()
+
+
+def edited(directory: Path, change: dict[str, Any]) -> None:
+    """Changes keys of a run's record of makers; None removes one."""
+    file = directory / "config.yaml"
+    data = yaml.safe_load(file.read_text())
+    for key, value in change.items():
+        node, names = data["made_by"], key.split(".")
+        for name in names[:-1]:
+            node = node[name]
+        node[names[-1]] = value
+    file.write_text(yaml.safe_dump(data))
+
+
+# ---------------------------------------------------------------- what is written
+
+
+def test_a_run_records_who_made_it(made: Path) -> None:
+    expected = {"neuprim": neuprim.__version__, "task": {"name": "glow", "package": "neuprim-glow", "version": "0.1"}}
+    assert yaml.safe_load((made / "config.yaml").read_text())["made_by"] == expected
+    assert checkpoint.read_header(made / "checkpoint.safetensors", "checkpoint")["made_by"] == expected
+    metrics = json.loads((made / "metrics.json").read_text())
+    assert metrics["made_by"] == {"neuprim": neuprim.__version__, "task": "neuprim-glow 0.1"}
+    assert "<dt>task made by</dt><dd>neuprim-glow 0.1</dd>" in (made / "report.html").read_text()
+    assert RunConfig.from_yaml(made).made_by == MadeBy(neuprim.__version__, Maker("glow", "neuprim-glow", "0.1"))
+
+
+def test_scene_and_loss_of_other_packages_are_recorded(site: Path, tmp_path: Path) -> None:
+    add(site, "scene")
+    add(site, "loss", package="fake_loss")
+    made_by = compose(["task=static", "scene=extra", "train.loss=extra"], False).made_by
+    assert made_by is not None
+    assert made_by.to_dict() == {
+        "neuprim": neuprim.__version__,
+        "task": {"name": "static", "package": "neuprim", "version": made_by.task.version},
+        "scene": {"name": "extra", "package": "fake-extra", "version": "0.3"},
+        "loss": {"name": "extra", "package": "fake-loss", "version": "0.3"},
+    }
+    assert MadeBy.from_dict(made_by.to_dict()) == made_by
+
+
+def test_a_version_of_any_length_is_readable_again(site: Path) -> None:
+    add(site, "loss")
+    (site / "fake_extra-0.3.dist-info" / "METADATA").write_text(f"Name: fake-extra\nVersion: 1{'.1' * 500}\t\n")
+    made_by = compose(["task=static", "train.loss=extra"], False).made_by
+    assert made_by is not None and MadeBy.from_dict(made_by.to_dict()) == made_by
+
+
+# ---------------------------------------------------------------- packages that are gone
+
+
+def test_without_the_package_every_command_names_it(made: Path, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", "r", "--format", "npz", "--out", "r.npz"]) == 0
+    uninstall(site, "neuprim-glow")
+    text = "this run was made by neuprim-glow 0.1 (task glow), which is not installed"
+    for words in (
+        ["eval", "r"],
+        ["render", "r", "--camera", "orbit"],
+        ["render", "r", "--camera", "orbit", "--time", "0.5"],
+        ["export", "r", "--format", "ply"],
+        ["inspect", "r", "--out", "x.html"],
+        ["run", "task=glow", "output_dir=r", "resume=true"],
+        ["run", "task=neuprim-glow:glow", "output_dir=r", "resume=true"],
+    ):
+        assert error(words, capsys) == f"neuprim: error: r/config.yaml: {text}", words
+    assert error(["import", "r.npz", "--out", "again"], capsys) == f"neuprim: error: r.npz: {text}"
+    assert not Path("again").exists()
+    assert "task=glow: no such task" in error(["run", "task=glow"], capsys), "nothing is resumed"
+    assert "task=glwo: no such task" in error(["run", "task=glwo", "output_dir=r", "resume=true"], capsys), "a typing error"
+
+
+def test_a_run_that_was_not_told_where_is_found_to_resume(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    glow(site)
+    for word in ("glow", "neuprim-glow:glow"):
+        config = compose([f"task={word}"])
+        config.output_dir.mkdir(parents=True)
+        (config.output_dir / "config.yaml").write_text(config.to_yaml())
+    uninstall(site, "neuprim-glow")
+    text = "config.yaml: this run was made by neuprim-glow 0.1 (task glow), which is not installed"
+    assert text in error(["run", "task=glow", "resume=true"], capsys)
+    assert f"outputs/neuprim-glow-glow-ball/{text}" in error(["run", "task=neuprim-glow:glow", "resume=true"], capsys)
+    assert "task=../glow: no such task" in error(["run", "task=../glow", "resume=true"], capsys)
+
+
+def test_without_the_package_of_the_scene_or_the_loss(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    add(site, "scene")
+    add(site, "loss", package="fake_loss")
+    words = ["task=static", "scene=extra", "train.loss=extra", "output_dir=r"]
+    run(compose([*words, *QUICK, "model.primitives=12"]), Console(quiet=True))
+    uninstall(site, "fake-loss")
+    assert main(["eval", "r"]) == 0, "only training needs the loss"
+    resume = ["run", *words, "resume=true"]
+    told = "neuprim: error: r/config.yaml: this run was made by "
+    assert error(resume, capsys) == told + "fake-loss 0.3 (loss extra), which is not installed"
+    uninstall(site, "fake-extra")
+    text = told + "fake-extra 0.3 (scene extra), which is not installed"
+    assert error(["eval", "r"], capsys) == text
+    assert error(["render", "r", "--camera", "test"], capsys) == text
+    assert error(resume, capsys) == text
+    assert main(["export", "r", "--format", "npz"]) == 0, "the model alone needs no scene"
+
+
+def test_another_package_of_the_same_name_is_not_taken(made: Path, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    glow(site, "glow-too", package="glow_too")
+    assert main(["eval", "r"]) == 0, "two packages of that name: the run knows which one made it"
+    assert "glow_too" not in sys.modules
+    uninstall(site, "neuprim-glow")
+    assert "r/config.yaml: this run was made by neuprim-glow 0.1 (task glow), which is not installed" in error(["eval", "r"], capsys)
+    edited(made, {"task.package": "Glow_Too"})
+    assert main(["eval", "r"]) == 0
+    assert "r/config.yaml: this run" not in capsys.readouterr().err
+
+
+def test_a_package_that_has_the_task_no_more(made: Path, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    uninstall(site, "neuprim-glow")
+    install_groups(site, "neuprim-glow", {}, {}, version="0.2")
+    text = "this run was made by neuprim-glow 0.1 (task glow); the installed neuprim-glow 0.2 has no such task"
+    assert error(["eval", "r"], capsys) == f"neuprim: error: r/config.yaml: {text}"
+
+
+# ---------------------------------------------------------------- other versions
+
+
+def test_another_version_is_one_warning(made: Path, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_run(made)
+    (site / "neuprim_glow-0.1.dist-info").rename(site / "neuprim_glow-0.2.dist-info")
+    metadata = site / "neuprim_glow-0.2.dist-info" / "METADATA"
+    metadata.write_text(metadata.read_text().replace("0.1", "0.2"))
+    capsys.readouterr()
+    assert main(["export", "r", "--format", "npz", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["lossless"] is True, "standard output is the JSON alone"
+    assert main(["eval", "r"]) == 0
+    err += capsys.readouterr().err
+    assert [line for line in err.splitlines() if "warning" in line] == [
+        "neuprim: warning: r/config.yaml: this run was made by neuprim-glow 0.1 (task glow); installed is neuprim-glow 0.2"
+    ]
+    with pytest.warns(NeuprimWarning, match=r"r/checkpoint.safetensors: .* neuprim-glow 0.1 \(task glow\); installed is neuprim-glow 0.2"):
+        run(compose(["task=glow", *SMALL, *QUICK, "train.iterations=3", "output_dir=r", "resume=true"]), Console(quiet=True))
+    made_by = RunConfig.from_yaml(made).made_by
+    assert made_by is not None and made_by.task.version == "0.2", "what went on was made by what is installed"
+
+
+@pytest.mark.parametrize(("version", "warns"), [("0.1.7", False), ("0.2.0", True), ("0.2.0.dev1", True), ("not a version", True)])
+def test_another_neuprim_is_a_warning_where_its_minor_version_differs(
+    version: str, warns: bool, site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = static_run(tmp_path / "r")
+    monkeypatch.setattr(provenance, "__version__", version)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load_run(folder)
+        load_run(folder)
+    texts = [f"{folder}/config.yaml: this run was made by neuprim {neuprim.__version__}; this is neuprim {version}"]
+    assert [str(w.message) for w in caught if w.category is NeuprimWarning] == (texts if warns else [])
+
+
+def test_a_configuration_that_runs_again_names_what_runs_it(made: Path) -> None:
+    edited(made, {"neuprim": "0.0.1"})
+    config = RunConfig.from_yaml(made)
+    assert config.made_by is not None and config.made_by.neuprim == "0.0.1"
+    config.output_dir = Path("second")
+    run(config, Console(quiet=True))
+    config.made_by, config.output_dir = None, Path("third")
+    run(config, Console(quiet=True))
+    for folder in ("second", "third"):
+        assert RunConfig.from_yaml(folder).made_by == MadeBy(neuprim.__version__, Maker("glow", "neuprim-glow", "0.1"))
+
+
+# ---------------------------------------------------------------- PACKAGE:NAME, from run to picture
+
+
+def test_a_run_of_a_chosen_package_goes_through_every_command(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    glow(site)
+    glow(site, "glow-too", "7", package="glow_too")
+    install(
+        site,
+        "my-losses",
+        {"photometric": "my_losses:PLUGIN"},
+        {"my_losses.py": LOSS.replace('"extra"', '"photometric"')},
+        group="neuprim.losses",
+    )
+    words = ["task=glow-too:glow", "scene=glow-too:ball", "train.loss=my-losses:photometric", *SMALL, *QUICK, "train.log_every=1"]
+    assert "choose task=glow-too:glow or task=neuprim-glow:glow" in error(["run", "task=glow"], capsys)
+    assert main(["run", *words]) == 0
+    folder = capsys.readouterr().out.strip()
+    assert folder == "outputs/glow-too-glow-glow-too-ball"
+    assert '"mse"' in Path(folder, "metrics.jsonl").read_text(), "the loss of that package"
+    assert main(["run", *words, "train.iterations=3", "resume=true"]) == 0
+    assert capsys.readouterr().out.strip() == folder
+    assert main(["eval", folder]) == 0
+    assert "made_by.task" in capsys.readouterr().out
+    assert main(["render", folder, "--camera", "test", "--format", "png"]) == 0
+    assert main(["export", folder, "--format", "neuprim:ply", "--out", "x.ply"]) == 0
+    assert main(["import", "x.ply", "--out", "again"]) == 0
+    assert RunConfig.from_yaml("again").made_by == RunConfig.from_yaml(folder).made_by
+    assert main(["inspect", "again", "--show", "neuprim:slices", "--grid", "8", "--out", "x.html"]) == 0
+    capsys.readouterr()
+    assert main(["run", *words, "--cfg"]) == 0
+    assert "package: glow-too\n    version: '7'" in capsys.readouterr().out
+    assert "neuprim_glow" not in sys.modules
+
+
+def test_a_run_does_not_go_on_with_another_packages_task(made: Path, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    glow(site, "glow-too", "7", package="glow_too")
+    before = (made / "checkpoint.safetensors").read_bytes()
+    text = "written for task 'glow' of neuprim-glow 0.1; this run's task is that of glow-too 7"
+    told = error(["run", "task=glow-too:glow", *SMALL, *QUICK, "output_dir=r", "resume=true"], capsys)
+    assert told.endswith(f"neuprim: error: r/checkpoint.safetensors: {text}")
+    assert (made / "checkpoint.safetensors").read_bytes() == before
+    assert RunConfig.from_yaml(made).made_by == MadeBy(neuprim.__version__, Maker("glow", "neuprim-glow", "0.1"))
+
+
+# ---------------------------------------------------------------- records from strangers
+
+
+def test_a_run_without_a_record_is_read_by_names(made: Path, site: Path) -> None:
+    file = made / "config.yaml"
+    text = file.read_text()
+    for without in (text[: text.index("made_by:")], text[: text.index("made_by:")] + "made_by: null\n"):
+        file.write_text(without)
+        config, task, _, _ = load_run(made)
+        assert config.made_by is None and task.name == "glow"
+    assert "made_by" not in evaluate_run(made)
+    header, tensors = checkpoint.read(made / "checkpoint.safetensors", "checkpoint")
+    rest = {key: value for key, value in header.items() if key not in ("made_by", "format", "kind")}
+    checkpoint.write(made / "checkpoint.safetensors", "checkpoint", tensors, rest)
+    run(compose(["task=glow", *SMALL, *QUICK, "train.iterations=3", "output_dir=r", "resume=true"]), Console(quiet=True))
+
+
+@pytest.mark.parametrize(
+    ("record", "text"),
+    [
+        (3, "made_by: found int; expected a mapping of neuprim, task, scene, loss"),
+        ({}, "made_by.task: missing; expected name, package and version"),
+        ({"neuprim": "0.1", "task": []}, "made_by.task: found list; expected a mapping of name, package, version"),
+        ({"neuprim": "0.1", "tsak": {}}, "made_by.tsak: no such setting; did you mean 'task'?"),
+        ({"neuprim": "0.1", "task": {"name": "static", "package": "neuprim"}}, "made_by.task.version: found None; expected text"),
+        (
+            {"neuprim": "0.1", "task": {"name": "static", "package": "a:b", "version": ""}},
+            "made_by.task.package: found 'a:b'; expected the name",
+        ),
+        ({"neuprim": "0.1", "task": {"name": "static", "package": " ", "version": ""}}, "made_by.task.package: found ' '; expected text"),
+        (
+            {"neuprim": "0.1", "task": {"name": "static", "package": "a\nb", "version": ""}},
+            "made_by.task.package: found 'a\\nb'; expected text",
+        ),
+        ({"neuprim": "0.1", "task": {"name": "static", "package": "\x1b[31m", "version": ""}}, "made_by.task.package: found '\\x1b[31m'"),
+        ({"neuprim": "0.1", "task": {"name": "static", "package": "x" * 9999, "version": ""}}, "package: found str of 10001 characters"),
+        ({"neuprim": 1, "task": {"name": "static", "package": "neuprim", "version": ""}}, "made_by.neuprim: found 1; expected text"),
+        (
+            {"neuprim": "0.1", "task": {"name": "x", "package": "neuprim", "version": "1"}},
+            "task.name: found 'x'; expected 'static', as task.name says",
+        ),
+        (
+            {
+                "neuprim": "0.1",
+                "task": {"name": "static", "package": "neuprim", "version": "1"},
+                "loss": {"name": "x", "package": "p", "version": "1"},
+            },
+            "made_by.loss.name: found 'x'; expected None, as train.loss says",
+        ),
+    ],
+)
+def test_records_that_nobody_wrote(record: Any, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = static_run(tmp_path / "r")
+    file = folder / "config.yaml"
+    data = yaml.safe_load(file.read_text())
+    file.write_text(yaml.safe_dump({**data, "made_by": record}))
+    with pytest.raises(ConfigError) as caught:
+        RunConfig.from_yaml(folder)
+    message = str(caught.value)
+    assert message.startswith(f"{file}: made_by") and text in message and message.isprintable() and len(message) < 600
+
+
+def test_a_damaged_record_in_a_checkpoint(made: Path) -> None:
+    header, tensors = checkpoint.read(made / "checkpoint.safetensors", "checkpoint")
+    rest = {key: value for key, value in header.items() if key not in ("format", "kind")}
+    checkpoint.write(made / "checkpoint.safetensors", "checkpoint", tensors, {**rest, "made_by": {"task": 3}})
+    config = compose(["task=glow", *SMALL, *QUICK, "output_dir=r", "resume=true"])
+    with pytest.raises(CheckpointError, match=r"^r/checkpoint.safetensors: made_by.task: found int; expected a mapping"):
+        run(config, Console(quiet=True))
+
+
+def test_warnings_are_said_once_and_can_be_silenced(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for text in ("a", "b", "a"):
+            notices.warn_once(text)
+    assert [str(w.message) for w in caught] == ["a", "b"]
+    with pytest.warns(UserWarning, match="a stranger's") as others, notices.warnings_as_lines():
+        notices.warn_once("two\nlines")
+        warnings.warn("a stranger's", UserWarning, stacklevel=1)
+    assert len(others) == 1 and capsys.readouterr().err == "neuprim: warning: two lines\n"

@@ -69,6 +69,10 @@ class Cosine:
     b2: Tensor
     omega0: float = 30.0
 
+    def rows(self, index: Tensor) -> Cosine:
+        """Those of some primitives, (M,) int64, without gradient."""
+        return Cosine(*(x.detach()[index] for x in (self.W1, self.b1, self.w2, self.b2)), self.omega0)
+
 
 @dataclass(frozen=True)
 class Opaque:
@@ -79,6 +83,10 @@ class Opaque:
     """
 
     line_integral: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
+
+    def rows(self, index: Tensor) -> Opaque:
+        """That of some primitives, (M,) int64."""
+        return Opaque(lambda prim, *ray: self.line_integral(index[prim], *ray))
 
 
 LoweredDensity = Cosine | Opaque

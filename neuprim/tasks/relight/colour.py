@@ -21,6 +21,7 @@ from torch import Tensor
 from neuprim.core.fields import ColourField, Conditions, LoweredDensity, RayNet, Shade
 from neuprim.core.geometry import Geometry
 from neuprim.core.ray_cameras import AnyCamera
+from neuprim.core.render.settings import RenderSettings
 from neuprim.core.schema import InitContext, ParameterSpec, Params
 from neuprim.tasks.relight.directions import unit
 from neuprim.tasks.relight.visibility import light_visibility
@@ -91,10 +92,10 @@ class LightNetwork(ColourField):
     def derive(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions) -> Conditions:
         if self.visibility != "primitive":
             return conditions
-        return {**conditions, "visibility": light_visibility(geometry, density, conditions["light"])(geometry.means)}
+        return {**conditions, "visibility": light_visibility(geometry, density, conditions["light"], RenderSettings())(geometry.means)}
 
     def shade(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions) -> Shade | None:
-        return light_visibility(geometry, density, conditions["light"]) if self.visibility == "pixel" else None
+        return light_visibility(geometry, density, conditions["light"], RenderSettings()) if self.visibility == "pixel" else None
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> RayNet:
         means = geometry.means

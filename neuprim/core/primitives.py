@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.fields import ColourField, Conditions, Constant, DensityField, LoweredColour, LoweredDensity, RayNet, Shade
+from neuprim.core.fields import ColourField, Conditions, Constant, DensityField, LoweredColour, LoweredDensity, RayNet, Shade, Shading
 from neuprim.core.geometry import GEOMETRY_SPECS, Geometry
 from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import InitContext, ParameterSpec
+from neuprim.core.settings import RenderSettings
 
 __all__ = ["Living", "Lowered", "Primitives"]
 
@@ -114,15 +115,20 @@ class Primitives:
         """The tensors one field owns."""
         return {s.name: self.params[s.name] for s in field.parameters()}
 
-    def lower(self, camera: AnyCamera, conditions: Conditions) -> Lowered:
-        """Fold a frame's conditions into closed forms; differentiable. Primitives that are not alive in it are left out."""
+    def lower(self, camera: AnyCamera, conditions: Conditions, settings: RenderSettings | None = None) -> Lowered:
+        """Fold a frame's conditions into closed forms; differentiable. Primitives that are not alive in it are left out.
+
+        ``settings`` are for images that a colour field needs first, such as a shadow's; None: the defaults.
+        """
         living = self.living(conditions)
         geometry = living.geometry
         density = self.density.lower(living.own, geometry, conditions)
-        conditions = self.colour.derive(geometry, density, conditions)
         tint = {s.name: living.params[s.name] for s in self.colour.parameters()}
         colour = self.colour.lower(tint, geometry, camera, conditions)
-        return Lowered(geometry, density, colour, living.rows, self.colour.shade(geometry, density, conditions))
+        shading = self.colour.shade(geometry, density, conditions, settings or RenderSettings()) or Shading()
+        if shading.primitives is not None:
+            colour = colour.scaled(shading.primitives)
+        return Lowered(geometry, density, colour, living.rows, shading.pixels)
 
     def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:
         """Where the primitives that live in a frame are, and their density; no camera needed."""

@@ -133,7 +133,7 @@ def summary(
 ) -> dict[str, Any]:
     """The content of ``metrics.json``. ``training`` holds iterations and train_seconds as the run recorded them."""
     worst = min(views, key=lambda v: v.psnr)
-    lowered = model.lower(dataset.test.view(0).camera, dataset.test.view(0).conditions)
+    lowered = model.lower(dataset.test.view(0).camera, dataset.test.view(0).conditions, config.renderer)
     seconds = sorted(v.seconds for v in views)
     return {
         "task": config.task,

@@ -104,7 +104,7 @@ def _train(trainer: Trainer, config: RunConfig, dataset: Dataset, progress: RunP
     """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
     directory = config.output_dir
     view = trainer.dataset.train.view(0)
-    lowered = trainer.model.lower(view.camera, view.conditions)
+    lowered = trainer.model.lower(view.camera, view.conditions, trainer.renderer)
     form = type(lowered.colour).__name__
     on_cpu = choose_backend(lowered, trainer.renderer, view.camera) == "cpu"
     if on_cpu and not compiled(form):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -17,6 +17,9 @@ from torch import Tensor
 from neuprim.core.geometry import Geometry
 from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import ParameterSpec, Params
+
+if TYPE_CHECKING:
+    from neuprim.core.settings import RenderSettings
 
 __all__ = [
     "MOST_UNITS",
@@ -33,6 +36,7 @@ __all__ = [
     "OpaqueColour",
     "RayNet",
     "Shade",
+    "Shading",
 ]
 
 Conditions = Mapping[str, Tensor]
@@ -96,6 +100,10 @@ class Cosine:
         b1 = torch.cat([f.b1 * scale for f, scale in parts], 1)
         return Cosine(W1, b1, torch.cat([self.w2, other.w2], 1), self.b2 + other.b2.reshape(self.b2.shape), omega0)
 
+    def rows(self, index: Tensor) -> Cosine:
+        """Those of some primitives, (M,) int64, without gradient."""
+        return Cosine(*(x.detach()[index] for x in (self.W1, self.b1, self.w2, self.b2)), self.omega0)
+
 
 @dataclass(frozen=True)
 class Opaque:
@@ -106,6 +114,10 @@ class Opaque:
     """
 
     line_integral: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
+
+    def rows(self, index: Tensor) -> Opaque:
+        """That of some primitives, (M,) int64."""
+        return Opaque(lambda prim, *ray: self.line_integral(index[prim], *ray))
 
 
 LoweredDensity = Cosine | Opaque
@@ -120,6 +132,10 @@ class Constant:
 
     rgb: Tensor
 
+    def scaled(self, factors: Tensor) -> Constant:
+        """The same times (N,) factors, at least 0."""
+        return Constant(self.rgb * factors.to(self.rgb)[:, None])
+
 
 @dataclass(frozen=True)
 class OpaqueColour:
@@ -131,6 +147,15 @@ class OpaqueColour:
 
     radiance: Callable[[Tensor, Tensor, Tensor], Tensor]
     channels: int
+
+    def scaled(self, factors: Tensor) -> OpaqueColour:
+        """The same times (N,) factors, at least 0."""
+
+        def radiance(prim: Tensor, x: Tensor, d: Tensor) -> Tensor:
+            found = self.radiance(prim, x, d)
+            return found * factors.to(found)[prim, None]
+
+        return OpaqueColour(radiance, self.channels)
 
 
 @dataclass(frozen=True)
@@ -162,6 +187,11 @@ class RayNet:
     def hidden(self) -> int:
         return int(self.Wx.shape[1])
 
+    def scaled(self, factors: Tensor) -> RayNet:
+        """The same times (N,) factors, at least 0, which max(0, .) lets through."""
+        factors = factors.to(self.base)
+        return RayNet(self.Wx, self.bias, self.Wout * factors[:, None, None], self.base * factors[:, None])
+
     def radiance(self, prim: Tensor, local: Tensor) -> Tensor:
         """(M, C) float64 colours of primitives ``prim`` (M,) at local chord middles ``local`` = x~_m (M, 3) float64; differentiable."""
         phase = (self.Wx.double()[prim] * local[:, None, :]).sum(-1) + self.bias.double()[prim]
@@ -173,6 +203,20 @@ LoweredColour = Constant | RayNet | OpaqueColour
 
 Shade = Callable[[Tensor], Tensor]
 """(M, 3) float64 scene points that pixels show -> (M,) factors on the light that they send to the camera, without gradient."""
+
+
+@dataclass(frozen=True)
+class Shading:
+    """Factors on a frame's colours that follow from the primitives themselves, such as shadows; without gradient.
+
+    Attributes:
+        primitives: (M,) at least 0, one for each primitive of the frame; None: 1.
+        pixels: a factor that varies faster than primitives do, such as a shadow's edge: the renderer asks for it once per pixel, at the
+            mean depth of what the pixel shows (deferred shading). None: 1 everywhere, and no depth image is drawn for it.
+    """
+
+    primitives: Tensor | None = None
+    pixels: Shade | None = None
 
 
 # ---------------------------------------------------------------- fields
@@ -268,12 +312,6 @@ class ColourField(Field):
 
     channels: int
 
-    def derive(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions) -> Conditions:
-        """Conditions of this frame that follow from its other ones and from the primitives themselves, such as which of them a
-        light reaches; added before :meth:`lower`.
-        """
-        return conditions
-
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None] | None:
         """The colour as :func:`neuprim.core.sh.colors` takes it under these conditions, for fields that are that: zero-order
         coefficients (N, C) and those of the higher bands (N, B, C) or None. None for other fields.
@@ -284,8 +322,8 @@ class ColourField(Field):
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> LoweredColour:
         """The frame's closed form."""
 
-    def shade(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions) -> Shade | None:
-        """A factor that varies faster than primitives do, such as a shadow's edge: the renderer asks for it once per pixel, at the
-        mean depth of what the pixel shows (deferred shading). None: 1 everywhere, and no depth image is drawn for it.
+    def shade(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings) -> Shading | None:
+        """What else the frame's colours are multiplied by. Images drawn for it take their backend and threads from ``settings``, those
+        of the frame.
         """
         return None

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import FormError
-from neuprim.core.fields import MOST_UNITS, Constant, Cosine, DensityField, Field, Opaque, OpaqueColour, RayNet
+from neuprim.core.fields import MOST_UNITS, Constant, Cosine, DensityField, Field, Opaque, OpaqueColour, RayNet, Shading
 from neuprim.core.geometry import Geometry
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ __all__ = [
     "check_lowered",
     "check_result",
     "check_rows",
+    "check_shading",
     "check_shape",
     "check_sum",
     "check_tensors",
@@ -284,6 +285,21 @@ def check_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:
         raise FormError(f"{who} returned shape {tuple(value.shape)}; expected {shape}, a row for each of the {shape[0]} that it was given")
     found = f"{value.dtype} {value.layout} on {value.device}" if isinstance(value, Tensor) else f"type {type(value).__name__}"
     raise FormError(f"{who} returned {found}; expected a dense tensor of real numbers on the cpu")
+
+
+def check_shading(found: Any, count: int, who: str) -> Shading:
+    """What ``shade`` returned, for ``count`` primitives; None is no shading.
+
+    Raises:
+        FormError: it is something else; ``who`` names field and method.
+    """
+    if found is None:
+        return Shading()
+    if not isinstance(found, Shading):
+        raise FormError(f"{who} returned type {type(found).__name__}; expected Shading or None")
+    if found.primitives is not None:
+        check_result(found.primitives, (count,), f"{who}: primitives")
+    return found
 
 
 def check_tensors(found: Any, like: Mapping[str, Tensor], who: str) -> dict[str, Tensor]:

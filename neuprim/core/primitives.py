@@ -11,10 +11,11 @@ from torch import Tensor
 
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.fields import ColourField, Conditions, Constant, DensityField, LoweredColour, LoweredDensity, RayNet, Shade
-from neuprim.core.forms import check_colour, check_density, check_geometry, check_result, check_rows, method, source
+from neuprim.core.forms import check_colour, check_density, check_geometry, check_result, check_rows, check_shading, method, source
 from neuprim.core.geometry import GEOMETRY_SPECS, Geometry
 from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import InitContext, ParameterSpec
+from neuprim.core.settings import RenderSettings
 
 __all__ = ["Living", "Lowered", "Primitives"]
 
@@ -128,8 +129,10 @@ class Primitives:
         """The tensors one field owns."""
         return {s.name: self.params[s.name] for s in field.parameters()}
 
-    def lower(self, camera: AnyCamera, conditions: Conditions) -> Lowered:
+    def lower(self, camera: AnyCamera, conditions: Conditions, settings: RenderSettings | None = None) -> Lowered:
         """Fold a frame's conditions into closed forms; differentiable. Primitives that are not alive in it are left out.
+
+        ``settings`` are for images that a colour field needs first, such as a shadow's; None: the defaults.
 
         Raises:
             FormError: a field hands over tensors that do not fit.
@@ -140,11 +143,14 @@ class Primitives:
         sizes = check_geometry(geometry, "geometry")
         density = self.density.lower(living.own, geometry, conditions)
         check_density(density, sizes, names[0])  # before the colour looks at it, which may draw it
-        conditions = self.colour.derive(geometry, density, conditions)
         tint = {s.name: living.params[s.name] for s in self.colour.parameters()}
         colour = self.colour.lower(tint, geometry, camera, conditions)
         check_colour(colour, sizes, names[1])
-        return Lowered(geometry, density, colour, living.rows, self.colour.shade(geometry, density, conditions), names)
+        found = self.colour.shade(geometry, density, conditions, settings or RenderSettings())
+        shading = check_shading(found, geometry.count, method(self.colour, "shade"))
+        if shading.primitives is not None:
+            colour = colour.scaled(shading.primitives)
+        return Lowered(geometry, density, colour, living.rows, shading.pixels, names)
 
     def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:
         """Where the primitives that live in a frame are, and their density; no camera needed."""

@@ -17,7 +17,7 @@ from neuprim.core import sh
 from neuprim.core.cosine import CosineDensity
 from neuprim.core.density_grid import density_at, density_grid
 from neuprim.core.errors import FormError
-from neuprim.core.fields import MOST_UNITS, Constant, Cosine, Opaque, OpaqueColour
+from neuprim.core.fields import MOST_UNITS, Constant, Cosine, Opaque, OpaqueColour, Shading
 from neuprim.core.primitives import Lowered, Primitives
 from neuprim.core.render import RenderSettings, render, render_lowered
 from neuprim.core.render.joint import joint_volume
@@ -175,21 +175,25 @@ def test_rows_and_places_name_their_method(methods: dict[str, Any], message: str
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_wrong_shade_names_its_field(backend: str) -> None:
-    wrong = model(colour=paint(shade=lambda *a: lambda points: points))
+    wrong = model(colour=paint(shade=lambda *a: Shading(pixels=lambda points: points)))
     with pytest.raises(FormError, match=r"^colour field Paint: shade returned shape \((\d+), 3\); expected \(\1,\)"):
         render(wrong, CAMERA, settings=settings(backend))
     with pytest.raises(FormError, match=r"^colour field Paint: shade has type float; expected a function or None"):
+        render(model(colour=paint(shade=lambda *a: Shading(pixels=0.5))), CAMERA, settings=settings(backend))
+    with pytest.raises(FormError, match=r"^colour field Paint: shade returned type float; expected Shading or None"):
         render(model(colour=paint(shade=lambda *a: 0.5)), CAMERA, settings=settings(backend))
+    with pytest.raises(FormError, match=r"^colour field Paint: shade: primitives returned shape \(1,\); expected \(\d+,\)"):
+        render(model(colour=paint(shade=lambda *a: Shading(torch.ones(1)))), CAMERA, settings=settings(backend))
 
 
 def test_the_colour_never_sees_a_wrong_density() -> None:
     """Shadows draw the density before the frame is drawn."""
 
-    def derive(*a: Any) -> Any:
+    def shade(*a: Any) -> Any:
         raise AssertionError("asked")
 
     with pytest.raises(FormError, match="density field Waves"):
-        render(model(lowers("w2", lambda v: v[:5]), paint(derive=derive)), CAMERA)
+        render(model(lowers("w2", lambda v: v[:5]), paint(shade=shade)), CAMERA)
 
 
 # ---------------------------------------------------------------- what surrounds the forms

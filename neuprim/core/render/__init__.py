@@ -68,7 +68,8 @@ def render(
         NonFiniteError: a parameter is NaN or infinite (named, with the primitive).
         BackendUnavailable: the backend asked for cannot draw this model or this camera.
     """
-    return render_lowered(model.lower(camera, conditions or {}), camera, settings or RenderSettings(), background)
+    settings = settings or RenderSettings()
+    return render_lowered(model.lower(camera, conditions or {}, settings), camera, settings, background)
 
 
 def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None) -> RenderOutput:

@@ -14,7 +14,7 @@ from torch import Tensor
 from neuprim.config import RunSettings, preset_settings, task_choices
 from neuprim.core.data import Dataset, View
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.fields import ColourField, Conditions, DensityField, LoweredDensity
+from neuprim.core.fields import ColourField, Conditions, DensityField, LoweredDensity, Shading
 from neuprim.core.geometry import Geometry
 from neuprim.core.primitives import Primitives
 from neuprim.core.ray_cameras import AnyCamera
@@ -131,10 +131,10 @@ class Subject:
 
 
 class Frozen(ColourField):
-    """A colour field whose derived conditions are given: those carry no gradient, and finite differences must not see them move."""
+    """A colour field whose shading is given: that carries no gradient, and finite differences must not see it move."""
 
-    def __init__(self, colour: ColourField, derived: Conditions) -> None:
-        self.colour, self.channels, self.derived = colour, colour.channels, {k: v.detach() for k, v in derived.items()}
+    def __init__(self, colour: ColourField, shading: Shading | None) -> None:
+        self.colour, self.channels, self.shading = colour, colour.channels, shading
 
     def parameters(self) -> list[ParameterSpec]:
         return self.colour.parameters()
@@ -142,18 +142,18 @@ class Frozen(ColourField):
     def settings(self) -> dict[str, Any]:
         return self.colour.settings()
 
-    def derive(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions) -> Conditions:
-        return self.derived
+    def shade(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings) -> Shading | None:
+        return self.shading
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Any:
         return self.colour.lower(params, geometry, camera, conditions)
 
     @classmethod
     def of(cls, model: Primitives, conditions: Conditions) -> Frozen:
-        """The model's colour with what it derives in this frame."""
+        """The model's colour with its shading in this frame."""
         with torch.no_grad():
             geometry, density = model.lower_density(conditions)
-            return cls(model.colour, model.colour.derive(geometry, density, conditions))
+            return cls(model.colour, model.colour.shade(geometry, density, conditions, RenderSettings()))
 
 
 def watched(model: Primitives) -> dict[str, Tensor]:

@@ -74,7 +74,7 @@ def _from_afar(run: TrainedModel, conditions: Conditions, direction: Tensor) -> 
     reach = float((means - middle).norm(dim=-1).max()) + 1.0
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     camera = Camera(look_at(middle - 1e4 * reach * direction, middle, up), 1e4, 1e4, 32, 32, 64, 64)
-    lowered = run.model.lower(camera, conditions)
+    lowered = run.model.lower(camera, conditions, run.settings)
     if isinstance(lowered.colour, OpaqueColour):
         raise ConfigError(f"{run.directory}: colours of the form OpaqueColour have no value per primitive")
     return lowered.center_colors(camera.position).double()

@@ -18,10 +18,11 @@ from typing import Any
 
 from torch import Tensor
 
-from neuprim.core.fields import ColourField, Conditions, LoweredDensity, RayNet, Shade
+from neuprim.core.fields import ColourField, Conditions, LoweredDensity, RayNet, Shading
 from neuprim.core.geometry import Geometry
 from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import InitContext, ParameterSpec, Params
+from neuprim.core.settings import RenderSettings
 from neuprim.tasks.relight.directions import unit
 from neuprim.tasks.relight.visibility import light_visibility
 
@@ -88,13 +89,11 @@ class LightNetwork(ColourField):
             ParameterSpec("net_out", outputs, 2e-2, lambda c: c.uniform(*outputs, bound=_output(c)), group="colour"),
         ]
 
-    def derive(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions) -> Conditions:
-        if self.visibility != "primitive":
-            return conditions
-        return {**conditions, "visibility": light_visibility(geometry, density, conditions["light"])(geometry.means)}
-
-    def shade(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions) -> Shade | None:
-        return light_visibility(geometry, density, conditions["light"]) if self.visibility == "pixel" else None
+    def shade(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings) -> Shading | None:
+        if self.visibility == "none":
+            return None
+        visible = light_visibility(geometry, density, conditions["light"], settings)
+        return Shading(pixels=visible) if self.visibility == "pixel" else Shading(primitives=visible(geometry.means))
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> RayNet:
         means = geometry.means
@@ -104,8 +103,6 @@ class LightNetwork(ColourField):
         factor = strength.expand(means.shape[0], -1)
         if self.falloff:
             factor = factor / to_light.square().sum(-1, keepdim=True).clamp_min(1e-12)
-        if "visibility" in conditions:
-            factor = factor * conditions["visibility"].to(means)[:, None]
         phase = (params["net_view"] * view[:, None]).sum(-1) + (params["net_light"] * unit(to_light)[:, None]).sum(-1) + params["net_phase"]
         if self.form == "additive":
             base, out = params["c_dc"], params["net_out"]

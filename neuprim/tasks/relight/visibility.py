@@ -1,13 +1,20 @@
-"""How far a point light reaches: a depth image out of the light, by the renderer that draws everything else (a shadow map).
+"""How much of a point light arrives: depth images out of the light, by the renderer that draws everything else (layered shadow maps).
 
-At a point x,  V(x) = sigmoid((depth(x) - z(x) + bias)/softness):  1 where nothing lies between light and point, 0 deep in a shadow. The
-depth image is read as inverse depth, bilinearly: that is exact on planes, so that a lit floor does not shadow itself at grazing light.
+The primitives are sorted into slabs across the light's direction, and each slab is drawn on its own, as opacity A_k and mean depth d_k.
+What absorbs on the way to a point x at depth z is what lies in front of it, so the light's transmittance is
+
+    V(x) = prod_k (1 - A_k s((z - d_k - bias)/softness)),      s a smooth step from 0 at -1 to 1 at 1,
+
+exactly 1 for what nothing lies in front of, and 1 - A behind something of opacity A, however translucent. One slab is a common shadow map
+with opacity, which knows only one mean depth per pixel: half way between a translucent thing and the floor below it. Depths are read as
+inverse depth, weighted by opacity, bilinearly: that is exact on planes, so that a lit floor does not shadow itself at grazing light.
 V carries no gradient: a shadow moves only as what casts it moves.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
@@ -22,20 +29,25 @@ from neuprim.core.render import RenderSettings, render_lowered
 __all__ = ["BIAS", "SIZE", "SOFTNESS", "light_visibility"]
 
 SIZE = 192
-"""Pixels of the depth image, square."""
+"""Pixels of the depth images, square."""
 
-BIAS, SOFTNESS = 0.2, 0.08
-"""In units of a quarter of the scene's diameter as the light sees it: how far behind the depth image a lit surface may lie, and over
-what distance light fades."""
+LAYERS = 4
+"""Slabs of equal depth."""
+
+BIAS, SOFTNESS = 0.2, 0.2
+"""In units of a quarter of the scene's diameter as the light sees it: how far behind a depth image a surface may lie and keep half of its
+light, and within what distance before and after that light fades. With both equal, a surface at the depth of its own image is lit fully."""
 
 _FAR = 1e3  # scene radii
 
 
-def light_visibility(geometry: Geometry, density: LoweredDensity, light: Tensor, bias: float = BIAS, softness: float = SOFTNESS) -> Shade:
+def light_visibility(
+    geometry: Geometry, density: LoweredDensity, light: Tensor, settings: RenderSettings, bias: float = BIAS, softness: float = SOFTNESS
+) -> Shade:
     """The function (M, 3) scene points -> (M,) visibility 0..1, float32, of a point light (3,).
 
     The light's camera looks at the middle of all centres and sees all of them; a light among them looks the way most of them lie,
-    and points behind it count as lit.
+    and points behind it count as lit. ``settings`` are the frame's own: its backend and threads draw the depth images too.
     """
     with torch.no_grad():
         means = geometry.means.detach().double()
@@ -52,14 +64,21 @@ def light_visibility(geometry: Geometry, density: LoweredDensity, light: Tensor,
         up = torch.tensor([0.0, 0.0, 1.0] if abs(float(light[2] - center[2])) < 0.9 * distance else [0.0, 1.0, 0.0], dtype=torch.float64)
         camera = Camera(look_at(light, center, up), focal, focal, SIZE / 2, SIZE / 2, SIZE, SIZE)
         near = max(1e-4 * radius, distance - 1.5 * radius, 1e-6)
-        flat = Lowered(
-            Geometry(geometry.means.detach(), geometry.log_scales.detach(), geometry.quats.detach()),
-            density,
-            Constant(torch.zeros(geometry.count, 1)),
-        )
-        output = render_lowered(flat, camera, RenderSettings(depth=True, near=near))
-        assert output.depth is not None
-        nearness = torch.where(output.alpha > 0.5, 1.0 / output.depth.double().clamp_min(near), 0.0)
+        own = replace(settings, depth=True, near=near, samples=1)
+        depths = means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+        edges = torch.linspace(float(depths.min()), float(depths.max()), LAYERS + 1, dtype=torch.float64)
+        slabs = torch.bucketize(depths, edges[1:-1])
+        layers = []
+        for k in range(LAYERS):
+            rows = (slabs == k).nonzero()[:, 0]
+            if len(rows) == 0:
+                continue
+            output = render_lowered(_depth_only(geometry, density, rows), camera, own)
+            assert output.depth is not None
+            alpha = output.alpha.double()
+            nearness = torch.where(alpha > 0, alpha / output.depth.double().clamp_min(near), 0.0)
+            layers.append(torch.stack([alpha, nearness]))
+        image = torch.stack(layers)
         unit = 0.5 * radius
 
     def visibility(points: Tensor) -> Tensor:
@@ -68,8 +87,16 @@ def light_visibility(geometry: Geometry, density: LoweredDensity, light: Tensor,
             front = z > near
             spread = focal / (0.5 * SIZE) / z.clamp_min(near)
             where = torch.stack([x * spread, y * spread], -1).clamp(-2.0, 2.0)
-            found = F.grid_sample(nearness[None, None], where[None, None], align_corners=False)[0, 0, 0]
-            behind = z - 1.0 / found.clamp_min(1e-12)
-            return torch.where(front, torch.sigmoid((bias * unit - behind) / (softness * unit)), 1.0).float()
+            found = F.grid_sample(image.flatten(0, 1)[None], where[None, None], align_corners=False)[0, :, 0].unflatten(0, (-1, 2))
+            alpha, nearness = found[:, 0], found[:, 1]
+            behind = z - alpha / nearness.clamp_min(1e-12)
+            u = (0.5 + 0.5 * (behind - bias * unit) / (softness * unit)).clamp(0, 1)
+            arrives = (1 - alpha * u * u * (3 - 2 * u)).prod(0)
+            return torch.where(front, arrives, 1.0).float()
 
     return visibility
+
+
+def _depth_only(geometry: Geometry, density: LoweredDensity, rows: Tensor) -> Lowered:
+    part = Geometry(geometry.means.detach()[rows], geometry.log_scales.detach()[rows], geometry.quats.detach()[rows])
+    return Lowered(part, density.rows(rows), Constant(torch.zeros(len(rows), 1)))

@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 
 from neuprim.core import sh
+from neuprim.core.cameras import Camera
 from neuprim.core.cosine import CosineDensity
 from neuprim.core.errors import ConfigError
 from neuprim.core.fields import Cosine, RayNet
 from neuprim.core.geometry import Geometry
-from neuprim.core.primitives import Primitives
-from neuprim.core.render import RenderSettings, render
+from neuprim.core.primitives import Lowered, Primitives
+from neuprim.core.render import RenderOutput, RenderSettings, render, render_lowered
 from neuprim.core.schema import InitContext
 from neuprim.core.train.population import split
 from neuprim.tasks.relight import TASK
@@ -25,6 +26,7 @@ from neuprim.tasks.relight.visibility import light_visibility
 from tests import scenes
 
 COUNT = 12
+SETTINGS = RenderSettings()
 
 
 def light(x: float = 2.0, y: float = -1.0, z: float = 3.0, strength: float = 1.0) -> dict[str, Tensor]:
@@ -140,24 +142,66 @@ def slabs() -> tuple[Geometry, Cosine]:
 
 def test_what_lies_behind_something_is_in_its_shadow() -> None:
     geometry, density = slabs()
-    straight = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 5.0]), bias=0.35)(geometry.means)
+    straight = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 5.0]), SETTINGS, bias=0.35)(geometry.means)
     assert float(straight[3]) < 0.05 and bool((straight[[0, 1, 2, 4, 5]] > 0.8).all())
-    slanted = light_visibility(geometry, density, torch.tensor([4.0, 0.0, 1.0 + 4.0 * (1.0 / 0.75)]), bias=0.35)(geometry.means)
+    slanted = light_visibility(geometry, density, torch.tensor([4.0, 0.0, 1.0 + 4.0 * (1.0 / 0.75)]), SETTINGS, bias=0.35)(geometry.means)
     assert float(slanted[2]) < 0.3 and float(slanted[3]) > 0.8
 
 
 def test_shadows_carry_no_gradient_and_are_bounded() -> None:
     geometry, density = slabs()
     wanted = Geometry(geometry.means.requires_grad_(), geometry.log_scales, geometry.quats)
-    found = light_visibility(wanted, density, torch.tensor([0.5, 0.2, 4.0]))(wanted.means)
+    found = light_visibility(wanted, density, torch.tensor([0.5, 0.2, 4.0]), SETTINGS)(wanted.means)
     assert not found.requires_grad and bool(((found >= 0) & (found <= 1)).all())
+
+
+def covered_floor(opacity: float) -> tuple[Geometry, Cosine]:
+    """An opaque floor of 441 flat discs, and the last primitive, a disc of this opacity 1.5 above its middle, number 220."""
+    side = torch.linspace(-2, 2, 21)
+    means = torch.cat([torch.cartesian_prod(side, side, torch.zeros(1)), torch.tensor([[0.0, 0.0, 1.5]])])
+    axes = torch.cat([torch.tensor([[0.25, 0.25, 0.03]]).expand(441, 3), torch.tensor([[0.6, 0.6, 0.05]])])
+    offsets = torch.full((442, 1), 20.0)
+    offsets[-1] = -math.log1p(-opacity) / 2 * 0.6 / 0.05  # straight through its middle
+    geometry = Geometry(means, axes.log(), torch.tensor([[1.0, 0, 0, 0]] * 442))
+    return geometry, Cosine(torch.zeros(442, 0, 3), torch.zeros(442, 0), torch.zeros(442, 0), offsets)
+
+
+@pytest.mark.parametrize("opacity", [0.1, 0.55, 0.9, 0.99])
+def test_behind_something_translucent_the_rest_of_the_light_arrives(opacity: float) -> None:
+    geometry, density = covered_floor(opacity)
+    found = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 6.0]), SETTINGS)(geometry.means)
+    assert float(found[220]) == pytest.approx(1 - opacity, abs=0.005)
+    assert float(found[-1]) == 1.0
+
+
+@pytest.mark.parametrize("light", [(0.0, 0.0, 6.0), (4.0, 0.0, 2.5)])
+def test_what_nothing_covers_is_lit_fully(light: tuple[float, float, float]) -> None:
+    geometry, density = covered_floor(0.9)
+    found = light_visibility(geometry, density, torch.tensor(light), SETTINGS)(geometry.means)
+    towards = torch.tensor(light)[:2] / torch.tensor(light).norm()
+    clear = (geometry.means[:, :2] @ towards > 0.3) if light[0] else (geometry.means[:, :2].norm(dim=1) > 1)
+    assert int(clear.sum()) > 100 and float(found[clear].min()) > 0.999
+
+
+def test_depth_images_are_drawn_as_the_frame_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[RenderSettings] = []
+
+    def spy(lowered: Lowered, camera: Camera, settings: RenderSettings) -> RenderOutput:
+        seen.append(settings)
+        return render_lowered(lowered, camera, settings)
+
+    monkeypatch.setattr("neuprim.tasks.relight.visibility.render_lowered", spy)
+    m = model(LightNetwork(2, visibility="pixel"), torch.float32)
+    own = RenderSettings(backend="reference", threads=1, alpha_max=0.98, samples=2)
+    render(m, scenes.camera(), light(), own)
+    assert seen and {(s.backend, s.threads, s.alpha_max, s.samples) for s in seen} == {("reference", 1, 0.98, 1)}
 
 
 @pytest.mark.parametrize("distance", [1e3, 1e8, 1e18])
 def test_distant_lights_cast_the_shadows_of_near_ones(distance: float) -> None:
     geometry, density = slabs()
     direction = torch.tensor([0.2, 0.1, 1.0])
-    near, far = (light_visibility(geometry, density, d * direction)(geometry.means) for d in (100.0, distance))
+    near, far = (light_visibility(geometry, density, d * direction, SETTINGS)(geometry.means) for d in (100.0, distance))
     assert float(near.min()) < 0.1 and float(near.max()) > 0.9 and torch.allclose(near, far, atol=0.05)
 
 
@@ -173,10 +217,10 @@ def test_a_flat_floor_does_not_shadow_itself(polar: float) -> None:
     light = 4.5 * torch.tensor([math.sin(angle), 0.0, math.cos(angle)])
     inner = torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) * 1.8 - 0.9
     points = torch.cat([inner, torch.zeros(500, 1)], -1).double()
-    assert float(light_visibility(geometry, density, light)(points).min()) > 0.85
+    assert float(light_visibility(geometry, density, light, SETTINGS)(points).min()) > 0.9
     below = points - torch.tensor([0.0, 0.0, 0.6], dtype=torch.float64)
     under = below[(below[:, 0] + 0.6 * math.tan(angle)).abs() < 0.8]  # whose light would have to cross the floor
-    assert not len(under) or float(light_visibility(geometry, density, light)(under).max()) < 0.1
+    assert not len(under) or float(light_visibility(geometry, density, light, SETTINGS)(under).max()) < 0.1
 
 
 # ---------------------------------------------------------------- harmonics

@@ -12,7 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-__all__ = ["atomic_path", "cache_directory", "publish_folder", "write_json", "write_text"]
+import numpy as np
+
+__all__ = ["atomic_path", "cache_directory", "publish_folder", "write_json", "write_npy", "write_text"]
 
 
 def cache_directory() -> Path:
@@ -86,3 +88,9 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write strict JSON (no NaN) atomically."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+def write_npy(path: Path, values: np.ndarray) -> None:
+    """Write an array as ``numpy.load(path, allow_pickle=False)`` reads it, atomically."""
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.save(file, values, allow_pickle=False)

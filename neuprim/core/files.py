@@ -10,9 +10,10 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
 __all__ = ["atomic_path", "cache_directory", "publish_folder", "write_json", "write_npy", "write_text"]
 
@@ -92,5 +93,7 @@ def write_json(path: Path, value: Any) -> None:
 
 def write_npy(path: Path, values: np.ndarray) -> None:
     """Write an array as ``numpy.load(path, allow_pickle=False)`` reads it, atomically."""
+    import numpy as np
+
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.save(file, values, allow_pickle=False)

@@ -15,6 +15,7 @@ NAMES = ("450nm", "550 nm", "650nm", "NIR", "SWIR.1")
 TASK = """
 import torch
 
+from neuprim.core.choices import choose
 from neuprim.core.cosine import CosineDensity
 from neuprim.core.task import SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
@@ -26,6 +27,11 @@ RED_GREEN_BLUE = torch.tensor([[0.0, 0.1, 0.9], [0.1, 0.7, 0.1], [0.6, 0.2, 0.0]
 
 def display(image):
     return (image.clamp_min(0) @ RED_GREEN_BLUE.to(image)).clamp(0, 1) ** (1 / 2.4)
+
+
+def check(model):
+    for group in ("density", "colour"):
+        choose(model[group], f"model.{group}", {})
 
 
 def build(model, dataset):
@@ -40,6 +46,7 @@ TASK = TaskSpec(
     scenes=(SceneSpec("ball", "a ball of many bands", lambda settings, context: Ball(**settings)),),
     build=build,
     loss=photometric,
+    check=check,
     fields={"CosineDensity": CosineDensity, "SphericalHarmonics": SphericalHarmonics},
     channels=("450nm", "550 nm", "650nm", "NIR", "SWIR.1"),
     display=display,

@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import re
+import sys
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -59,8 +60,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def forget() -> None:
-    import sys
-
+    """The package that was imported, so that another one of its name can be."""
     for name in [n for n in sys.modules if n.partition(".")[0] == "spectraltask"]:
         del sys.modules[name]
 

@@ -31,6 +31,7 @@ from static_quality import cpu_name, spread
 from tables import between_markers
 
 from neuprim.config import compose
+from neuprim.core.channels import channels_of
 from neuprim.core.checkpoint import save_model
 from neuprim.evaluate import load_dataset
 from neuprim.measure import measure, summary
@@ -116,11 +117,12 @@ def train(job: Job, words: list[str], iterations: int, backend: str, target: Pat
         pass
     for field in (model.density, model.colour):
         field.set_progress(1.0)
-    views = measure(model, dataset, config.renderer)
+    channels = channels_of(task, dataset)
+    views = measure(model, dataset, config.renderer, channels)
     target.mkdir(parents=True, exist_ok=True)
     (target / "config.yaml").write_text(config.to_yaml())
     save_model(target / "model.safetensors", model, config.task, {"color_space": dataset.color_space})
-    metrics = summary(config, model, dataset, views, 0, {"iterations": trainer.step, "train_seconds": trainer.elapsed})
+    metrics = summary(config, model, dataset, channels, views, 0, {"iterations": trainer.step, "train_seconds": trainer.elapsed})
     return {"scene": dataset.name, "form": job.form, "job": job.name, **{k: metrics[k] for k in KEYS}, "versions": metrics["versions"]}
 
 

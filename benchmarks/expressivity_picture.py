@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from neuprim.core.channels import Channels
 from neuprim.core.data import Dataset, View
 from neuprim.core.fields import Constant
 from neuprim.core.gaussian import GaussianDensity
@@ -26,7 +27,7 @@ from neuprim.core.primitives import Lowered, Primitives
 from neuprim.core.render import render_lowered
 from neuprim.core.render.reference import pixel_directions
 from neuprim.evaluate import load_dataset, load_run
-from neuprim.measure import display, draw
+from neuprim.measure import draw
 from neuprim.report.pictures import ERROR_SCALE
 
 SIZE = 200
@@ -80,7 +81,8 @@ def panels(run_dir: Path) -> Panels:
         reach = GAUSSIAN_REACH if isinstance(model.density, GaussianDensity) else 1.0
         shaded = ellipsoids(model.geometry, view, random, reach)
     error = (rendered - truth).abs().mean(-1)
-    return Panels(title(model), display(truth, dataset.color_space), display(rendered, dataset.color_space), error, sigma, coloured, shaded)
+    shown = Channels(color_space=dataset.color_space).display
+    return Panels(title(model), shown(truth), shown(rendered), error, sigma, coloured, shaded)
 
 
 def density_slice(model: Primitives, view: View, center: Tensor) -> Tensor:

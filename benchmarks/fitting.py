@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from neuprim.config import RunConfig
+from neuprim.core.channels import channels_of
 from neuprim.core.train.trainer import Trainer
 from neuprim.measure import measure, summary
+from neuprim.plugins.registry import load_task
 
 __all__ = ["finish"]
 
@@ -19,5 +21,6 @@ def finish(config: RunConfig, trainer: Trainer) -> dict[str, Any]:
         field.set_progress(1.0)
     size = 4 * sum(v.numel() for v in trainer.model.params.values())
     training = {"iterations": trainer.step, "train_seconds": trainer.elapsed}
-    views = measure(trainer.model, trainer.dataset, config.renderer)
-    return summary(config, trainer.model, trainer.dataset, views, size, training)
+    channels = channels_of(load_task(config.task), trainer.dataset)
+    views = measure(trainer.model, trainer.dataset, config.renderer, channels)
+    return summary(config, trainer.model, trainer.dataset, channels, views, size, training)

@@ -24,13 +24,14 @@ from tables import ROOT, Table, between_markers
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.channels import Channels
 from neuprim.core.data import View
 from neuprim.core.environment import Environment
 from neuprim.core.images import write_exr, write_png
 from neuprim.core.metrics import psnr
 from neuprim.core.solids.raycast import Scene
 from neuprim.evaluate import load_dataset, load_run
-from neuprim.measure import display, draw_sum
+from neuprim.measure import draw_sum
 from neuprim.tasks.relight.environment import illuminate
 from neuprim.tasks.relight.lit.generate import INTENSITY, picture
 from neuprim.tasks.relight.lit.scene import solids
@@ -123,7 +124,7 @@ def main() -> None:
             planes = radiance.clamp(0, 1).movedim(-1, 0)[None]
             small = torch.nn.functional.interpolate(planes, size=(PIXELS // 2, PIXELS), mode="bilinear", antialias=True)[0].movedim(0, -1)
             images = [small, truth(scene, camera, lights, 3).float(), drawn]
-            columns.append(torch.cat([display(x, "linear").clamp(0, 1) for x in images]))
+            columns.append(torch.cat([Channels(color_space="linear").display(x).clamp(0, 1) for x in images]))
     if args.picture:
         write_png(args.picture, torch.cat(columns, 1))
     if args.record:

@@ -135,7 +135,7 @@ def _parsers(with_tasks: bool) -> tuple[Parser, dict[str, argparse.ArgumentParse
     render.add_argument("run_dir", type=Path, metavar="RUN_DIR")
     render.add_argument("--camera", required=True, metavar="orbit|test|FILE.json", help="which cameras")
     render.add_argument("--size", type=arguments.size, metavar="WxH", help="pixels (default: the data set's)")
-    render.add_argument("--format", choices=("png", "exr", "webp", "gif", "mp4"), help="default: png, or webp for an animation")
+    render.add_argument("--format", choices=("png", "exr", "npy", "webp", "gif", "mp4"), help="default: png, or webp for an animation")
     render.add_argument(
         "--fps", type=arguments.rate, metavar="F", help="frames per second of an animation (default: about four seconds in all)"
     )

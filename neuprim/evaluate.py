@@ -14,24 +14,26 @@ import torch
 from neuprim.config import RunConfig, scene_of, task_of
 from neuprim.core import images
 from neuprim.core.camera_file import read_cameras
+from neuprim.core.channels import Channels, channels_of, stored_channels
 from neuprim.core.checkpoint import load_model
 from neuprim.core.data import Dataset, View
 from neuprim.core.datasets.records import Record
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.fields import Conditions
-from neuprim.core.files import cache_directory
+from neuprim.core.files import cache_directory, write_npy
 from neuprim.core.film import write_film
 from neuprim.core.primitives import Primitives
 from neuprim.core.task import SceneContext, TaskSpec
-from neuprim.measure import display, draw, draw_sum, measure, summary
+from neuprim.measure import draw, draw_sum, measure, summary
 from neuprim.plugins.provenance import warn_of_neuprim
 
 __all__ = ["FORMATS", "evaluate_run", "load_dataset", "load_run", "read_metrics", "render_run"]
 
 ANIMATIONS = ("webp", "gif", "mp4")
-FORMATS = ("png", "exr", *ANIMATIONS)
-"""What ``neuprim render`` writes."""
+_RAW = ("exr", "npy")
+FORMATS = ("png", "exr", "npy", *ANIMATIONS)
+"""What ``neuprim render`` writes: pictures of what the task's channels look like, but all channels as they are in EXR and npy."""
 
 
 def load_dataset(
@@ -71,8 +73,9 @@ def evaluate_run(run_dir: Path) -> dict[str, Any]:
     dataset = load_dataset(config, task, file=run_dir / "config.yaml")
     path = run_dir / "model.safetensors"
     training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
-    views = measure(model, dataset, config.renderer)
-    return summary(config, model, dataset, views, path.stat().st_size, training)
+    channels = channels_of(task, dataset)
+    views = measure(model, dataset, config.renderer, channels)
+    return summary(config, model, dataset, channels, views, path.stat().st_size, training)
 
 
 def render_run(
@@ -106,7 +109,7 @@ def render_run(
     """
     config, task, model, header = load_run(run_dir)
     background = torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)])
-    color_space = str(header.get("color_space", "srgb"))
+    channels = stored_channels(run_dir, header, task, model.colour.channels)
     lights: Sequence[Conditions] = ()
     if environment is not None:
         around = _illumination(environment, config, task, header, conditions)
@@ -127,6 +130,8 @@ def render_run(
         views = [replace(v, conditions={**v.conditions, **lights[0]}) for v in views]
     views, animated = with_conditions(views, task, conditions)
     format = format or _format_of(out, animated)
+    if channels.partial and format not in _RAW:
+        tell(f"shown: {channels.shown}; --format exr and npy hold all channels")
 
     single = out is not None and out.suffix.lower() == f".{format}"
     folder = out if out is not None and not single else run_dir / "renders" / camera.removesuffix(".json").split("/")[-1]
@@ -153,24 +158,31 @@ def render_run(
     if animate:
         target = out if single and out is not None else folder.with_suffix(f".{format}")
         target.parent.mkdir(parents=True, exist_ok=True)
-        stack = [display(image(v), color_space) for v in views]
+        stack = [channels.display(image(v)) for v in views]
         write_film(target, stack, fps or min(30.0, max(len(views) / 4.0, 5.0)))
         return [target]
     paths = []
     for v in views:
         path = out if single and out is not None else folder / f"{_file_name(v.name)}.{format}"
         path.parent.mkdir(parents=True, exist_ok=True)
-        pixels = image(v)
-        if format == "exr":
-            images.write_exr(path, pixels if color_space == "linear" else images.srgb_to_linear(pixels.clamp_min(0.0)), half=False)
-        elif format == "png":
-            images.write_png(path, display(pixels, color_space))
-        elif format == "webp":
-            images.write_webp(path, display(pixels, color_space))
-        else:
-            write_film(path, [display(pixels, color_space)], fps or 12.0)
+        _write(path, format, image(v), channels, fps)
         paths.append(path)
     return paths
+
+
+def _write(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fps: float | None) -> None:
+    """One image: all channels, linear in EXR and as the data set has them in npy; or what its channels look like."""
+    if format == "exr":
+        linear = pixels if channels.color_space == "linear" else images.srgb_to_linear(pixels.clamp_min(0.0))
+        images.write_exr(path, linear, half=False, names=channels.names)
+    elif format == "npy":
+        write_npy(path, pixels.contiguous().numpy())
+    elif format == "png":
+        images.write_png(path, channels.display(pixels))
+    elif format == "webp":
+        images.write_webp(path, channels.display(pixels))
+    else:
+        write_film(path, [channels.display(pixels)], fps or 12.0)
 
 
 def _illumination(

@@ -85,6 +85,8 @@ def inspect_run(request: Request) -> list[Path]:
     if request.against is None and any(i.shows == "both" for i in inspectors):
         raise ConfigError("--show difference: there is no ground truth; give --against FILE.vdb, DIR or scene")
     film = _Film(request)
+    if film.channels.partial and any(i.shows == "model" for i in inspectors):
+        request.say(f"shown: {film.channels.shown}")
     if kind == ".html":
         assert request.out is not None
         write_page(request.out, film, inspectors)
@@ -131,7 +133,7 @@ class _Film:
         run = trained_model(request.run_dir)
         self.model = run.model
         self.truth: DensityTruth | None = None
-        self.color_space, self.needed = str(run.header.get("color_space", "srgb")), tuple(c.name for c in run.task.conditions)
+        self.channels, self.needed = run.channels, tuple(c.name for c in run.task.conditions)
         self.up = request.up or str(run.scene.get("up", "z"))
         self.up = self.up if self.up in ("x", "y", "z") else "z"
         self.options, self.name = request.options, request.run_dir.resolve().name
@@ -196,7 +198,7 @@ class _Film:
         """A fresh frame; its grids live as long as it does."""
         conditions, number = self.pairs[index]
         made = FieldFrame(self.model, conditions, in_words(conditions), self.matrix, self.shape, self.top, self.gain, self.focus)
-        made = replace(made, color_space=self.color_space, needed=self.needed, options=self.options, numbers=self.numbers[index])
+        made = replace(made, channels=self.channels, needed=self.needed, options=self.options, numbers=self.numbers[index])
         truth = self.truth
         if truth is None:
             return made

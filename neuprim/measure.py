@@ -1,7 +1,8 @@
 """The numbers of a fitted model: every held-out view, their means, and what the data set adds.
 
 PSNR and SSIM compare float images in the data set's own colour space, unclamped and unquantised. A linear data set also gets
-both after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``). Where it marks a part of its views (the union of all that a
+both after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``), if its channels are red, green and blue; a task with a display
+of its own gets both of what that shows instead (``psnr_display``, ``ssim_display``). Where it marks a part of its views (the union of all that a
 camera ever sees of a volume), the error there counts on its own: a black background flatters.
 """
 
@@ -20,13 +21,14 @@ from torch import Tensor
 import neuprim
 from neuprim.config import RunConfig
 from neuprim.core import images
+from neuprim.core.channels import Channels
 from neuprim.core.data import Dataset, View
 from neuprim.core.fields import Conditions
 from neuprim.core.metrics import means, psnr, ssim, to_json
 from neuprim.core.primitives import Primitives
 from neuprim.core.render import RenderSettings, choose_backend, render
 
-__all__ = ["ViewMetrics", "display", "draw", "draw_sum", "measure", "summary"]
+__all__ = ["ViewMetrics", "draw", "draw_sum", "measure", "summary"]
 
 
 @dataclass(frozen=True)
@@ -36,8 +38,8 @@ class ViewMetrics:
     Attributes:
         psnr, ssim: in the data set's colour space.
         seconds: of the forward pass alone.
-        more: further numbers by name: ``psnr_srgb``, ``ssim_srgb`` of linear images; ``psnr_mask`` and ``mse_mask`` inside the
-            data set's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without anything on it; what
+        more: further numbers by name: ``psnr_srgb``, ``ssim_srgb`` of linear images, or ``psnr_display``, ``ssim_display`` of what the
+            task's own display shows; ``psnr_mask`` and ``mse_mask`` inside the data set's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without anything on it; what
             :meth:`~neuprim.core.data.Dataset.judge` adds.
     """
 
@@ -79,19 +81,11 @@ def draw_sum(
     return (total + (1.0 - alpha.double())[..., None] * background.double()).to(frame.rgb)
 
 
-def display(image: Tensor, color_space: str) -> Tensor:
-    """(H, W, 3) display-referred copy of a rendered image: linear values get the sRGB curve, one channel becomes grey."""
-    if image.shape[-1] == 1:
-        image = image.expand(-1, -1, 3)
-    elif image.shape[-1] != 3:
-        image = torch.nn.functional.pad(image[..., :3], (0, 3 - min(image.shape[-1], 3)))
-    return images.linear_to_srgb(image.clamp_min(0.0)) if color_space == "linear" else image
-
-
 def measure(
     model: Primitives,
     dataset: Dataset,
     settings: RenderSettings,
+    channels: Channels,
     seen: Callable[[int, View, Tensor, Tensor], None] | None = None,
 ) -> list[ViewMetrics]:
     """Every view of the test split, composited over the data set's background.
@@ -108,16 +102,21 @@ def measure(
         seconds = time.perf_counter() - start
         if pixels.mask is not None:
             rendered = torch.where(pixels.mask[..., None], rendered, truth)
-        more = _more(rendered, truth, dataset, dataset.mask(i), pixels.mask) | dataset.judge(i, rendered, truth)
+        more = _more(rendered, truth, dataset, channels, dataset.mask(i), pixels.mask) | dataset.judge(i, rendered, truth)
         result.append(ViewMetrics(view.name, psnr(rendered, truth, pixels.mask), ssim(rendered, truth), seconds, more))
         if seen is not None:
             seen(i, view, rendered, truth)
     return result
 
 
-def _more(rendered: Tensor, truth: Tensor, dataset: Dataset, part: Tensor | None, valid: Tensor | None) -> dict[str, float]:
+def _more(
+    rendered: Tensor, truth: Tensor, dataset: Dataset, channels: Channels, part: Tensor | None, valid: Tensor | None
+) -> dict[str, float]:
     more: dict[str, float] = {}
-    if dataset.color_space == "linear":
+    if channels.own is not None:
+        shown, wanted = channels.display(rendered), channels.display(truth)
+        more |= {"psnr_display": psnr(shown, wanted, valid), "ssim_display": ssim(shown, wanted)}
+    elif dataset.color_space == "linear" and channels.plain:
         shown, wanted = (images.linear_to_srgb(x.clamp_min(0.0)) for x in (rendered, truth))
         more |= {"psnr_srgb": psnr(shown, wanted, valid), "ssim_srgb": ssim(shown, wanted)}
     if part is not None and bool(part.any()):
@@ -129,7 +128,13 @@ def _more(rendered: Tensor, truth: Tensor, dataset: Dataset, part: Tensor | None
 
 
 def summary(
-    config: RunConfig, model: Primitives, dataset: Dataset, views: Sequence[ViewMetrics], model_bytes: int, training: Mapping[str, Any]
+    config: RunConfig,
+    model: Primitives,
+    dataset: Dataset,
+    channels: Channels,
+    views: Sequence[ViewMetrics],
+    model_bytes: int,
+    training: Mapping[str, Any],
 ) -> dict[str, Any]:
     """The content of ``metrics.json``. ``training`` holds iterations and train_seconds as the run recorded them."""
     worst = min(views, key=lambda v: v.psnr)
@@ -160,6 +165,8 @@ def summary(
         "downsampling": dataset.downsampling,
         "background": [round(float(x), 6) for x in dataset.background],
         "color_space": dataset.color_space,
+        "channels": list(channels.names),
+        **({"shown": channels.shown} if channels.shown else {}),
         "data_source": dataset.data_source,
         "train_views": len(dataset.train),
         "seed": config.seed,

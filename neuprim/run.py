@@ -18,15 +18,16 @@ from rich.console import Console
 
 from neuprim.config import RunConfig, made_now, task_of
 from neuprim.core import checkpoint, images
+from neuprim.core.channels import Channels, channels_of
 from neuprim.core.data import Clip, Dataset, View
-from neuprim.core.errors import CheckpointError, DataError
+from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.files import write_json, write_text
 from neuprim.core.primitives import Primitives
 from neuprim.core.render import choose_backend
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer, initial_model
 from neuprim.evaluate import load_dataset
-from neuprim.measure import display, draw, measure, summary
+from neuprim.measure import draw, measure, summary
 from neuprim.plugins.provenance import check_resumed
 from neuprim.plugins.registry import load_loss
 from neuprim.progress import RunProgress
@@ -60,6 +61,9 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
         dataset = load_dataset(config, task, progress.preparing)
         if len(dataset.test) == 0:
             raise DataError(f"{dataset.name}: the test split is empty")
+        channels = channels_of(task, dataset)
+        if channels.partial:
+            progress.note(f"shown: {channels.shown}; task {task.name!r} has no display that shows them all")
         progress.preparing("starting points", 0.0)
         trainer = make_trainer(config, task, dataset)
         saved = directory / "checkpoint.safetensors"
@@ -75,9 +79,9 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
         if kernels.running:
             progress.preparing(_COMPILING, 0.0)
             kernels.wait()
-        interrupted = _train(trainer, config, dataset, progress)
+        interrupted = _train(trainer, config, dataset, channels, progress)
         progress.finishing("measuring held-out views")
-        _finish(trainer, config, dataset, directory)
+        _finish(trainer, config, dataset, channels, directory)
     if interrupted:
         raise KeyboardInterrupt
     return directory
@@ -87,10 +91,15 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset) -> Trainer
     """A fresh model of a run's configuration and what fits it.
 
     Raises:
-        ConfigError: a rate or starting value for something the model does not have, or a loss that does not exist.
+        ConfigError: a rate or starting value for something the model does not have, a loss that does not exist, or a colour of another
+            number of channels than the data.
         DataError: the data set offers no starting point.
     """
     density, colour = task.build({**vars(config.model), "options": config.options}, dataset)
+    if colour.channels != dataset.channels:
+        raise ConfigError(
+            f"task {task.name!r} built a colour of {colour.channels} channels; expected {dataset.channels}, as in {dataset.name}"
+        )
     model = initial_model(density, colour, dataset, config.model, config.seed)
     # A preset has rates for every density and colour of its task; the trainer refuses names that the model does not have.
     others = task.parameter_names() - model.params.keys()
@@ -100,7 +109,7 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset) -> Trainer
     return Trainer(model, dataset, loss, settings, config.renderer, config.seed)
 
 
-def _train(trainer: Trainer, config: RunConfig, dataset: Dataset, progress: RunProgress) -> bool:
+def _train(trainer: Trainer, config: RunConfig, dataset: Dataset, channels: Channels, progress: RunProgress) -> bool:
     """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
     directory = config.output_dir
     view = trainer.dataset.train.view(0)
@@ -130,22 +139,23 @@ def _train(trainer: Trainer, config: RunConfig, dataset: Dataset, progress: RunP
                 curve.write(json.dumps(line) + "\n")
                 curve.flush()
             if time.monotonic() - last_saved > config.train.checkpoint_every_seconds:
-                _save(trainer, config, dataset)
+                _save(trainer, config, dataset, channels)
                 last_saved = time.monotonic()
             if stop.is_set():
                 interrupted = True
                 break
-    _save(trainer, config, dataset)
+    _save(trainer, config, dataset, channels)
     return interrupted
 
 
-def _save(trainer: Trainer, config: RunConfig, dataset: Dataset) -> None:
+def _save(trainer: Trainer, config: RunConfig, dataset: Dataset, channels: Channels) -> None:
     tensors, header = trainer.state()
     made_by = {} if config.made_by is None else {"made_by": config.made_by.to_dict()}
     checkpoint.write(config.output_dir / "checkpoint.safetensors", "checkpoint", tensors, {"task": config.task, **made_by, **header})
     extra: dict[str, Any] = {
         "background": [float(x) for x in dataset.background],
         "color_space": dataset.color_space,
+        "channels": list(channels.names),
         "data_source": dataset.data_source,
         "data": dataset.facts(),
         "iterations": trainer.step,
@@ -157,7 +167,7 @@ def _save(trainer: Trainer, config: RunConfig, dataset: Dataset) -> None:
     checkpoint.save_model(config.output_dir / "model.safetensors", trainer.model, config.task, extra)
 
 
-def _finish(trainer: Trainer, config: RunConfig, dataset: Dataset, directory: Path) -> None:
+def _finish(trainer: Trainer, config: RunConfig, dataset: Dataset, channels: Channels, directory: Path) -> None:
     """Metrics, pictures and report of the last checkpoint, from the same tensors that lie on disk."""
     model = trainer.model
     for field in (model.density, model.colour):
@@ -172,7 +182,7 @@ def _finish(trainer: Trainer, config: RunConfig, dataset: Dataset, directory: Pa
     pictures: list[torch.Tensor] = []
 
     def film(clip: Clip, index: int, rendered: torch.Tensor, truth: torch.Tensor) -> None:
-        pictures.append(images.to_uint8(torch.cat([display(x, dataset.color_space) for x in (truth, rendered)], dim=1)))
+        pictures.append(images.to_uint8(torch.cat([channels.display(x) for x in (truth, rendered)], dim=1)))
         if index == clip.views[-1]:
             images.write_animation(folder / f"clip_{clip.name}.webp", pictures, clip.fps)
             pictures.clear()
@@ -183,11 +193,11 @@ def _finish(trainer: Trainer, config: RunConfig, dataset: Dataset, directory: Pa
             film(clip, index, rendered, truth)
         if index in shown:
             stem = f"test_{index:03d}_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in view.name)
-            images.write_png(folder / f"{stem}.png", display(rendered, dataset.color_space))
-            images.write_png(folder / f"{stem}_truth.png", display(truth, dataset.color_space))
+            images.write_png(folder / f"{stem}.png", channels.display(rendered))
+            images.write_png(folder / f"{stem}_truth.png", channels.display(truth))
             images.write_png(folder / f"{stem}_error.png", torch.from_numpy(error_map(rendered, truth)))
 
-    views = measure(model, dataset, config.renderer, keep)
+    views = measure(model, dataset, config.renderer, channels, keep)
     for clip in clips:
         if clip.source is None:
             continue  # drawn above
@@ -196,8 +206,8 @@ def _finish(trainer: Trainer, config: RunConfig, dataset: Dataset, directory: Pa
             film(clip, i, draw(model, clip.source.view(i), config.renderer, dataset.background), truth)
     size = (directory / "model.safetensors").stat().st_size
     training = {"iterations": trainer.step, "train_seconds": trainer.elapsed}
-    write_json(directory / "metrics.json", summary(config, model, dataset, views, size, training))
-    frames = [display(draw(model, v, config.renderer, dataset.background), dataset.color_space) for v in dataset.orbit(_ORBIT_FRAMES)]
+    write_json(directory / "metrics.json", summary(config, model, dataset, channels, views, size, training))
+    frames = [channels.display(draw(model, v, config.renderer, dataset.background)) for v in dataset.orbit(_ORBIT_FRAMES)]
     images.write_animation(folder / "orbit.webp", frames, fps=12.0)
     write_report(directory)
 

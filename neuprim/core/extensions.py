@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from neuprim.core.channels import Channels, stored_channels
 from neuprim.core.data import Dataset
 from neuprim.core.primitives import Primitives
 from neuprim.core.render.settings import RenderSettings
@@ -43,6 +44,15 @@ class TrainedModel:
     settings: RenderSettings
     dataset: Callable[[], Dataset]
     volume: Callable[[], VolumeSource | None] = lambda: None
+
+    @property
+    def channels(self) -> Channels:
+        """What its colours are called, and what they look like.
+
+        Raises:
+            CheckpointError: the header names others than the model has.
+        """
+        return stored_channels(self.directory, self.header, self.task, self.model.colour.channels)
 
 
 @dataclass(frozen=True)

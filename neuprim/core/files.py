@@ -10,9 +10,12 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["atomic_path", "cache_directory", "publish_folder", "write_json", "write_text"]
+if TYPE_CHECKING:
+    import numpy as np
+
+__all__ = ["atomic_path", "cache_directory", "publish_folder", "write_json", "write_npy", "write_text"]
 
 
 def cache_directory() -> Path:
@@ -86,3 +89,11 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write strict JSON (no NaN) atomically."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+def write_npy(path: Path, values: np.ndarray) -> None:
+    """Write an array as ``numpy.load(path, allow_pickle=False)`` reads it, atomically."""
+    import numpy as np
+
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.save(file, values, allow_pickle=False)

@@ -21,12 +21,14 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from neuprim.core.channel_names import names_fault
 from neuprim.core.errors import DataError
 from neuprim.core.files import atomic_path
 
 __all__ = [
     "MAX_PIXELS",
     "ImageInfo",
+    "exr_channels",
     "image_info",
     "linear_to_srgb",
     "read_image",
@@ -45,6 +47,7 @@ MAX_PIXELS = 64 * 2**20
 _MAX_FLOATS = 16 * MAX_PIXELS
 """Most channel values in one OpenEXR file, as all of its channels are decoded together."""
 
+_EXR = b"\x76\x2f\x31\x01"
 _PNG_KINDS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 
 
@@ -54,7 +57,7 @@ class ImageInfo:
 
     Attributes:
         width, height: pixels.
-        channels: 3 (RGB) or 4 (RGBA).
+        channels: 3 (RGB) or 4 (RGBA), or as many as were asked for by name.
         linear: True for OpenEXR (linear light, premultiplied alpha), False for PNG/JPEG (sRGB, straight alpha).
     """
 
@@ -67,33 +70,45 @@ class ImageInfo:
 # ---------------------------------------------------------------- reading
 
 
-def image_info(path: Path) -> ImageInfo:
-    """Size and channels of an image from its header alone.
+def image_info(path: Path, channels: Sequence[str] | None = None) -> ImageInfo:
+    """Size and channels of an image from its header alone; ``channels`` as of :func:`read_image`.
 
     Raises:
-        DataError: missing, empty, not PNG/JPEG/OpenEXR, not 8-bit RGB(A) or float RGB(A), or larger than :data:`MAX_PIXELS`.
+        DataError: missing, empty, not PNG/JPEG/OpenEXR, not 8-bit RGB(A) or float RGB(A), without a channel that was asked for, or larger
+            than :data:`MAX_PIXELS`.
     """
-    if _is_exr(path):
-        names, width, height = _exr_layout(path)
+    if _is_exr(path, channels is not None):
+        names, width, height = _exr_layout(path, channels)
         return ImageInfo(width, height, len(names), True)
     with _open_pillow(path) as image:
         _check_rgb8(path, image)
         return ImageInfo(image.width, image.height, len(image.getbands()), False)
 
 
-def read_image(path: Path, size: tuple[int, int] | None = None) -> Tensor:
+def exr_channels(path: Path) -> tuple[str, ...]:
+    """Names of all channels of an OpenEXR file, in the file's own order, which is that of the alphabet.
+
+    Raises:
+        DataError: missing, empty, damaged, another format, or larger than :data:`MAX_PIXELS`.
+    """
+    _is_exr(path, named=True)
+    return tuple(_exr_header(path)[0])
+
+
+def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequence[str] | None = None) -> Tensor:
     """(H, W, 3 or 4) pixels as stored: uint8 sRGB with straight alpha (PNG, JPEG), or linear premultiplied float (OpenEXR).
 
     OpenEXR values come as float16 or float32, as in the file, and are never clamped.
 
     Args:
         size: expected (width, height); any other is an error.
+        channels: names of the channels C of an OpenEXR file to read in their stead, in this order, as (H, W, C).
 
     Raises:
         DataError: as :func:`image_info`; also for truncated or corrupt data, a wrong size, NaN or infinite values.
     """
-    if _is_exr(path):
-        names, width, height = _exr_layout(path)
+    if _is_exr(path, channels is not None):
+        names, width, height = _exr_layout(path, channels)
         _check_size(path, width, height, size)
         return _read_exr(path, names, width, height)
     with _open_pillow(path) as image:
@@ -126,7 +141,7 @@ def _check_size(path: Path, width: int, height: int, size: tuple[int, int] | Non
         raise DataError(f"{path}: image is {width}x{height}; expected {size[0]}x{size[1]}")
 
 
-def _is_exr(path: Path) -> bool:
+def _is_exr(path: Path, named: bool = False) -> bool:
     try:
         with open(path, "rb") as file:
             head = file.read(8)
@@ -136,7 +151,9 @@ def _is_exr(path: Path) -> bool:
         raise DataError(f"{path}: cannot be read ({error.strerror or error}); expected an image") from None
     if not head:
         raise DataError(f"{path}: file is empty; expected an image")
-    return head[:4] == b"\x76\x2f\x31\x01"
+    if named and head[:4] != _EXR:
+        raise DataError(f"{path}: not an OpenEXR file; expected one, as channels have names in no other")
+    return head[:4] == _EXR
 
 
 @contextmanager
@@ -200,8 +217,8 @@ def _decode(path: Path, image: Image.Image) -> np.ndarray:
     return np.array(image)
 
 
-def _exr_layout(path: Path) -> tuple[list[str], int, int]:
-    """Names of the R, G, B(, A) channels, width and height, from the header."""
+def _exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
+    """Channels by name, width and height."""
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
             parts = len(file.parts)
@@ -223,11 +240,20 @@ def _exr_layout(path: Path) -> tuple[list[str], int, int]:
         raise DataError(
             f"{path}: header claims {len(channels)} channels of {width}x{height} pixels; at most {_MAX_FLOATS} values are accepted"
         )
-    layers = [name[:-1] for name in channels if name.endswith("R") and {name[:-1] + "G", name[:-1] + "B"} <= channels.keys()]
-    layers = [""] if "" in layers else layers
-    if len(layers) != 1:
-        raise DataError(f"{path}: OpenEXR channels are {', '.join(channels) or 'none'}; expected R, G, B and optionally A, of one layer")
-    names = [layers[0] + c for c in "RGBA" if layers[0] + c in channels]
+    return channels, width, height
+
+
+def _exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[list[str], int, int]:
+    """Names of the wanted channels, or of R, G, B(, A), width and height, from the header."""
+    channels, width, height = _exr_header(path)
+    names, expected = list(wanted or ()), ", ".join(wanted or ())
+    if wanted is None:
+        layers = [name[:-1] for name in channels if name.endswith("R") and {name[:-1] + "G", name[:-1] + "B"} <= channels.keys()]
+        layers = [""] if "" in layers else layers
+        names = [layers[0] + c for c in "RGBA" if layers[0] + c in channels] if len(layers) == 1 else []
+        expected = "R, G, B and optionally A, of one layer"
+    if not names or not set(names) <= channels.keys():
+        raise DataError(f"{path}: OpenEXR channels are {', '.join(channels) or 'none'}; expected {expected or 'some to be asked for'}")
     if any(channels[n].xSampling != 1 or channels[n].ySampling != 1 for n in names):
         raise DataError(f"{path}: OpenEXR colour channels are subsampled; expected one value per pixel")
     return names, width, height
@@ -337,24 +363,31 @@ def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: i
     _save(path, images[0], kind, save_all=True, append_images=images[1:], duration=duration, loop=0, **options)
 
 
-def write_exr(path: Path, image: Tensor, half: bool = True, extra: Mapping[str, Tensor] | None = None) -> None:
-    """Write (H, W, 3 or 4) *linear* values, alpha premultiplied, as OpenEXR without clamping; atomic.
+def write_exr(
+    path: Path, image: Tensor, half: bool = True, extra: Mapping[str, Tensor] | None = None, names: Sequence[str] | None = None
+) -> None:
+    """Write (H, W, 3 or 4) *linear* values, alpha premultiplied, or channels of other names as OpenEXR without clamping; atomic.
 
     Args:
         half: store colour as 16-bit instead of 32-bit floats.
         extra: further channels by name, each (H, W), stored as 32-bit floats, e.g. ``{"Z": depth}``.
+        names: of the channels C of an (H, W, C) image that is not R, G, B(, A).
 
     Raises:
-        DataError: wrong shapes, colour values that are not finite or (with ``half``) beyond 65504, or the file cannot be written.
+        DataError: wrong shapes or names, colour values that are not finite or (with ``half``) beyond 65504, or the file cannot be written.
     """
-    if image.ndim != 3 or image.shape[-1] not in (3, 4) or 0 in image.shape:
-        raise DataError(f"{path}: image to write has shape {tuple(image.shape)}; expected (H, W, 3) or (H, W, 4)")
+    wrong = None if names is None else names_fault(names)
+    if wrong:
+        raise DataError(f"{path}: names{wrong}")
+    if image.ndim != 3 or 0 in image.shape or (image.shape[-1] not in (3, 4) if names is None else image.shape[-1] != len(names)):
+        expected = "(H, W, 3) or (H, W, 4)" if names is None else f"(H, W, {len(names)}), for the channels {', '.join(names)}"
+        raise DataError(f"{path}: image to write has shape {tuple(image.shape)}; expected {expected}")
     pixels = image.detach().cpu().float().numpy()
     _check_finite(path, pixels)
     if half and np.abs(pixels).max() > 65504.0:
         raise DataError(f"{path}: value {np.abs(pixels).max():.6g} does not fit 16-bit floats (65504); write with half=False")
     kind = np.float16 if half else np.float32
-    channels = {c: np.ascontiguousarray(pixels[..., i], dtype=kind) for i, c in enumerate("RGBA"[: pixels.shape[-1]])}
+    channels = {c: np.ascontiguousarray(pixels[..., i], dtype=kind) for i, c in enumerate(names or "RGBA"[: pixels.shape[-1]])}
     for name, plane in (extra or {}).items():
         if tuple(plane.shape) != tuple(image.shape[:2]) or name in channels:
             raise DataError(

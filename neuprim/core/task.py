@@ -9,6 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
+from neuprim.core.channels import Display
 from neuprim.core.data import Dataset
 from neuprim.core.environment import Environment, Illumination
 from neuprim.core.fields import ColourField, ConditionSpec, DensityField, Field
@@ -90,6 +91,13 @@ class TaskSpec:
     """A tiny data set, made in memory, that the checks of :mod:`neuprim.plugins.conformance` use in place of their own: for tasks
     whose fields ask for something beside posed images and conditions within their ranges. Images of about 10 x 10 pixels will do."""
     environment: Illuminate | None = None
+    channels: tuple[str, ...] = ()
+    """What the channels of its images are called, e.g. ``("450nm", "550nm")``, in files and wherever they are listed; a data set with
+    another number of them is refused. Empty: R, G, B for three channels, Y for one, else c0, c1, ..."""
+    display: Display | None = None
+    """What pictures show: (H, W, C) colours in the data set's colour space -> (H, W, 3) sRGB values 0..1. It must take each pixel by
+    itself, as it also gets the colours of primitives, as an image one pixel high. None: three channels are red, green and blue, one is
+    grey, and of others the first three are shown."""
 
     def parameter_names(self) -> set[str]:
         """Names of the parameters that the task's fields have at any settings.

@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Mapping
 from typing import Any
 
+from neuprim.core.channel_names import names_fault
 from neuprim.core.extensions import Exporter, Inspector, LossExtension, SceneExtension
 from neuprim.core.fields import ConditionSpec, Field
 from neuprim.core.task import SceneSpec, TaskSpec
@@ -76,6 +77,13 @@ def _task(spec: TaskSpec) -> str | None:
             return f"fields[{name!r}] lacks the methods {lacking}"
     if spec.example is not None and not callable(spec.example):
         return f"example is of type {type(spec.example).__name__}; expected a function or None"
+    if not isinstance(spec.channels, tuple | list):
+        return f"channels is of type {type(spec.channels).__name__}; expected a tuple of names"
+    wrong = names_fault(spec.channels)
+    if wrong:
+        return f"channels{wrong}"
+    if spec.display is not None and not callable(spec.display):
+        return f"display is of type {type(spec.display).__name__}; expected a function or None"
     return None
 
 

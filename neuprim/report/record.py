@@ -64,6 +64,11 @@ class RunRecord:
         """A value of ``metrics.json``, None where the file or the key is missing."""
         return None if self.metrics is None else self.metrics.get(key)
 
+    @property
+    def shown(self) -> str:
+        """What pictures show of the channels, in words; empty where they are red, green and blue, or grey."""
+        return str(self.field("shown") or "")
+
     def name_of(self, key: str) -> str | None:
         """The task's or scene's name: from the metrics, else from the config (a string, or a section with ``name``)."""
         value = self.field(key)

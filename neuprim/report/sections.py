@@ -75,7 +75,8 @@ def headline(run: RunRecord) -> str:
         rule = "Metrics of the last checkpoint, not the best." if kept in (None, "last") else f"Metrics of checkpoint “{escape(kept)}”."
         html += f'<p class="rule">{rule}</p>'
     if run.orbit is not None:
-        picture = _figure(inline(run.orbit), "camera orbit", "camera orbit around the scene", exists=True)
+        caption = "camera orbit" + (f"; shown: {escape(run.shown)}" if run.shown else "")
+        picture = _figure(inline(run.orbit), caption, "camera orbit around the scene", exists=True)
         html = f'<div class="with-orbit"><div>{html}</div><div class="orbit">{picture}</div></div>'
     return html
 
@@ -152,7 +153,12 @@ def films(run: RunRecord) -> str:
     for path in run.clips:
         name = escape(path.stem.removeprefix("clip_"))
         figures.append(_figure(inline(path), f"{name}: ground truth, render", f"film of {name}, ground truth beside render", exists=True))
-    return _section("Held-out films", f'<div class="films">{"".join(figures)}</div>') if figures else ""
+    return _section("Held-out films", f'{_shown(run)}<div class="films">{"".join(figures)}</div>') if figures else ""
+
+
+def _shown(run: RunRecord) -> str:
+    """A line that says what pictures show of the channels, where these are more than a picture is made of anyway."""
+    return f'<p class="note">Shown: {escape(run.shown)}.</p>' if run.shown else ""
 
 
 def held_out(run: RunRecord) -> str:
@@ -170,12 +176,12 @@ def held_out(run: RunRecord) -> str:
         notes.append("Large pictures are compressed on this page (WebP, quality 90); the PNG files in renders/ are exact.")
     ticks = "".join(f"<span>{'≥ ' if i == 4 else ''}{ERROR_SCALE * i / 4:g}</span>" for i in range(5))
     bar = (
-        f'<div class="scale"><p>Error: mean absolute difference over channels</p><div class="bar" style="background: {color_bar()}"></div>'
+        f'<div class="scale"><p>Error: mean absolute difference over {"all " if run.shown else ""}channels</p><div class="bar" style="background: {color_bar()}"></div>'
         f'<div class="ticks">{ticks}</div></div>'
     )
     rows = "".join(_view_row(run, view, row) for view, row in pictures)
     note = f'<p class="note">{" ".join(notes)}</p>' if notes else ""
-    return _section("Held-out views", f"{bar}{rows}{note}")
+    return _section("Held-out views", f"{_shown(run)}{bar}{rows}{note}")
 
 
 def _picture(view: ViewFiles, kind: str) -> Inlined | None:
@@ -284,6 +290,8 @@ def facts(run: RunRecord) -> str:
     """Where the numbers come from: split, data, machine, versions."""
     keys = ("split", "data_source", "color_space", "downsampling", "background", "seed", "iterations", "checkpoint", "backend", "device")
     pairs = [(key.replace("_", " ").replace("color", "colour"), escape(run.field(key))) for key in keys]
+    channels = run.field("channels")
+    pairs.insert(3, ("channels", escape(", ".join(map(str, channels)) if isinstance(channels, list) else channels)))
     versions = run.field("versions")
     if isinstance(versions, Mapping):
         pairs += [(escape(name), escape(value)) for name, value in versions.items()]

@@ -32,7 +32,7 @@ def value_and_grad(loss, rendered: Tensor, truth: Tensor) -> tuple[float, Tensor
 
 
 @pytest.mark.parametrize("size", SIZES, ids=lambda s: f"{s[0]}x{s[1]}")
-@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("channels", [1, 2, 3, 5, 31])
 @pytest.mark.parametrize("weight", [0.2, 1.0])
 def test_fused_equals_kornia(size: tuple[int, int], channels: int, weight: float) -> None:
     rendered, truth = pair(*size, channels)

@@ -168,3 +168,13 @@ def test_infinite_values_survive_strict_json() -> None:
     assert from_json({}, "psnr") is None
     assert from_json({"psnr": True}, "psnr") is None
     assert from_json({"psnr": "12"}, "psnr") is None
+
+
+@pytest.mark.parametrize("channels", [1, 2, 5, 31])
+def test_any_number_of_channels_is_the_mean_over_them(channels: int) -> None:
+    rendered, truth = pair(17, 23, channels)
+    alone = [(rendered[..., i : i + 1], truth[..., i : i + 1]) for i in range(channels)]
+    assert ssim(rendered, truth) == pytest.approx(np.mean([ssim(a, b) for a, b in alone]), abs=1e-12)
+    errors = [10 ** (-psnr(a, b) / 10) for a, b in alone]
+    assert psnr(rendered, truth) == pytest.approx(-10 * math.log10(float(np.mean(errors))), abs=1e-9)
+    assert ssim(rendered, truth) == pytest.approx(plain_ssim(rendered.numpy(), truth.numpy(), SSIM_WINDOW), abs=1e-9)

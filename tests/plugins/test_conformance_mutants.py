@@ -234,6 +234,11 @@ class WithoutTime(Example):
         super().__init__(())
 
 
+class ThreeChannels(Example):
+    def __init__(self) -> None:
+        super().__init__(())
+
+
 class Misfit(Example):
     def __init__(self) -> None:
         super().__init__(())
@@ -304,6 +309,14 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("initialisers", "changed in place", using(Meddler)),
     ("dataset", "view train0: condition 'time'", timed(example=WithoutTime)),
     ("dataset", "view train0: pixels: found (4, 4, 3)", using(example=Misfit)),
+    (
+        "channels",
+        "conformance example: 3 channels; expected 2, which task 'static' names: a, b",
+        using(channels=("a", "b"), example=ThreeChannels),
+    ),
+    ("channels", "display gave torch.float32 of shape (9, 10, 2)", using(display=lambda image: image[..., :2])),
+    ("channels", "found its argument changed in place", using(display=lambda image: image.mul_(0.5))),
+    ("channels", "off its rows one by one", using(display=lambda image: image / image.max())),
     ("loss", "loss of the truth itself", using(loss=negative)),
     ("loss", "shape (9, 10, 3)", using(loss=per_pixel)),
     ("loss", "no gradient", using(loss=detached)),

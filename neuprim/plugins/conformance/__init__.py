@@ -38,6 +38,7 @@ from neuprim.plugins.conformance.parameters import (
 from neuprim.plugins.conformance.population import check_clone, check_divide, check_scale_density, check_split
 from neuprim.plugins.conformance.subject import ConformanceError, Subject
 from neuprim.plugins.conformance.training import (
+    check_channels,
     check_dataset,
     check_determinism,
     check_learning,
@@ -57,6 +58,7 @@ CHECKS: dict[str, Callable[[Subject], None]] = {
         check_parameter_specs,
         check_initialisers,
         check_dataset,
+        check_channels,
         check_loss,
         check_lowered_forms,
         check_alive,

@@ -88,8 +88,8 @@ class Subject:
 
     @cached_property
     def dataset(self) -> Dataset:
-        """The task's own example, or one with the conditions it declares."""
-        return self.task.example() if self.task.example is not None else Example(self.task.conditions)
+        """The task's own example, or one with the conditions and channels it declares."""
+        return self.task.example() if self.task.example is not None else Example(self.task.conditions, len(self.task.channels) or 3)
 
     def fields(self) -> tuple[DensityField, ColourField]:
         """Freshly built fields."""

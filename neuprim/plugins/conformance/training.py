@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from neuprim.core import checkpoint
+from neuprim.core.channels import channels_of
 from neuprim.core.errors import CheckpointError
 from neuprim.core.render import render
 from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.conformance.subject import Subject
 
-__all__ = ["check_dataset", "check_determinism", "check_learning", "check_loss", "check_resume", "check_save_load"]
+__all__ = ["check_channels", "check_dataset", "check_determinism", "check_learning", "check_loss", "check_resume", "check_save_load"]
 
 _STEPS = 4  # before the kill, and again after it; the population changes twice in each half
 
@@ -37,6 +38,18 @@ def check_dataset(t: Subject) -> None:
     a, b = (data.initial_points(8, torch.Generator().manual_seed(1)) for _ in range(2))
     t.require(1 <= len(a.means) <= 8, "example: initial_points(8)", f"{len(a.means)} points", "1 to 8")
     t.require(torch.equal(a.means, b.means), "example: initial_points", "other points for the same seed", "the same")
+
+
+def check_channels(t: Subject) -> None:
+    """The names of the channels fit the data, and the display makes sRGB of each pixel by itself: of primitives, parts and whole images."""
+    channels = channels_of(t.task, t.dataset)
+    image = t.dataset.test.pixels(0).over(t.dataset.background)
+    given = image.clone()
+    shown = channels.display(image)
+    t.require(torch.equal(image, given), "display", "its argument changed in place", "the image as it was")
+    apart = torch.cat([channels.display(row[None]) for row in image])
+    off = float((shown - apart).abs().max())
+    t.require(off < 1e-4, "display of an image", f"{off:.3g} off its rows one by one", "the same, as single primitives have colours too")
 
 
 def check_loss(t: Subject) -> None:

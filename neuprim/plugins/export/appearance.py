@@ -15,7 +15,7 @@ from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import ExportJob, TrainedModel
 from neuprim.core.fields import Conditions, OpaqueColour
 
-__all__ = ["Harmonics", "comparison_views", "harmonics_of", "sphere"]
+__all__ = ["Harmonics", "comparison_views", "harmonics_of", "rgb_of", "sphere"]
 
 _DEGREE = 3
 _DIRECTIONS = 64
@@ -26,22 +26,42 @@ class Harmonics:
     """Colours max(0, SH(direction) + 1/2) of the primitives that live under some conditions.
 
     Attributes:
-        dc: (M, 3), rest: (M, 15, 3) float64 coefficients in the order and signs of 3D Gaussian splatting.
+        dc: (M, C), rest: (M, 15, C) float64 coefficients in the order and signs of 3D Gaussian splatting.
         residual: RMS error of the fit over directions and primitives; 0.0 where the model's colours are harmonics themselves.
     """
 
     def __init__(self, dc: Tensor, rest: Tensor | None, residual: float) -> None:
         bands = sh.coefficient_count(_DEGREE) - 1
-        full = torch.zeros(len(dc), bands, 3, dtype=torch.float64)
+        full = torch.zeros(len(dc), bands, dc.shape[1], dtype=torch.float64)
         if rest is not None:
             full[:, : rest.shape[1]] = rest
         self.dc, self.rest, self.residual = dc.double(), full, residual
 
     def towards(self, rows: Tensor, directions: Tensor) -> Tensor:
-        """(P, 3) colours of primitives ``rows`` (P,) seen along unit ``directions`` (P, 3), camera to primitive."""
+        """(P, C) colours of primitives ``rows`` (P,) seen along unit ``directions`` (P, 3), camera to primitive."""
         basis = sh.basis(directions.double(), _DEGREE)
         mixed = basis[:, :1] * self.dc[rows] + (basis[:, 1:, None] * self.rest[rows]).sum(1)
         return (mixed + 0.5).clamp_min(0.0)
+
+    def picked(self, channels: tuple[int, ...]) -> Harmonics:
+        """The same with these channels alone, in this order."""
+        index = list(channels)
+        return Harmonics(self.dc[:, index], self.rest[:, :, index], self.residual)
+
+
+def rgb_of(run: TrainedModel, hint: str = "") -> tuple[int, int, int]:
+    """Which of the model's channels are red, green and blue; a grey one is all three. For formats to ask before anything takes time.
+
+    Raises:
+        ConfigError: none is; ``hint`` says what else the format would take.
+    """
+    channels = run.channels
+    if channels.rgb is None:
+        raise ConfigError(
+            f"{run.directory}: {channels.count} channels, {channels.listed}; this format has red, green and blue{hint}; "
+            "--format ply and npz hold all channels"
+        )
+    return channels.rgb
 
 
 def harmonics_of(run: TrainedModel, conditions: Conditions) -> Harmonics:
@@ -49,18 +69,16 @@ def harmonics_of(run: TrainedModel, conditions: Conditions) -> Harmonics:
     centres seen from 64 directions far away, under the given conditions.
 
     Raises:
-        ConfigError: the colours are not three channels, or of a form that has no value per primitive.
+        ConfigError: the colours are of a form that has no value per primitive.
     """
     model = run.model
-    if model.colour.channels != 3:
-        raise ConfigError(f"{run.directory}: {model.colour.channels} colour channels; this format has red, green and blue")
     with torch.no_grad():
         params = model.living(conditions).params
         exact = model.colour.harmonics({spec.name: params[spec.name] for spec in model.colour.parameters()}, conditions)
         if exact is not None:
             return Harmonics(exact[0], exact[1], 0.0)
         directions = sphere(_DIRECTIONS)
-        seen = torch.stack([_from_afar(run, conditions, d) for d in directions], 1)  # (M, V, 3)
+        seen = torch.stack([_from_afar(run, conditions, d) for d in directions], 1)  # (M, V, C)
         basis = sh.basis(directions, _DEGREE)
         fitted = torch.einsum("bv,nvc->nbc", torch.linalg.pinv(basis), seen - 0.5)
         residual = float((torch.einsum("vb,nbc->nvc", basis, fitted) + 0.5 - seen).square().mean().sqrt())
@@ -68,7 +86,7 @@ def harmonics_of(run: TrainedModel, conditions: Conditions) -> Harmonics:
 
 
 def _from_afar(run: TrainedModel, conditions: Conditions, direction: Tensor) -> Tensor:
-    """(M, 3) float64 colours at the primitives' centres from a camera so far away that all are seen along one direction."""
+    """(M, C) float64 colours at the primitives' centres from a camera so far away that all are seen along one direction."""
     means = run.model.params["means"].double()
     middle = means.mean(0)
     reach = float((means - middle).norm(dim=-1).max()) + 1.0

@@ -3,13 +3,16 @@
 Binary little-endian vertices of floats ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``: centre in scene units,
 normals 0, SH coefficients of degree 3 (``f_rest`` channel by channel: 15 of red, 15 of green, 15 of blue), logit of the opacity,
 natural logarithm of the standard deviations, quaternion wxyz. How the Gaussians are fitted: :mod:`neuprim.plugins.export.gaussians`.
-Colours are those of the model in its own colour space; viewers show numbers as sRGB. A model that depends on time or light is written
+Colours are those of the model in its own colour space; viewers show numbers as sRGB. A grey model is written as three equal channels;
+other channels than red, green and blue are refused. A model that depends on time or light is written
 under one value of each (``time=0.5``, ``light=1,2,3 light_intensity=10,10,10``); colours that are no harmonics are fitted by harmonics.
 
 The error is the PSNR of images of the fitted Gaussians, drawn as the 3DGS rasteriser draws them, against the model's own.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -23,7 +26,7 @@ from neuprim.core.metrics import psnr
 from neuprim.core.ply import write_ply
 from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
-from neuprim.plugins.export.appearance import Harmonics, comparison_views, harmonics_of
+from neuprim.plugins.export.appearance import Harmonics, comparison_views, harmonics_of, rgb_of
 from neuprim.plugins.export.common import Options, conditions_of, target
 from neuprim.plugins.export.gaussians import Gaussians, draw_gaussians, fit_gaussians
 
@@ -49,23 +52,28 @@ def _write(job: ExportJob) -> ExportReport:
     size, which = options.choice("size", "auto", "footprint", "moments"), options.choice("views", "auto", "test", "orbit")
     path = target(job, "gaussians.ply", (".ply",))
     (conditions,) = conditions_of(job)
+    channels, rgb = job.run.channels, rgb_of(job.run)
     job.progress("fitting Gaussians", 0.0)
-    colours = harmonics_of(job.run, conditions)
-    images, seen = _images(job, which, conditions)
+    colours = harmonics_of(job.run, conditions).picked(rgb)
+    images, seen = _images(job, which, conditions, rgb)
     fits = {name: fit_gaussians(job.run, conditions, name == "footprint") for name in ("moments", "footprint") if size in ("auto", name)}
     if not all(len(g.means) for g in fits.values()):
         raise ConfigError(f"{job.run.directory}: no primitive absorbs anything under these conditions; nothing to export")
-    scores = {name: _psnrs(job, fit, colours, images, name) for name, fit in fits.items()}
+    scores = {name: _psnrs(job, fit, colours, images, rgb, name) for name, fit in fits.items()}
     size = max(scores, key=lambda name: float(np.mean(scores[name])))
     gaussians, errors = fits[size], {"psnr": float(np.mean(scores[size])), "psnr_worst": float(np.min(scores[size]))}
     write_ply(path, _rows(gaussians, colours), ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"])
-    space = str(job.run.header.get("color_space", "srgb"))
+    space = channels.color_space
     notes = [
         f"{len(gaussians.means)} Gaussians, size={size}; PSNR of them drawn as the 3DGS rasteriser does, against the model's images, {seen}, {space} values",
         "axes and units are the scene's; degree 3 harmonics",
     ]
     if colours.residual > 0:
         notes.append(f"the model's colours are no harmonics of the view; fitted at the centres with an RMS error of {colours.residual:.2g}")
+    if channels.own is not None:
+        notes.append(f"red, green and blue are the channels {channels.listed}, not what the display of task {job.run.task.name!r} shows")
+    elif channels.shown:
+        notes.append(f"colours: {channels.shown}")
     if space == "linear":
         notes.append("colours are linear, viewers take them for sRGB: they look darker there")
     return ExportReport((path,), False, errors, tuple(notes))
@@ -86,28 +94,30 @@ def _rows(gaussians: Gaussians, colours: Harmonics) -> np.ndarray:
     return rows
 
 
-def _images(job: ExportJob, which: str, conditions: Conditions) -> tuple[list[tuple[View, Tensor]], str]:
-    """The model's own images, and what they show."""
+def _images(job: ExportJob, which: str, conditions: Conditions, rgb: Sequence[int]) -> tuple[list[tuple[View, Tensor]], str]:
+    """The model's own images, red, green and blue, and what they show."""
     run = job.run
     views, what = comparison_views(job, which, conditions)
     background, images = _background(job), []
     for i, view in enumerate(views):
         job.progress("drawing the model", i / len(views))
         with torch.no_grad():
-            images.append((view, render(run.model, view.camera, view.conditions, run.settings, background).rgb))
+            images.append((view, render(run.model, view.camera, view.conditions, run.settings, background).rgb[..., list(rgb)]))
     return images, what
 
 
-def _psnrs(job: ExportJob, gaussians: Gaussians, colours: Harmonics, images: list[tuple[View, Tensor]], name: str) -> list[float]:
-    found = []
+def _psnrs(
+    job: ExportJob, gaussians: Gaussians, colours: Harmonics, images: list[tuple[View, Tensor]], rgb: Sequence[int], name: str
+) -> list[float]:
+    background, found = _background(job)[list(rgb)], []
     for i, (view, truth) in enumerate(images):
         job.progress(f"drawing the Gaussians (size={name})", i / len(images))
-        found.append(psnr(draw_gaussians(gaussians, colours, view.camera, _background(job)), truth))
+        found.append(psnr(draw_gaussians(gaussians, colours, view.camera, background), truth))
     return found
 
 
 def _background(job: ExportJob) -> Tensor:
-    return torch.tensor([float(x) for x in job.run.header.get("background", [0.0] * 3)])
+    return torch.tensor([float(x) for x in job.run.header.get("background", [0.0] * job.run.model.colour.channels)])
 
 
 EXPORTER = Exporter(

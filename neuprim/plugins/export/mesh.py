@@ -8,7 +8,8 @@ piece's area are left out.
 
 A vertex has the mean colour of the primitives around it, weighted by their density there, seen from outside along its normal.
 Coordinates are scene units on scene axes; a .glb is turned from z up to glTF's y up (``up=y`` for scenes that are y up already), as
-its readers turn it back. Colours are sRGB in .ply and .obj and linear in .glb, as glTF wants them.
+its readers turn it back. Colours are sRGB in .ply and .obj and linear in .glb, as glTF wants them; they are what the
+task's display shows, or red, green and blue, or grey. Other channels are refused.
 
 The error is the intersection over union of silhouettes against where the model's alpha passes one half, over views of an orbit.
 """
@@ -33,7 +34,7 @@ from neuprim.core.fields import Conditions
 from neuprim.core.files import atomic_path
 from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
-from neuprim.plugins.export.appearance import Harmonics, comparison_views, harmonics_of
+from neuprim.plugins.export.appearance import Harmonics, comparison_views, harmonics_of, rgb_of
 from neuprim.plugins.export.common import Options, conditions_of, model_box, target
 
 __all__ = ["EXPORTER", "best_level"]
@@ -56,8 +57,11 @@ def _write(job: ExportJob) -> ExportReport:
     options = Options(job, OPTIONS)
     path = target(job, "mesh.glb", _SUFFIXES)
     (conditions,) = conditions_of(job)
+    channels = job.run.channels
+    rgb = None if channels.own is not None else rgb_of(job.run, f", and task {job.run.task.name!r} has no display that makes these")
     contour = _contour()
     smooth, keep, up = options.number("smooth", 0, 4) or 0.0, options.number("keep", 0, 1) or 0.0, options.choice("up", "z", "y")
+    seen = harmonics_of(job.run, conditions)
     job.progress("sampling the density", 0.0)
     sigma, scene_from_index = _sample(job, conditions, options.count("grid", 8, 1024) or 192)
     step = float(scene_from_index[0, 0])
@@ -76,11 +80,14 @@ def _write(job: ExportJob) -> ExportReport:
     if mesh.volume < 0:
         mesh.invert()
     job.progress("colouring", 0.5)
-    colours = _colours(job, conditions, harmonics_of(job.run, conditions), np.array(mesh.vertices), np.array(mesh.vertex_normals))
+    colours = torch.from_numpy(_colours(job, conditions, seen, np.array(mesh.vertices), np.array(mesh.vertex_normals))).float()
+    colours = channels.display_rows(colours) if rgb is None else colours[:, list(rgb)]
     iou = _silhouettes(job, conditions, mesh)
-    _save(mesh, colours, str(job.run.header.get("color_space", "srgb")), path, up)
+    _save(mesh, colours, "srgb" if rgb is None else channels.color_space, path, up)
     notes.append(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles; {dropped} small pieces left out")
     notes.append("colours: of the primitives around each vertex, weighted by density, seen along the normal from outside")
+    if channels.shown:
+        notes.append(f"colours: {channels.shown}")
     if path.suffix.lower() == ".glb" and up == "z":
         notes.append("turned from z up to glTF's y up; Blender and others turn it back")
     return ExportReport((path,), False, {"silhouette_iou": iou}, tuple(notes))
@@ -157,12 +164,12 @@ def _larger_pieces(mesh: Any, keep: float) -> tuple[Any, int]:
 
 
 def _colours(job: ExportJob, conditions: Conditions, colours: Harmonics, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(V, 3) of the primitives around each point, weighted by density; of the nearest one where none reaches."""
+    """(V, C) of the primitives around each point, weighted by density; of the nearest one where none reaches."""
     with torch.no_grad():
         living = job.run.model.living(conditions)
         moved = living.geometry
         whiten = moved.rotations.double().transpose(1, 2) / moved.scales.double()[:, :, None]
-        total, weight = torch.zeros(len(points), 3, dtype=torch.float64), torch.zeros(len(points), dtype=torch.float64)
+        total, weight = torch.zeros(len(points), colours.dc.shape[1], dtype=torch.float64), torch.zeros(len(points), dtype=torch.float64)
         tree = cKDTree(points)
         around = tree.query_ball_point(moved.means.double().numpy(), moved.scales.double().amax(1).numpy())
         counts = np.array([len(a) for a in around])
@@ -186,10 +193,10 @@ def _colours(job: ExportJob, conditions: Conditions, colours: Harmonics, points:
     return result
 
 
-def _save(mesh: Any, colours: np.ndarray, space: str, path: Path, up: str) -> None:
+def _save(mesh: Any, colours: Tensor, space: str, path: Path, up: str) -> None:
     import trimesh
 
-    suffix, values = path.suffix.lower(), torch.from_numpy(colours).float().clamp(0, 1)
+    suffix, values = path.suffix.lower(), colours.clamp(0, 1)
     if suffix == ".glb" and space != "linear":
         values = images.srgb_to_linear(values)
     elif suffix != ".glb" and space == "linear":

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
+from neuprim.core.channels import Channels
 from neuprim.core.density_grid import density_grid
 from neuprim.core.errors import ConfigError
 from neuprim.core.fields import Conditions
 from neuprim.core.geometry import Geometry
-from neuprim.core.images import linear_to_srgb
 from neuprim.core.primitives import Living, Primitives
 
 __all__ = ["UNIT", "FieldFrame", "ViewOptions"]
@@ -47,6 +47,7 @@ class FieldFrame:
         scene_from_index, shape: of the grid; its axes are the scene's.
         top: largest extinction shown, 1/scene unit; the same for all frames, so that colours mean the same.
         focus: (3,) middle of the matter of all frames, scene units.
+        channels: of the model's colours.
         gain: by which a volume's opacity is stronger than the density's own, for the same reason the same for all frames.
         needed: names of the conditions of the model's task.
         truth: (X, Y, Z) float32 ground truth on the grid, or None; computed when called.
@@ -62,7 +63,7 @@ class FieldFrame:
     top: float
     gain: float
     focus: tuple[float, ...] = (0.0, 0.0, 0.0)
-    color_space: str = "srgb"
+    channels: Channels = field(default_factory=Channels)
     needed: tuple[str, ...] = ()
     options: ViewOptions = field(default_factory=ViewOptions)
     truth: Callable[[], np.ndarray] | None = None
@@ -169,9 +170,7 @@ class FieldFrame:
         camera = Camera(look_at(eye, center, torch.tensor([0.0, 0.0, 1.0])), 64.0, 64.0, 32.0, 32.0, 64, 64)
         with torch.no_grad():
             rgb = self.model.lower(camera, self.conditions).center_colors(eye)
-        rgb = rgb.float().clamp_min(0)
-        rgb = rgb.expand(-1, 3) if rgb.shape[1] == 1 else torch.nn.functional.pad(rgb[:, :3], (0, max(0, 3 - rgb.shape[1])))
-        return np.asarray((linear_to_srgb(rgb) if self.color_space == "linear" else rgb).clamp(0, 1).numpy())
+        return np.asarray(self.channels.display_rows(rgb.float().clamp_min(0)).numpy())
 
     def row(self) -> int:
         """Position in :attr:`alive` of the primitive to look into.

@@ -1,0 +1,158 @@
+"""What the channels of a task's images are, and how people see them: the one place that makes red, green and blue of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from neuprim.core.channel_names import default_names, names_fault
+from neuprim.core.errors import CheckpointError, ConfigError, DataError
+from neuprim.core.images import linear_to_srgb
+
+if TYPE_CHECKING:
+    from neuprim.core.data import Dataset
+    from neuprim.core.task import TaskSpec
+
+__all__ = ["Channels", "Display", "channels_of", "stored_channels"]
+
+Display = Callable[[Tensor], Tensor]
+"""(H, W, C) colours in the data set's own colour space -> (H, W, 3) sRGB values 0..1, each pixel by itself."""
+
+_LISTED = 8  # names that a line of text lists; of more, the first three and the last
+
+
+@dataclass(frozen=True)
+class Channels:
+    """The channels of a task's images, for whoever shows or writes these.
+
+    Attributes:
+        names: one per channel, in the order of the tensors' last axis.
+        color_space: "srgb" or "linear", the data set's.
+        own: the task's display, or None: three channels are red, green and blue, one is grey, and of others some are shown.
+        task: its name, for messages.
+    """
+
+    names: tuple[str, ...] = ("R", "G", "B")
+    color_space: str = "srgb"
+    own: Display | None = None
+    task: str = ""
+
+    @property
+    def count(self) -> int:
+        """C."""
+        return len(self.names)
+
+    @property
+    def rgb(self) -> tuple[int, int, int] | None:
+        """Which channels are red, green and blue: those of that name, else all three there are, or the only one three times; None where
+        that is not said."""
+        if {"R", "G", "B"} <= set(self.names):
+            return self.names.index("R"), self.names.index("G"), self.names.index("B")
+        return {1: (0, 0, 0), 3: (0, 1, 2)}.get(self.count)
+
+    @property
+    def plain(self) -> bool:
+        """Whether an image is red, green and blue and nothing else, so that the sRGB curve has its meaning for all of it."""
+        return self.own is None and sorted(self.names) == ["B", "G", "R"]
+
+    @property
+    def partial(self) -> bool:
+        """Whether pictures leave channels out, or have too few, as the task has no display."""
+        return self.own is None and self.count not in (1, 3)
+
+    @property
+    def shown(self) -> str:
+        """What pictures show, in words; empty for red, green and blue, or grey, without a display of the task's own."""
+        if self.own is not None:
+            return f"{self.listed} through the display of task {self.task!r}"
+        if self.names == default_names(self.count) and not self.partial:
+            return ""
+        if self.count == 1:
+            return f"{self.names[0]} as grey"
+        chosen = [self.names[i] for i in self._chosen]
+        part = f" of {self.count} channels" if self.count > 3 else ""
+        return f"{', '.join(chosen)}{part} as {', '.join(('red', 'green', 'blue')[: len(chosen)])}"
+
+    @property
+    def listed(self) -> str:
+        """The names in a line; of many, the first and the last ones."""
+        if self.count <= _LISTED:
+            return ", ".join(self.names)
+        return f"{', '.join(self.names[:3])}, … {self.names[-1]} ({self.count} channels)"
+
+    @property
+    def _chosen(self) -> tuple[int, ...]:
+        return self.rgb or tuple(range(min(self.count, 3)))
+
+    def display(self, image: Tensor) -> Tensor:
+        """(H, W, 3) display-referred sRGB copy of an image (H, W, C) in the data set's colour space.
+
+        The task's own display ends in 0..1. Without one, linear values get the sRGB curve, and nothing is clamped at 1.
+
+        Raises:
+            ConfigError: the task's display returned something else.
+        """
+        if image.shape[-1] != self.count:
+            raise ValueError(f"an image of shape {tuple(image.shape)} for {self.count} channels, {self.listed}")
+        if self.own is not None:
+            return self._checked(self.own(image), image)
+        if self.count == 1:
+            image = image.expand(-1, -1, 3)
+        elif self.count != 3 or self._chosen != (0, 1, 2):
+            image = torch.nn.functional.pad(image[..., list(self._chosen)], (0, max(0, 3 - self.count)))
+        return linear_to_srgb(image.clamp_min(0.0)) if self.color_space == "linear" else image
+
+    def display_rows(self, colours: Tensor) -> Tensor:
+        """(M, 3) display-referred sRGB values 0..1 of M colours (M, C), e.g. those of primitives: the same as of an image one pixel high."""
+        return self.display(colours[None])[0].clamp(0.0, 1.0)
+
+    def _checked(self, found: Any, image: Tensor) -> Tensor:
+        expected = (*image.shape[:2], 3)
+        if not isinstance(found, Tensor) or tuple(found.shape) != expected or not found.is_floating_point():
+            what = f"{found.dtype} of shape {tuple(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
+            raise ConfigError(f"task {self.task!r}: display gave {what} for {tuple(image.shape)}; expected floats of shape {expected}")
+        bad = int((~torch.isfinite(found)).sum())
+        if bad:
+            raise ConfigError(f"task {self.task!r}: display gave {bad} NaN or infinite values; expected numbers from 0 to 1")
+        return found.clamp(0.0, 1.0)
+
+
+def channels_of(task: TaskSpec, dataset: Dataset) -> Channels:
+    """The channels of a task's data set.
+
+    Raises:
+        DataError: the task names another number of channels, or the background does not have one number for each.
+    """
+    if task.channels and len(task.channels) != dataset.channels:
+        raise DataError(
+            f"{dataset.name}: {dataset.channels} channels; expected {len(task.channels)}, which task {task.name!r} names: "
+            f"{', '.join(task.channels)}"
+        )
+    if tuple(dataset.background.shape) != (dataset.channels,):
+        raise DataError(
+            f"{dataset.name}: the background has shape {tuple(dataset.background.shape)}; expected ({dataset.channels},), a number per channel"
+        )
+    return Channels(tuple(task.channels) or default_names(dataset.channels), dataset.color_space, task.display, task.name)
+
+
+def stored_channels(where: Path, header: Mapping[str, Any], task: TaskSpec, count: int) -> Channels:
+    """The channels of a model out of its header, without its data.
+
+    Args:
+        where: the model's run directory, for messages.
+        count: channels of the model's colour.
+
+    Raises:
+        CheckpointError: the header's names are damaged or do not fit the model.
+    """
+    names = header.get("channels")
+    if names is None:  # written before models kept them
+        names = task.channels if len(task.channels) == count else default_names(count)
+    elif not isinstance(names, list) or len(names) != count or names_fault(names):
+        raise CheckpointError(f"{where}: the model's header names the channels {str(names)[:100]}; expected {count} different names")
+    return Channels(tuple(names), str(header.get("color_space", "srgb")), task.display, task.name)

@@ -1,0 +1,179 @@
+"""Channels of any number and name: what pictures show of them, and what files hold."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import OpenEXR
+import pytest
+import torch
+from torch import Tensor
+
+from neuprim.core import images
+from neuprim.core.channel_names import default_names, names_fault
+from neuprim.core.channels import Channels, channels_of, stored_channels
+from neuprim.core.errors import CheckpointError, ConfigError, DataError
+from neuprim.tasks.static import TASK
+from tests.core import tiny
+
+BANDS = ("450nm", "550 nm", "Ünïcode", "NIR", "layer.R")
+
+
+def image(channels: int, height: int = 4, width: int = 6) -> Tensor:
+    return torch.rand(height, width, channels, generator=torch.Generator().manual_seed(channels)) * 1.5 - 0.1
+
+
+# ---------------------------------------------------------------- what pictures show
+
+
+def test_three_channels_without_a_display_are_shown_as_ever() -> None:
+    values = image(3)
+    assert Channels().display(values) is values and Channels().shown == ""
+    linear = Channels(color_space="linear")
+    assert torch.equal(linear.display(values), images.linear_to_srgb(values.clamp_min(0.0)))
+    assert linear.plain and not linear.partial and linear.rgb == (0, 1, 2)
+
+
+def test_one_channel_is_grey() -> None:
+    grey = Channels(default_names(1), "linear")
+    assert torch.equal(grey.display(image(1)), images.linear_to_srgb(image(1).clamp_min(0.0)).expand(-1, -1, 3))
+    assert grey.shown == "" and not grey.partial and not grey.plain
+    assert Channels(("heat",)).shown == "heat as grey"
+
+
+@pytest.mark.parametrize(
+    ("names", "shown", "indices"),
+    [
+        (default_names(5), "c0, c1, c2 of 5 channels as red, green, blue", (0, 1, 2)),
+        (BANDS, "450nm, 550 nm, Ünïcode of 5 channels as red, green, blue", (0, 1, 2)),
+        (("NIR", "B", "G", "R"), "R, G, B of 4 channels as red, green, blue", (3, 2, 1)),
+        (("700nm", "550nm", "450nm"), "700nm, 550nm, 450nm as red, green, blue", (0, 1, 2)),
+        (("c0", "c1"), "c0, c1 as red, green", (0, 1)),
+    ],
+)
+def test_without_a_display_it_is_said_what_is_shown(names: tuple[str, ...], shown: str, indices: Sequence[int]) -> None:
+    channels, values = Channels(names), image(len(names))
+    assert channels.shown == shown
+    assert channels.partial == (len(names) != 3) and not channels.plain
+    found = channels.display(values)
+    assert found.shape == (4, 6, 3) and torch.equal(found[..., : len(indices)], values[..., list(indices)])
+    assert not found[..., len(indices) :].any()
+
+
+def test_many_names_are_listed_by_their_ends() -> None:
+    assert Channels(default_names(31)).listed == "c0, c1, c2, … c30 (31 channels)"
+
+
+def test_the_tasks_own_display_is_what_is_shown() -> None:
+    channels = Channels(BANDS, "linear", lambda x: x.flip(-1)[..., :3], "bands")
+    values = image(5)
+    assert torch.equal(channels.display(values), values[..., [4, 3, 2]].clamp(0, 1))
+    assert torch.equal(channels.display_rows(values[0]), channels.display(values)[0])
+    assert "through the display of task 'bands'" in channels.shown and not channels.partial and not channels.plain
+    assert not Channels(own=lambda x: x).plain
+
+
+@pytest.mark.parametrize(
+    ("own", "words"),
+    [
+        (lambda x: x, ("torch.float32 of shape (4, 6, 5) for (4, 6, 5)", "expected floats of shape (4, 6, 3)")),
+        (lambda x: (255 * x[..., :3]).byte(), ("torch.uint8",)),
+        (lambda x: x[..., :3].numpy(), ("display gave ndarray",)),
+        (lambda x: x[..., :3] / 0, ("72 NaN or infinite values",)),
+    ],
+)
+def test_a_display_that_gives_no_picture_is_named(own: Any, words: Sequence[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        Channels(BANDS, own=own, task="bands").display(image(5))
+    text = str(caught.value)
+    assert text.startswith("task 'bands': display gave") and all(w in text for w in words)
+
+
+# ---------------------------------------------------------------- where they come from
+
+
+def test_a_data_set_must_have_the_channels_that_its_task_names() -> None:
+    dataset = tiny.TwoPrimitives()
+    assert channels_of(TASK, dataset).names == ("R", "G", "B")
+    assert channels_of(replace(TASK, channels=("a", "b", "c")), dataset).names == ("a", "b", "c")
+    with pytest.raises(DataError, match=r"^two: 3 channels; expected 5, which task 'static' names: 450nm, 550 nm"):
+        channels_of(replace(TASK, channels=BANDS), dataset)
+    dataset.channels = 5
+    with pytest.raises(DataError, match=r"^two: the background has shape \(3,\); expected \(5,\), a number per channel"):
+        channels_of(TASK, dataset)
+
+
+def test_a_model_keeps_its_names_and_old_ones_get_some(tmp_path: Path) -> None:
+    bands = replace(TASK, channels=BANDS)
+    kept = stored_channels(tmp_path, {"channels": list("vwxyz"), "color_space": "linear"}, bands, 5)
+    assert (kept.names, kept.color_space) == (tuple("vwxyz"), "linear")
+    assert stored_channels(tmp_path, {}, bands, 5).names == BANDS
+    assert stored_channels(tmp_path, {}, bands, 4).names == ("c0", "c1", "c2", "c3")
+    assert stored_channels(tmp_path, {}, TASK, 3) == Channels(task="static")
+    for damaged in (list("abcd"), "abcde", list("abcdd"), [1, 2, 3, 4, 5], ["a", "b", "c", "d", "\n"]):
+        with pytest.raises(CheckpointError, match=r"header names the channels .*; expected 5 different names"):
+            stored_channels(tmp_path, {"channels": damaged}, bands, 5)
+
+
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [
+        (["a", 3], "[1] is of type int; expected text"),
+        (["a", "b", "a"], "[2] is 'a' once more; expected different names"),
+        (["A"], "[0] is 'A'; expected another name, as A is alpha"),
+        ([""], "expected 1 to 31 bytes of printable text"),
+        ([" a"], "without blanks around it"),
+        (["a\nb"], "printable"),
+        (["ü" * 16], "1 to 31 bytes"),
+    ],
+)
+def test_names_that_no_file_holds(names: list[Any], text: str) -> None:
+    assert text in (names_fault(names) or "")
+
+
+# ---------------------------------------------------------------- OpenEXR
+
+
+@pytest.mark.parametrize("half", [True, False])
+@pytest.mark.parametrize("names", [BANDS, ("R", "G", "B"), ("Y",), ("NIR", "B", "G", "R"), ("z" * 31, "ü" * 15), default_names(31)])
+def test_exr_gives_back_every_channel_by_its_name(tmp_path: Path, names: tuple[str, ...], half: bool) -> None:
+    path, values = tmp_path / "a.exr", image(len(names))
+    images.write_exr(path, values, half=half, names=names)
+    read = images.read_image(path, (6, 4), names)
+    expected = values.half() if half else values
+    assert read.dtype == expected.dtype and torch.equal(read, expected)
+    assert images.exr_channels(path) == tuple(sorted(names, key=str.encode))
+    assert images.image_info(path, names) == images.ImageInfo(6, 4, len(names), True)
+    assert torch.equal(images.read_image(path, channels=names[-1:]), expected[..., -1:])
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        assert set(file.channels()) == set(names)
+
+
+def test_rgb_by_name_is_the_file_that_it_was(tmp_path: Path) -> None:
+    images.write_exr(tmp_path / "a.exr", image(3))
+    images.write_exr(tmp_path / "b.exr", image(3), names=("R", "G", "B"))
+    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+
+
+def test_exr_refusals_name_the_channels(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+
+    def refuses(call: Any, *words: str) -> None:
+        with pytest.raises(DataError) as caught:
+            call()
+        assert all(w in str(caught.value) for w in (str(path), *words)), caught.value
+
+    refuses(lambda: images.write_exr(path, image(5)), "(4, 6, 5); expected (H, W, 3) or (H, W, 4)")
+    refuses(lambda: images.write_exr(path, image(4), names=BANDS), "(4, 6, 4); expected (H, W, 5), for the channels 450nm, 550 nm")
+    refuses(lambda: images.write_exr(path, image(2), names=("a", "a")), "names[1] is 'a' once more")
+    assert not path.exists()
+    images.write_exr(path, image(5), names=BANDS)
+    refuses(lambda: images.read_image(path), "channels are 450nm, 550 nm, NIR, layer.R, Ünïcode; expected R, G, B and optionally A")
+    refuses(lambda: images.read_image(path, channels=("NIR", "red")), "channels are 450nm", "expected NIR, red")
+    refuses(lambda: images.read_image(path, channels=()), "expected some to be asked for")
+    images.write_png(path, torch.zeros(2, 2, 3))
+    refuses(lambda: images.read_image(path, channels=("NIR",)), "not an OpenEXR file")
+    refuses(lambda: images.exr_channels(path), "not an OpenEXR file")

@@ -1,0 +1,328 @@
+"""A task of five channels, from the data to the report: what is shown is said, what is written is everything, what cannot be is refused."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+import sys
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from rich.console import Console
+from torch import Tensor
+
+import neuprim.run as running
+from neuprim.cli import main
+from neuprim.core import checkpoint, images, sh
+from neuprim.core.channels import stored_channels
+from neuprim.core.errors import CheckpointError, ConfigError, DataError, NeuprimError
+from neuprim.core.render import render
+from neuprim.evaluate import FORMATS, evaluate_run, load_dataset, load_run, read_metrics, render_run
+from neuprim.exporting import export_run, import_run
+from neuprim.inspecting import Request, inspect_run
+from neuprim.plugins.conformance import check_task
+from neuprim.plugins.export import appearance, mesh
+from neuprim.plugins.registry import load_task
+from tests.plugins.fakes import site
+from tests.plugins.spectral import NAMES, fit, install_spectral
+
+__all__ = ["site"]
+
+SHOWN = "450nm, 550 nm, 650nm of 5 channels as red, green, blue"
+THROUGH = ", ".join(NAMES) + " through the display of task 'spectral'"
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(running, "_ORBIT_FRAMES", 3)
+    monkeypatch.setattr(appearance, "_SIZE", 48)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A run of the task with its display."""
+    with pytest.MonkeyPatch.context() as patch:
+        folder = tmp_path_factory.mktemp("spectral")
+        (folder / "site").mkdir()
+        patch.syspath_prepend(str(folder / "site"))
+        patch.setattr(running, "_ORBIT_FRAMES", 3)
+        install_spectral(folder / "site")
+        yield fit(folder / "run")
+        forget()
+
+
+def forget() -> None:
+    """The package that was imported, so that another one of its name can be."""
+    for name in [n for n in sys.modules if n.partition(".")[0] == "spectraltask"]:
+        del sys.modules[name]
+
+
+def changed(site: Path, tmp_path: Path, *words: str, **changes: str) -> tuple[Path, str]:
+    """A run of a task with other lines in its TaskSpec, and what the console said."""
+    forget()
+    install_spectral(site, **changes)
+    console = Console(file=io.StringIO(), width=200)
+    out = fit(tmp_path / "run", *words, console=console)
+    return out, console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def first_view(run_dir: Path) -> tuple[Any, Tensor, Tensor]:
+    """Channels of the model, rendered and true image of the first test view."""
+    config, task, model, header = load_run(run_dir)
+    dataset = load_dataset(config, task)
+    view = dataset.test.view(0)
+    with torch.no_grad():
+        drawn = render(model, view.camera, view.conditions, config.renderer, dataset.background).rgb
+    return stored_channels(run_dir, header, task, 5), drawn, dataset.test.pixels(0).over(dataset.background)
+
+
+# ---------------------------------------------------------------- with a display
+
+
+def test_the_task_is_sound(trained: Path) -> None:
+    check_task(load_task("spectral"))
+
+
+def test_pictures_show_what_the_display_says(trained: Path) -> None:
+    channels, drawn, truth = first_view(trained)
+    display = load_task("spectral").display
+    assert display is not None
+    for path, values in (("test_000_view0.png", drawn), ("test_000_view0_truth.png", truth)):
+        picture = images.read_image(trained / "renders" / path)
+        assert torch.equal(picture, images.to_uint8(display(values))) and picture.float().std() > 20
+        assert (picture.int() - images.to_uint8(values[..., :3]).int()).abs().max() > 50, "not the first three channels"
+    with Image.open(trained / "renders" / "orbit.webp") as film:
+        assert getattr(film, "n_frames", 1) == 3 and np.asarray(film.convert("RGB")).std() > 20
+    assert channels.names == NAMES
+
+
+def test_metrics_and_report_name_the_channels(trained: Path) -> None:
+    found = read_metrics(trained)
+    assert found["channels"] == list(NAMES) and found["shown"] == THROUGH
+    assert not {"psnr_srgb", "ssim_srgb"} & found.keys()
+    channels, drawn, truth = first_view(trained)
+    shown, wanted = channels.display(drawn).double(), channels.display(truth).double()
+    assert found["per_view"][0]["psnr_display"] == pytest.approx(-10 * torch.log10((shown - wanted).square().mean()).item(), abs=1e-4)
+    assert found["ssim_display"] > 0.3
+    page = (trained / "report.html").read_text()
+    assert page.count(f"hown: {THROUGH.replace(chr(39), '&#x27;')}") == 2, "at the orbit and at the held-out views"
+    assert "<dt>channels</dt><dd>450nm, 550 nm, 650nm, NIR, SWIR.1</dd>" in page
+    assert "mean absolute difference over all channels" in page
+    again = evaluate_run(trained)
+    assert {k: again[k] for k in ("psnr", "ssim", "psnr_display", "channels", "shown")} == {k: found[k] for k in ("psnr", "ssim", "psnr_display", "channels", "shown")}  # fmt: skip
+
+
+def test_exr_and_npy_hold_every_channel(trained: Path, tmp_path: Path) -> None:
+    _, drawn, _ = first_view(trained)
+    exr, other = render_run(trained, "test", None, "exr", tmp_path / "exr", 1, {})
+    assert torch.equal(images.read_image(exr, channels=NAMES), drawn) and exr != other
+    npy = render_run(trained, "test", None, "npy", tmp_path / "npy", 1, {})
+    assert [p.name for p in npy] == ["view0.npy", "view1.npy"]
+    values = np.load(npy[0], allow_pickle=False)
+    assert values.dtype == np.float32 and values.shape == (24, 24, 5) and np.array_equal(values, drawn.numpy())
+    assert render_run(trained, "orbit", None, None, tmp_path / "one.npy", 1, {}) == [tmp_path / "one.npy"]
+    with pytest.raises(ConfigError, match=r"2 views do not fit one \.npy file"):
+        render_run(trained, "orbit", None, None, tmp_path / "two.npy", 2, {})
+
+
+def test_rendering_needs_no_data_for_the_names(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(*_: object) -> None:
+        raise DataError("the data are gone")
+
+    monkeypatch.setattr("neuprim.evaluate.load_dataset", gone)
+    monkeypatch.setattr("neuprim.evaluate.find_scene", gone)
+    pose = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0.5], [0, 0, 0, 1]]
+    (tmp_path / "cameras.json").write_text(json.dumps({"w": 20, "h": 16, "camera_angle_x": 0.7, "frames": [{"transform_matrix": pose}]}))
+    (exr,) = render_run(trained, str(tmp_path / "cameras.json"), None, "exr", tmp_path / "exr", 1, {})
+    (png,) = render_run(trained, str(tmp_path / "cameras.json"), None, "png", tmp_path / "png", 1, {})
+    display = load_task("spectral").display
+    assert display is not None
+    shown = display(images.read_image(exr, (20, 16), NAMES))
+    assert torch.equal(images.read_image(png), images.to_uint8(shown)) and shown.std() > 0.1
+
+
+def test_webp_is_a_picture_of_the_display(trained: Path, tmp_path: Path) -> None:
+    channels, drawn, _ = first_view(trained)
+    said: list[str] = []
+    webp = render_run(trained, "test", None, "webp", tmp_path / "film.webp", 1, {}, tell=said.append)
+    with Image.open(webp[0]) as film:
+        frame = torch.from_numpy(np.asarray(film.convert("RGB")).astype(np.float32) / 255)
+    assert (frame - channels.display(drawn)).abs().mean() < 0.03 and said == []
+
+
+def test_the_inspectors_page_has_the_displays_colours(trained: Path, tmp_path: Path) -> None:
+    said: list[str] = []
+    inspect_run(Request(trained, ("primitives",), grid=8, out=tmp_path / "page.html", say=said.append))
+    data = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', (tmp_path / "page.html").read_text(), re.S)[1])  # type: ignore[index]
+    found = np.frombuffer(zlib.decompress(base64.b64decode(data["frames"][0]["prims"])), "<f4").reshape(-1, 15)[:, 12:]
+    _, task, model, _ = load_run(trained)
+    assert task.display is not None
+    raw = (0.5 + 0.28209479177387814 * model.params["sh_dc"]).clamp_min(0)
+    wanted = task.display(raw[None])[0].detach().numpy()
+    assert len(found) and all(np.abs(wanted - row).max(1).min() < 1e-5 for row in found)
+    assert not any(line.startswith("shown") for line in said)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb"])
+def test_a_meshs_colours_go_through_the_display(trained: Path, tmp_path: Path, suffix: str) -> None:
+    pytest.importorskip("pyvista", exc_type=ImportError)
+    import trimesh
+
+    colour = torch.tensor([0.1, 0.2, 0.3, 0.6, 0.8])
+    header, tensors = checkpoint.read(trained / "model.safetensors", "model")
+    (tmp_path / "config.yaml").write_text((trained / "config.yaml").read_text())
+    painted = {**tensors, "sh_dc": sh.initial_dc(colour.expand(len(tensors["sh_dc"]), 5))}
+    rest = {k: v for k, v in header.items() if k not in ("format", "kind")}
+    checkpoint.write(tmp_path / "model.safetensors", "model", painted, rest)
+    report = export_run(tmp_path, "mesh", tmp_path / f"m.{suffix}", ["grid=32"])
+    assert f"colours: {THROUGH}" in report.notes
+    ball = trimesh.load(report.files[0], force="mesh", process=False)
+    display = load_task("spectral").display
+    assert display is not None
+    wanted = display(colour[None, None])[0, 0]
+    wanted = wanted if suffix == "ply" else images.srgb_to_linear(wanted)
+    found = np.asarray(ball.visual.vertex_colors)[:, :3] / 255
+    assert len(found) > 100 and np.abs(found - wanted.numpy()).max() <= 0.5 / 255 + 1e-6
+
+
+def test_whole_models_keep_every_channel(trained: Path, tmp_path: Path) -> None:
+    for name in ("npz", "ply"):
+        back = import_run(export_run(trained, name, tmp_path / f"m.{name}").files[0], tmp_path / name)
+        (exr,) = render_run(back, "orbit", None, "exr", tmp_path / f"{name}_out", 1, {})
+        (own,) = render_run(trained, "orbit", None, "exr", tmp_path / "own", 1, {})
+        assert exr.read_bytes() == own.read_bytes()
+
+
+def test_gaussians_of_five_channels_are_refused_before_any_is_fitted(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neuprim.plugins.export.gaussian_ply.harmonics_of", lambda *a: pytest.fail("too late"))
+    with pytest.raises(ConfigError, match=r"5 channels, 450nm, .*; this format has red, green and blue; --format ply and npz hold all"):
+        export_run(trained, "gaussian-ply")
+
+
+def test_a_damaged_header_is_the_files_fault(trained: Path, tmp_path: Path) -> None:
+    header, tensors = checkpoint.read(trained / "model.safetensors", "model")
+    (tmp_path / "config.yaml").write_text((trained / "config.yaml").read_text())
+    rest = {k: v for k, v in header.items() if k not in ("format", "kind")}
+    checkpoint.write(tmp_path / "model.safetensors", "model", tensors, {**rest, "channels": ["a"]})
+    with pytest.raises(CheckpointError, match=r"header names the channels \['a'\]; expected 5"):
+        render_run(tmp_path, "orbit", None, "png", None, 1, {})
+
+
+# ---------------------------------------------------------------- without one
+
+
+def test_without_a_display_it_is_said_what_is_shown(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out, said = changed(site, tmp_path, display="None")
+    assert f"shown: {SHOWN}; task 'spectral' has no display that shows them all" in said
+    assert f"Shown: {SHOWN}." in (out / "report.html").read_text()
+    _, _, truth = first_view(out)
+    picture = images.read_image(out / "renders" / "test_000_view0_truth.png")
+    assert torch.equal(picture, images.to_uint8(images.linear_to_srgb(truth[..., :3])))
+    assert not {"psnr_srgb", "psnr_display"} & read_metrics(out).keys()
+    lines: list[str] = []
+    render_run(out, "orbit", None, "png", tmp_path / "png", 1, {}, tell=lines.append)
+    assert lines == [f"shown: {SHOWN}; --format exr and npy hold all channels"]
+    render_run(out, "orbit", None, "exr", tmp_path / "exr", 1, {}, tell=lines.append)
+    assert len(lines) == 1
+    inspect_run(Request(out, ("primitives",), grid=8, out=tmp_path / "page.html", say=lines.append))
+    assert f"shown: {SHOWN}" in lines
+    monkeypatch.setattr(mesh, "_sample", lambda *a: pytest.fail("too late"))
+    with pytest.raises(ConfigError, match=r"5 channels, .* and task 'spectral' has no display that makes these"):
+        export_run(out, "mesh")
+
+
+@pytest.mark.parametrize("count", [1, 2, 31])
+@pytest.mark.parametrize("space", ["linear", "srgb"])
+def test_any_number_of_channels_runs_and_is_written(site: Path, tmp_path: Path, count: int, space: str) -> None:
+    words = (f"scene.channels={count}", f"scene.space={space}", "train.iterations=5")
+    out, said = changed(site, tmp_path, *words, display="None", channels="()")
+    names = ("Y",) if count == 1 else tuple(f"c{i}" for i in range(count))
+    found = read_metrics(out)
+    assert found["channels"] == list(names) and ("shown" in found) == ("shown:" in said) == (count > 1)
+    assert np.isfinite(found["psnr"]) and np.isfinite(found["ssim"]) and "psnr_srgb" not in found
+    (npy,) = render_run(out, "orbit", None, "npy", tmp_path / "npy", 1, {})
+    (exr,) = render_run(out, "orbit", None, "exr", tmp_path / "exr", 1, {})
+    values, read = torch.from_numpy(np.load(npy)), images.read_image(exr, channels=names)
+    assert torch.equal(read, values if space == "linear" else images.srgb_to_linear(values.clamp_min(0.0)))
+    assert torch.isfinite(read).all() and read.std() > 0
+
+
+def test_a_grey_model_is_exported_as_grey(site: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyvista", exc_type=ImportError)
+    import trimesh
+
+    out, _ = changed(site, tmp_path, "scene.channels=1", display="None", channels="()")
+    report = export_run(out, "gaussian-ply", tmp_path / "g.ply", ["views=orbit"])
+    assert report.errors["psnr"] > 15
+    rows = trimesh.load(tmp_path / "g.ply").metadata["_ply_raw"]["vertex"]["data"]
+    assert np.array_equal(rows["f_dc_0"], rows["f_dc_2"]) and np.array_equal(rows["f_rest_0"], rows["f_rest_15"])
+    assert rows["f_dc_0"].std() > 0
+    ball = trimesh.load(export_run(out, "mesh", tmp_path / "m.ply", ["grid=32"]).files[0], process=False)
+    colours = np.asarray(ball.visual.vertex_colors)[:, :3]
+    assert (colours == colours[:, :1]).all() and colours.std() > 0
+
+
+def test_red_green_and_blue_among_others_are_exported_by_name(site: Path, tmp_path: Path) -> None:
+    out, _ = changed(site, tmp_path, "scene.channels=4", display="None", channels="('NIR', 'B', 'G', 'R')")
+    report = export_run(out, "gaussian-ply", tmp_path / "g.ply", ["views=orbit"])
+    assert "colours: R, G, B of 4 channels as red, green, blue" in report.notes and report.errors["psnr"] > 15
+    _, tensors = checkpoint.read(out / "model.safetensors", "model")
+    data = (tmp_path / "g.ply").read_bytes()
+    body = np.frombuffer(data[data.index(b"end_header\n") + 11 :], "<f4").reshape(-1, 62)
+    sets = {tuple(row) for row in tensors["sh_dc"][:, [3, 2, 1]].tolist()}
+    assert {tuple(row) for row in body[:, 6:9].tolist()} <= sets
+
+
+# ---------------------------------------------------------------- refused before training
+
+
+@pytest.mark.parametrize(
+    ("words", "changes", "text"),
+    [
+        (("scene.channels=4",), {}, "spectral ball: 4 channels; expected 5, which task 'spectral' names: 450nm, 550 nm"),
+        (
+            (),
+            {"build": "lambda m, d: (CosineDensity(2), SphericalHarmonics(0))"},
+            "task 'spectral' built a colour of 3 channels; expected 5, as in spectral ball",
+        ),
+    ],
+)
+def test_contradictions_end_before_training(site: Path, tmp_path: Path, words: tuple[str, ...], changes: dict[str, str], text: str) -> None:
+    with pytest.raises(NeuprimError, match=re.escape(text)):
+        changed(site, tmp_path, *words, **changes)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"channels": "'RGB'"}, "TaskSpec.channels is of type str; expected a tuple of names"),
+        ({"channels": "('a', 'b', 'a')"}, "TaskSpec.channels[2] is 'a' once more; expected different names"),
+        ({"channels": "('a', 5)"}, "TaskSpec.channels[1] is of type int; expected text"),
+        ({"channels": "('A',)"}, "TaskSpec.channels[0] is 'A'; expected another name"),
+        ({"display": "3"}, "TaskSpec.display is of type int; expected a function or None"),
+    ],
+)
+def test_a_task_that_says_nonsense_is_refused(site: Path, changes: dict[str, str], text: str) -> None:
+    forget()
+    install_spectral(site, **changes)
+    with pytest.raises(NeuprimError, match=re.escape(text)):
+        load_task("spectral")
+
+
+def test_the_command_line_offers_every_format(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["render", str(trained), "--camera", "orbit", "--frames", "1", "--size", "8x8"]
+    for name in FORMATS:
+        if name != "mp4":
+            assert main([*words, "--format", name, "--out", str(tmp_path / name)]) == 0
+    capsys.readouterr()
+    assert main(["render", "--help"]) == 0
+    assert "{" + ",".join(FORMATS) + "}" in capsys.readouterr().out

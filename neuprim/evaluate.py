@@ -16,6 +16,7 @@ from neuprim.core import images
 from neuprim.core.camera_file import read_cameras
 from neuprim.core.checkpoint import load_model
 from neuprim.core.data import Dataset, View
+from neuprim.core.data_check import check_dataset
 from neuprim.core.datasets.records import Record
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
 from neuprim.core.errors import ConfigError, DataError
@@ -25,19 +26,43 @@ from neuprim.core.film import write_film
 from neuprim.core.primitives import Primitives
 from neuprim.core.task import SceneContext, TaskSpec
 from neuprim.measure import display, draw, draw_sum, measure, summary
+from neuprim.plugins.blame import Suspects, blamed
+from neuprim.plugins.mechanism import PluginError
 from neuprim.plugins.registry import find_scene, load_task
 
-__all__ = ["FORMATS", "evaluate_run", "load_dataset", "load_run", "read_metrics", "render_run"]
+__all__ = ["FORMATS", "LOGS", "evaluate_run", "load_dataset", "load_run", "read_metrics", "render_run"]
 
 ANIMATIONS = ("webp", "gif", "mp4")
 FORMATS = ("png", "exr", *ANIMATIONS)
 """What ``neuprim render`` writes."""
 
+LOGS = "logs"
+"""Folder of a run directory for tracebacks of plugins."""
 
-def load_dataset(config: RunConfig, task: TaskSpec, progress: Callable[[str, float], None] = lambda text, fraction: None) -> Dataset:
-    """The data set of a run's configuration."""
+
+def load_dataset(
+    config: RunConfig,
+    task: TaskSpec,
+    progress: Callable[[str, float], None] = lambda text, fraction: None,
+    run_dir: Path | None = None,
+) -> Dataset:
+    """The data set of a run's configuration.
+
+    Args:
+        run_dir: where the traceback of a loader of another package is kept, should it crash.
+
+    Raises:
+        NeuprimError: what the loader refuses, or that it crashed.
+    """
     context = SceneContext(config.seed, cache_directory() / "scenes", progress)
-    return find_scene(task, config.scene_name).spec.load(config.scene, context)
+    load = find_scene(task, config.scene_name).spec.load
+    scene = Suspects(task.name, config.scene_name).scene
+    with blamed(scene.origin, scene.what, None if run_dir is None else run_dir / LOGS):
+        dataset = load(config.scene, context)
+    if not isinstance(dataset, Dataset):
+        found = f"a {type(dataset).__name__}" if dataset is not None else "None"
+        raise PluginError(f"{scene.what} of {scene.origin.origin}: its loader returned {found}; expected a neuprim.core.data.Dataset")
+    return dataset
 
 
 def load_run(run_dir: Path) -> tuple[RunConfig, TaskSpec, Primitives, dict[str, Any]]:
@@ -55,11 +80,15 @@ def load_run(run_dir: Path) -> tuple[RunConfig, TaskSpec, Primitives, dict[str, 
 def evaluate_run(run_dir: Path) -> dict[str, Any]:
     """The metrics of a run's last checkpoint, measured again from disk alone; the same numbers as the run's own."""
     config, task, model, header = load_run(run_dir)
-    dataset = load_dataset(config, task)
-    path = run_dir / "model.safetensors"
-    training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
-    views = measure(model, dataset, config.renderer)
-    return summary(config, model, dataset, views, path.stat().st_size, training)
+    suspects = Suspects(config.task, config.scene_name)
+    with suspects.watch(run_dir / LOGS):
+        dataset = load_dataset(config, task, run_dir=run_dir)
+        suspects.know(dataset)
+        check_dataset(dataset, task.conditions)
+        path = run_dir / "model.safetensors"
+        training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
+        views = measure(model, dataset, config.renderer)
+        return summary(config, model, dataset, views, path.stat().st_size, training)
 
 
 def render_run(
@@ -92,11 +121,14 @@ def render_run(
         BackendUnavailable: a format whose package is missing.
     """
     config, task, model, header = load_run(run_dir)
+    suspects = Suspects(config.task, config.scene_name)
+    watch = suspects.watch(run_dir / LOGS)
     background = torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)])
     color_space = str(header.get("color_space", "srgb"))
     lights: Sequence[Conditions] = ()
     if environment is not None:
-        around = _illumination(environment, config, task, header, conditions)
+        with watch:
+            around = _illumination(environment, config, task, header, conditions)
         lights = around.frames(environment.guesses)
         if not lights:
             raise ConfigError(f"--environment-unseen drop: all light of {environment.path} comes from where the model never saw any")
@@ -106,13 +138,16 @@ def render_run(
     if camera.endswith(".json"):
         views = [View(name, c) for name, c in read_cameras(Path(camera), size)]
     else:
-        dataset = load_dataset(config, task)
-        views = dataset.orbit(frames) if camera == "orbit" else [dataset.test.view(i) for i in range(len(dataset.test))]
+        dataset = load_dataset(config, task, run_dir=run_dir)
+        suspects.know(dataset)
+        with watch:
+            views = dataset.orbit(frames) if camera == "orbit" else [dataset.test.view(i) for i in range(len(dataset.test))]
     if size is not None:
         views = [replace(v, camera=v.camera.resized(*size)) for v in views]
     if lights:  # these replace the views' own; the first stands for all where only their presence counts
         views = [replace(v, conditions={**v.conditions, **lights[0]}) for v in views]
-    views, animated = with_conditions(views, task, conditions)
+    with watch:
+        views, animated = with_conditions(views, task, conditions)
     format = format or _format_of(out, animated)
 
     single = out is not None and out.suffix.lower() == f".{format}"
@@ -131,9 +166,10 @@ def render_run(
             progress(f"view {done // each + (done % each > 0)} of {len(views)}", done / (each * len(views)))
 
         each = max(len(lights), 1)
-        if lights:
-            return draw_sum(model, view, lights, config.renderer, background, drawn)
-        result = draw(model, view, config.renderer, background)
+        with watch:
+            if lights:
+                return draw_sum(model, view, lights, config.renderer, background, drawn)
+            result = draw(model, view, config.renderer, background)
         drawn()
         return result
 

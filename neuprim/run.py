@@ -19,14 +19,18 @@ from rich.console import Console
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint, images
 from neuprim.core.data import Clip, Dataset, View
-from neuprim.core.errors import CheckpointError, DataError
+from neuprim.core.data_check import check_dataset
+from neuprim.core.errors import CheckpointError
 from neuprim.core.files import write_json, write_text
 from neuprim.core.primitives import Primitives
 from neuprim.core.render import choose_backend
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer, initial_model
-from neuprim.evaluate import load_dataset
+from neuprim.core.uses import build_settings, loss_settings
+from neuprim.evaluate import LOGS, load_dataset
 from neuprim.measure import display, draw, measure, summary
+from neuprim.plugins.blame import Suspects, blamed
+from neuprim.plugins.checked import check_fields, checked_loss
 from neuprim.plugins.registry import load_loss, load_task
 from neuprim.progress import RunProgress
 from neuprim.report import error_map, write_report
@@ -51,13 +55,15 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
     console = console or Console(stderr=True)
     task = load_task(config.task)
     directory = config.output_dir
+    suspects = Suspects(config.task, config.scene_name, config.train.loss)
     with (
         compiling(config.renderer.backend != "reference") as kernels,
         RunProgress(console, f"{config.task}/{config.scene_name}") as progress,
+        suspects.watch(directory / LOGS),
     ):
-        dataset = load_dataset(config, task, progress.preparing)
-        if len(dataset.test) == 0:
-            raise DataError(f"{dataset.name}: the test split is empty")
+        dataset = load_dataset(config, task, progress.preparing, directory)
+        suspects.know(dataset)
+        check_dataset(dataset, task.conditions)
         progress.preparing("starting points", 0.0)
         trainer = make_trainer(config, task, dataset)
         saved = directory / "checkpoint.safetensors"
@@ -86,15 +92,20 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset) -> Trainer
     Raises:
         ConfigError: a rate or starting value for something the model does not have, or a loss that does not exist.
         DataError: the data set offers no starting point.
+        PluginError: the task of another package does not build what the data set needs.
     """
-    density, colour = task.build({**vars(config.model), "options": config.options}, dataset)
+    suspects, logs = Suspects(config.task, config.scene_name, config.train.loss), config.output_dir / LOGS
+    with blamed(suspects.task.origin, f"task {task.name!r}: build", logs):
+        density, colour = task.build(build_settings(task, config.model, config.options), dataset)
+    check_fields(density, colour, dataset, f"task {task.name!r} of {suspects.task.origin.origin}: build")
     model = initial_model(density, colour, dataset, config.model, config.seed)
     # A preset has rates for every density and colour of its task; the trainer refuses names that the model does not have.
     others = task.parameter_names() - model.params.keys()
     settings = replace(config.train, rates={k: v for k, v in config.train.rates.items() if k not in others})
-    factory = task.loss if config.train.loss is None else load_loss(config.train.loss).make
-    loss = factory({**vars(config.train), "options": config.options})
-    return Trainer(model, dataset, loss, settings, config.renderer, config.seed)
+    chosen = None if config.train.loss is None else load_loss(config.train.loss)
+    with blamed(suspects.loss.origin, suspects.loss.what, logs) as guard:
+        made = (task.loss if chosen is None else chosen.make)(loss_settings(chosen or task, config.train, config.options))
+    return Trainer(model, dataset, checked_loss(made, guard), settings, config.renderer, config.seed)
 
 
 def _train(trainer: Trainer, config: RunConfig, dataset: Dataset, progress: RunProgress) -> bool:

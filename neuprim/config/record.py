@@ -14,6 +14,7 @@ from neuprim.config.schema import build
 from neuprim.core.errors import CheckpointError, ConfigError, nearest
 from neuprim.core.render.settings import RenderSettings
 from neuprim.core.train.settings import ModelSettings, TrainSettings
+from neuprim.core.uses import OPTIONAL
 
 __all__ = ["RunConfig", "RunSettings"]
 
@@ -45,7 +46,8 @@ class RunConfig:
     Attributes:
         task, scene_name, preset: what was chosen.
         scene: the scene's own settings, as its loader takes them.
-        options: the task's own settings (``task.options``).
+        options: the task's own settings and those of its loss (``task.options``).
+        unused: names of the shared settings that nothing in this run reads; ``config.yaml`` does not show them.
         output_dir: the run's directory; it need not exist yet.
         seed: of every random number the run draws.
         resume: continue from the checkpoint in ``output_dir``, if there is one.
@@ -64,12 +66,13 @@ class RunConfig:
     seed: int = 0
     resume: bool = False
     options: dict[str, Any] = field(default_factory=dict)
+    unused: tuple[str, ...] = ()
     overrides: list[str] = field(default_factory=list)
     non_default: dict[str, tuple[Any, Any]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested values, in the layout of the command line's keys."""
-        return {
+        tree: dict[str, Any] = {
             "task": {"name": self.task, "options": self.options},
             "scene": {"name": self.scene_name, **self.scene},
             "preset": self.preset,
@@ -82,6 +85,10 @@ class RunConfig:
             "overrides": list(self.overrides),
             "non_default": {key: list(pair) for key, pair in self.non_default.items()},
         }
+        for name in self.unused:
+            group, _, key = name.partition(".")
+            del tree[group][key]
+        return tree
 
     def to_yaml(self) -> str:
         """The resolved configuration as YAML; :meth:`from_yaml` reads it back unchanged."""
@@ -136,6 +143,7 @@ class RunConfig:
             seed=common.seed,
             resume=common.resume,
             options=options,
+            unused=tuple(name for name in OPTIONAL if not _has(data, name)),
             overrides=overrides,
             non_default={str(key): (pair[0], pair[1]) for key, pair in non_default.items()},
         )
@@ -165,6 +173,11 @@ def _read(file: Path) -> Mapping[str, Any]:
     if not isinstance(data, Mapping):
         raise CheckpointError(f"{file}: not a run's configuration (expected a mapping, found {type(data).__name__})")
     return data
+
+
+def _has(data: Mapping[str, Any], name: str) -> bool:
+    group, _, key = name.partition(".")
+    return key in (data.get(group) or {})
 
 
 def _node(data: Mapping[str, Any], key: str) -> Mapping[str, Any]:

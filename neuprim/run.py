@@ -24,19 +24,20 @@ from neuprim.core.errors import CheckpointError
 from neuprim.core.files import write_json, write_text
 from neuprim.core.primitives import Primitives
 from neuprim.core.render import choose_backend
-from neuprim.core.task import TaskSpec
+from neuprim.core.task import Loss, TaskSpec
 from neuprim.core.train.trainer import Trainer, initial_model
 from neuprim.core.uses import build_settings, loss_settings
 from neuprim.evaluate import LOGS, load_dataset
 from neuprim.measure import display, draw, measure, summary
-from neuprim.plugins.blame import Suspects, blamed
+from neuprim.plugins.blame import Suspects, blamed, origin_of
 from neuprim.plugins.checked import check_fields, checked_loss
-from neuprim.plugins.registry import load_loss, load_task
+from neuprim.plugins.mechanism import PluginError
+from neuprim.plugins.registry import TASKS, load_loss, load_task
 from neuprim.progress import RunProgress
 from neuprim.report import error_map, write_report
 from neuprim.warm import compiled, compiling, mark_compiled
 
-__all__ = ["make_trainer", "run", "warm_up"]
+__all__ = ["make_loss", "make_trainer", "run", "warm_up"]
 
 _COMPILING = "compiling kernels, once per installation (about a minute)"
 _CURVE_VIEWS = 5  # held-out views behind the curve's eval_psnr
@@ -55,6 +56,7 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
     console = console or Console(stderr=True)
     task = load_task(config.task)
     directory = config.output_dir
+    loss = make_loss(config, task)  # options that it refuses must not cost the loading of the data
     suspects = Suspects(config.task, config.scene_name, config.train.loss)
     with (
         compiling(config.renderer.backend != "reference") as kernels,
@@ -65,7 +67,7 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
         suspects.know(dataset)
         check_dataset(dataset, task.conditions)
         progress.preparing("starting points", 0.0)
-        trainer = make_trainer(config, task, dataset)
+        trainer = make_trainer(config, task, dataset, loss)
         saved = directory / "checkpoint.safetensors"
         if config.resume and saved.exists():
             header, tensors = checkpoint.read(saved, "checkpoint")
@@ -86,26 +88,42 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
     return directory
 
 
-def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset) -> Trainer:
-    """A fresh model of a run's configuration and what fits it.
+def make_loss(config: RunConfig, task: TaskSpec) -> Loss:
+    """The loss of a run's configuration: the task's own, or the one that ``train.loss`` names.
 
     Raises:
-        ConfigError: a rate or starting value for something the model does not have, or a loss that does not exist.
+        ConfigError: no such loss, or an option that it refuses.
+        PluginError: it is another package's and cannot be made.
+    """
+    chosen = None if config.train.loss is None else load_loss(config.train.loss)
+    party = Suspects(config.task, config.scene_name, config.train.loss).loss
+    with blamed(party.origin, party.what, config.output_dir / LOGS) as guard:
+        made = (task.loss if chosen is None else chosen.make)(loss_settings(chosen or task, config.train, config.options))
+    if not callable(made):
+        raise PluginError(f"{party.what} of {party.origin.origin}: made a {type(made).__name__}; expected a function")
+    return checked_loss(made, guard)
+
+
+def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss | None = None) -> Trainer:
+    """A fresh model of a run's configuration and what fits it.
+
+    Args:
+        loss: as :func:`make_loss` makes it, which is called without one.
+
+    Raises:
+        ConfigError: a rate or starting value for something the model does not have.
         DataError: the data set offers no starting point.
         PluginError: the task of another package does not build what the data set needs.
     """
-    suspects, logs = Suspects(config.task, config.scene_name, config.train.loss), config.output_dir / LOGS
-    with blamed(suspects.task.origin, f"task {task.name!r}: build", logs):
+    origin = origin_of(TASKS, task.name, task.build.__module__)
+    with blamed(origin, f"task {task.name!r}: build", config.output_dir / LOGS):
         density, colour = task.build(build_settings(task, config.model, config.options), dataset)
-    check_fields(density, colour, dataset, f"task {task.name!r} of {suspects.task.origin.origin}: build")
+    check_fields(density, colour, dataset, f"task {task.name!r} of {origin.origin}: build")
     model = initial_model(density, colour, dataset, config.model, config.seed)
     # A preset has rates for every density and colour of its task; the trainer refuses names that the model does not have.
     others = task.parameter_names() - model.params.keys()
     settings = replace(config.train, rates={k: v for k, v in config.train.rates.items() if k not in others})
-    chosen = None if config.train.loss is None else load_loss(config.train.loss)
-    with blamed(suspects.loss.origin, suspects.loss.what, logs) as guard:
-        made = (task.loss if chosen is None else chosen.make)(loss_settings(chosen or task, config.train, config.options))
-    return Trainer(model, dataset, checked_loss(made, guard), settings, config.renderer, config.seed)
+    return Trainer(model, dataset, loss or make_loss(config, task), settings, config.renderer, config.seed)
 
 
 def _train(trainer: Trainer, config: RunConfig, dataset: Dataset, progress: RunProgress) -> bool:

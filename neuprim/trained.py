@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from neuprim.core.data import Dataset
 from neuprim.core.extensions import TrainedModel
 from neuprim.core.files import cache_directory
 from neuprim.core.task import SceneContext
 from neuprim.core.volume_source import VolumeSource
-from neuprim.evaluate import load_dataset, load_run
+from neuprim.evaluate import LOGS, load_dataset, load_run
+from neuprim.plugins.blame import Suspects, blamed
 from neuprim.plugins.registry import find_scene
 
 __all__ = ["trained_model"]
@@ -27,6 +29,13 @@ def trained_model(run_dir: Path, progress: Progress = lambda text, fraction: Non
 
     def volume() -> VolumeSource | None:
         load = find_scene(task, config.scene_name).spec.volume
-        return load(config.scene, SceneContext(config.seed, cache_directory() / "scenes", progress)) if load else None
+        if load is None:
+            return None
+        scene = Suspects(task.name, config.scene_name).scene
+        with blamed(scene.origin, f"{scene.what}: volume", run_dir / LOGS):
+            return load(config.scene, SceneContext(config.seed, cache_directory() / "scenes", progress))
 
-    return TrainedModel(run_dir, task, model, header, config.scene, config.renderer, lambda: load_dataset(config, task, progress), volume)
+    def dataset() -> Dataset:
+        return load_dataset(config, task, progress, run_dir)
+
+    return TrainedModel(run_dir, task, model, header, config.scene, config.renderer, dataset, volume)

@@ -96,11 +96,11 @@ def check_preset(spec: TaskSpec, loss: LossExtension | None, preset: Mapping[str
 
 
 def _refuse(name: str, spec: TaskSpec, loss: LossExtension | None) -> None:
-    owner, uses, which = f"task {spec.name!r}", spec.uses, OPTIONAL
+    owner, uses = f"task {spec.name!r}", spec.uses
     if loss is not None and name.startswith("train."):
-        owner, uses, which = f"loss {loss.name!r}", loss.uses, tuple(n for n in OPTIONAL if n.startswith("train."))
-    used = ", ".join(n for n in which if n in uses)
-    raise ConfigError(f"{name}: {owner} does not use this setting; it uses {used or 'none of ' + ', '.join(which)}")
+        owner, uses = f"loss {loss.name!r}", loss.uses
+    used = f"; it uses {', '.join(uses)}" if uses else ""
+    raise ConfigError(f"{name}: {owner} does not use this setting{used}")
 
 
 def _dotted(where: str, value: Any) -> Iterator[str]:

@@ -134,7 +134,10 @@ def _view(view: View, where: str, conditions: Sequence[ConditionSpec]) -> None:
         if spec.name not in view.conditions:
             there = ", ".join(sorted(view.conditions)) or "none"
             raise DatasetFault(f"{where}: condition {spec.name!r} is missing; found {there}, the task needs it")
-        _floats(f"{where}: condition {spec.name!r}", view.conditions[spec.name], tuple(spec.shape))
+        value, shape = view.conditions[spec.name], tuple(spec.shape)
+        if not isinstance(value, Tensor) or tuple(value.shape) != shape:
+            _refuse(f"{where}: condition {spec.name!r}", value, torch.float32, shape)
+        _finite(value, f"{where}: condition {spec.name!r}")
 
 
 def _camera(camera: AnyCamera, where: str) -> None:
@@ -169,8 +172,8 @@ def _finite(value: Tensor, where: str) -> None:
     bad = ~torch.isfinite(value)
     if bool(bad.any()):
         place = bad.nonzero()[0].tolist()
-        at = f" at {place}" if place else ""
-        raise DatasetFault(f"{where}: found {int(bad.sum())} values that are NaN or infinite, the first{at}; expected finite numbers")
+        first = f", the first at {place}" if place else ""
+        raise DatasetFault(f"{where}: found {int(bad.sum())} values that are NaN or infinite{first}; expected finite numbers")
 
 
 def _one_of(where: str, value: object, choices: Iterable[str]) -> None:

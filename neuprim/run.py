@@ -116,9 +116,9 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss
         PluginError: the task of another package does not build what the data set needs.
     """
     origin = origin_of(TASKS, task.name, task.build.__module__)
-    with blamed(origin, f"task {task.name!r}: build", config.output_dir / LOGS):
+    with blamed(origin, f"build of task {task.name!r}", config.output_dir / LOGS):
         density, colour = task.build(build_settings(task, config.model, config.options), dataset)
-    check_fields(density, colour, dataset, f"task {task.name!r} of {origin.origin}: build")
+    check_fields(density, colour, dataset, f"build of task {task.name!r} of {origin.origin}")
     model = initial_model(density, colour, dataset, config.model, config.seed)
     # A preset has rates for every density and colour of its task; the trainer refuses names that the model does not have.
     others = task.parameter_names() - model.params.keys()

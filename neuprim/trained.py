@@ -32,7 +32,7 @@ def trained_model(run_dir: Path, progress: Progress = lambda text, fraction: Non
         if load is None:
             return None
         scene = Suspects(task.name, config.scene_name).scene
-        with blamed(scene.origin, f"{scene.what}: volume", run_dir / LOGS):
+        with blamed(scene.origin, f"volume of {scene.what}", run_dir / LOGS):
             return load(config.scene, SceneContext(config.seed, cache_directory() / "scenes", progress))
 
     def dataset() -> Dataset:

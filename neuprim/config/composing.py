@@ -75,7 +75,7 @@ def _compose(overrides: Sequence[str], check_output: bool, files: Files) -> RunC
     check_typed(spec, loss, values)
     options = _options(spec, loss, own.options, plain, full)
     check_names(spec, settings)
-    with blamed(origin_of(TASKS, spec.name), f"task {spec.name!r}: check"):
+    with blamed(origin_of(TASKS, spec.name), f"check of task {spec.name!r}"):
         spec.check(build_settings(spec, settings.model, options))
     scene = _scene(full["scene"], base["scene"], declared_paths)
     directory = output_directory(settings.output_dir, f"{spec.name}-{scene_name}", settings.resume, check_output)

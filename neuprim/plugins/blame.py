@@ -37,7 +37,7 @@ class blamed:
 
     Args:
         origin: the plugin.
-        what: e.g. ``"task 'glow': build"``.
+        what: e.g. ``"build of task 'glow'"``.
         folder: for the file with the traceback, usually ``RUN_DIR/logs``; a temporary file takes its place while the directory around
             it holds nothing, because a run refuses to write into one that does.
 
@@ -117,7 +117,7 @@ class _Watch:
             return
         called = _frames(trace)[1:]
         for frame in reversed(called):
-            for party in (self.suspects.loss, scene, self.suspects.task):
+            for party in (self.suspects.task, scene, self.suspects.loss):  # of one package, the most general
                 if party.origin.distribution != _OURS and _top(frame[0]) in party.modules:
                     theirs = [f for f in called if _top(f[0]) in party.modules]
                     raise PluginError(_line(party.what, party.origin, error, theirs, self.folder)) from error

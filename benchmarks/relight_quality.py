@@ -48,7 +48,7 @@ FORMS = {
     "multiplicative, visibility per pixel": ("model.colour.form=multiplicative", "model.colour.visibility=pixel"),
     "multiplicative, visibility per primitive": ("model.colour.form=multiplicative", "model.colour.visibility=primitive"),
 }
-LOSSES = {loss: (f"task.options.loss={loss}",) for loss in ("l1", "compressed", "relative")}
+LOSSES = {loss: (f"train.loss={loss}",) for loss in ("l1", "compressed", "relative")}
 CLASSES = ("lit", "cast_shadow", "attached_shadow", "highlight")
 KEYS = (
     "psnr_linear_clamped", "psnr_display", "ssim_display", *(f"psnr_pooled_{c}" for c in CLASSES),

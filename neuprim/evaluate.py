@@ -11,12 +11,13 @@ from typing import Any
 
 import torch
 
-from neuprim.config import RunConfig, scene_of, task_of
+from neuprim.config import RunConfig, scene_of, suspects_of, task_of
 from neuprim.core import images
 from neuprim.core.camera_file import read_cameras
 from neuprim.core.channels import Channels, channels_of, stored_channels
 from neuprim.core.checkpoint import load_model
 from neuprim.core.data import Dataset, View
+from neuprim.core.data_check import check_dataset
 from neuprim.core.datasets.records import Record
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
 from neuprim.core.errors import ConfigError, DataError
@@ -26,25 +27,45 @@ from neuprim.core.film import write_film
 from neuprim.core.primitives import Primitives
 from neuprim.core.task import SceneContext, TaskSpec
 from neuprim.measure import draw, draw_sum, measure, summary
+from neuprim.plugins.blame import blamed
+from neuprim.plugins.mechanism import PluginError
 from neuprim.plugins.provenance import warn_of_neuprim
 
-__all__ = ["FORMATS", "evaluate_run", "load_dataset", "load_run", "read_metrics", "render_run"]
+__all__ = ["FORMATS", "LOGS", "evaluate_run", "load_dataset", "load_run", "read_metrics", "render_run"]
 
 ANIMATIONS = ("webp", "gif", "mp4")
 _RAW = ("exr", "npy")
 FORMATS = ("png", "exr", "npy", *ANIMATIONS)
 """What ``neuprim render`` writes: pictures of what the task's channels look like, but all channels as they are in EXR and npy."""
 
+LOGS = "logs"
+"""Folder of a run directory for tracebacks of plugins."""
+
 
 def load_dataset(
     config: RunConfig,
     task: TaskSpec,
     progress: Callable[[str, float], None] = lambda text, fraction: None,
-    file: Path | None = None,
+    run_dir: Path | None = None,
 ) -> Dataset:
-    """The data set of a run's configuration; ``file`` is where that was read from, for messages."""
+    """The data set of a run's configuration.
+
+    Args:
+        run_dir: the finished run that the configuration was read from: messages name its file, and the traceback of a loader of
+            another package is kept there, should it crash. None: a run that is only about to be made.
+
+    Raises:
+        NeuprimError: what the loader refuses, or that it crashed.
+    """
     context = SceneContext(config.seed, cache_directory() / "scenes", progress)
-    return scene_of(config, task, file).spec.load(config.scene, context)
+    load = scene_of(config, task, None if run_dir is None else run_dir / "config.yaml").spec.load
+    scene = suspects_of(config).scene
+    with blamed(scene.origin, scene.what, (config.output_dir if run_dir is None else run_dir) / LOGS):
+        dataset = load(config.scene, context)
+    if not isinstance(dataset, Dataset):
+        found = f"a {type(dataset).__name__}" if dataset is not None else "None"
+        raise PluginError(f"{scene.what} of {scene.origin.origin}: its loader returned {found}; expected a neuprim.core.data.Dataset")
+    return dataset
 
 
 def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Primitives, dict[str, Any]]:
@@ -70,12 +91,16 @@ def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Pr
 def evaluate_run(run_dir: Path) -> dict[str, Any]:
     """The metrics of a run's last checkpoint, measured again from disk alone; the same numbers as the run's own."""
     config, task, model, header = load_run(run_dir)
-    dataset = load_dataset(config, task, file=run_dir / "config.yaml")
-    path = run_dir / "model.safetensors"
-    training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
-    channels = channels_of(task, dataset)
-    views = measure(model, dataset, config.renderer, channels)
-    return summary(config, model, dataset, channels, views, path.stat().st_size, training)
+    suspects = suspects_of(config)
+    with suspects.watch(run_dir / LOGS):
+        dataset = load_dataset(config, task, run_dir=run_dir)
+        suspects.know(dataset)
+        check_dataset(dataset, task.conditions)
+        path = run_dir / "model.safetensors"
+        training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
+        channels = channels_of(task, dataset)
+        views = measure(model, dataset, config.renderer, channels)
+        return summary(config, model, dataset, channels, views, path.stat().st_size, training)
 
 
 def render_run(
@@ -108,11 +133,14 @@ def render_run(
         BackendUnavailable: a format whose package is missing.
     """
     config, task, model, header = load_run(run_dir)
+    suspects = suspects_of(config)
+    watch = suspects.watch(run_dir / LOGS)
     background = torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)])
     channels = stored_channels(run_dir, header, task, model.colour.channels)
     lights: Sequence[Conditions] = ()
     if environment is not None:
-        around = _illumination(environment, config, task, header, conditions)
+        with watch:
+            around = _illumination(environment, config, task, header, conditions)
         lights = around.frames(environment.guesses)
         if not lights:
             raise ConfigError(f"--environment-unseen drop: all light of {environment.path} comes from where the model never saw any")
@@ -122,13 +150,16 @@ def render_run(
     if camera.endswith(".json"):
         views = [View(name, c) for name, c in read_cameras(Path(camera), size)]
     else:
-        dataset = load_dataset(config, task, file=run_dir / "config.yaml")
-        views = dataset.orbit(frames) if camera == "orbit" else [dataset.test.view(i) for i in range(len(dataset.test))]
+        dataset = load_dataset(config, task, run_dir=run_dir)
+        suspects.know(dataset)
+        with watch:
+            views = dataset.orbit(frames) if camera == "orbit" else [dataset.test.view(i) for i in range(len(dataset.test))]
     if size is not None:
         views = [replace(v, camera=v.camera.resized(*size)) for v in views]
     if lights:  # these replace the views' own; the first stands for all where only their presence counts
         views = [replace(v, conditions={**v.conditions, **lights[0]}) for v in views]
-    views, animated = with_conditions(views, task, conditions)
+    with watch:
+        views, animated = with_conditions(views, task, conditions)
     format = format or _format_of(out, animated)
     if channels.partial and format not in _RAW:
         tell(f"shown: {channels.shown}; --format exr and npy hold all channels")
@@ -149,9 +180,10 @@ def render_run(
             progress(f"view {done // each + (done % each > 0)} of {len(views)}", done / (each * len(views)))
 
         each = max(len(lights), 1)
-        if lights:
-            return draw_sum(model, view, lights, config.renderer, background, drawn)
-        result = draw(model, view, config.renderer, background)
+        with watch:
+            if lights:
+                return draw_sum(model, view, lights, config.renderer, background, drawn)
+            result = draw(model, view, config.renderer, background)
         drawn()
         return result
 

@@ -9,7 +9,7 @@ from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.plugins.registry import EXPORTERS, INSPECTORS, LOSSES, SCENES, Group, PluginReport, list_tasks, survey
 
 if TYPE_CHECKING:
-    from neuprim.core.extensions import SceneExtension
+    from neuprim.core.extensions import LossExtension, SceneExtension
     from neuprim.core.task import TaskSpec
 
 __all__ = ["list_plugins"]
@@ -44,7 +44,12 @@ def list_plugins() -> list[str]:
         reports = group.survey()
         if reports:
             width = max(len(r.info.name) for r in reports)
-            lines += [heading, *(f"  {_line(r, f'{r.info.name:{width}}')}" for r in reports), ""]
+            lines.append(heading)
+            for report in reports:
+                lines.append(f"  {_line(report, f'{report.info.name:{width}}')}")
+                if group is LOSSES and report.spec is not None:
+                    lines += [f"    {line}" for line in _options(report.spec)]
+            lines.append("")
     return lines
 
 
@@ -69,7 +74,13 @@ def _task(spec: TaskSpec, added: list[PluginReport[SceneExtension]]) -> list[str
     found.append(("presets", ", ".join(name + " (default)" * (name == default.preset) for name in presets(spec))))
     if spec.conditions:
         found.append(("conditions", ", ".join(f"{c.name} [{c.unit}]" for c in spec.conditions)))
+    found += [("options", line) for line in _options(spec)]
     return [f"{title if i == 0 or title != found[i - 1][0] else '':10}  {text}" for i, (title, text) in enumerate(found)]
+
+
+def _options(spec: TaskSpec | LossExtension) -> list[str]:
+    """What may stand under ``task.options``, with defaults."""
+    return [f"task.options.{name}={default}  {text}" for name, (default, text) in spec.options.items()]
 
 
 def _scene(spec: TaskSpec, report: PluginReport[SceneExtension]) -> tuple[str, str]:

@@ -23,6 +23,7 @@ from neuprim.config import RunConfig
 from neuprim.core import images
 from neuprim.core.channels import Channels
 from neuprim.core.data import Dataset, View
+from neuprim.core.data_check import check_mask, check_pixels
 from neuprim.core.fields import Conditions
 from neuprim.core.metrics import means, psnr, ssim, to_json
 from neuprim.core.primitives import Primitives
@@ -96,13 +97,17 @@ def measure(
     result = []
     for i in range(len(views)):
         view, pixels = views.view(i), views.pixels(i)
+        check_pixels("test", view, pixels, dataset.channels)
         truth = pixels.over(background)
         start = time.perf_counter()
         rendered = draw(model, view, settings, background)
         seconds = time.perf_counter() - start
         if pixels.mask is not None:
             rendered = torch.where(pixels.mask[..., None], rendered, truth)
-        more = _more(rendered, truth, dataset, channels, dataset.mask(i), pixels.mask) | dataset.judge(i, rendered, truth)
+        counted = dataset.mask(i)
+        if counted is not None:
+            check_mask("test", view, counted)
+        more = _more(rendered, truth, dataset, channels, counted, pixels.mask) | dataset.judge(i, rendered, truth)
         result.append(ViewMetrics(view.name, psnr(rendered, truth, pixels.mask), ssim(rendered, truth), seconds, more))
         if seen is not None:
             seen(i, view, rendered, truth)

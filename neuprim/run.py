@@ -16,25 +16,30 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from neuprim.config import RunConfig, made_now, task_of
+from neuprim.config import RunConfig, made_now, suspects_of, task_of
 from neuprim.core import checkpoint, images
 from neuprim.core.channels import Channels, channels_of
 from neuprim.core.data import Clip, Dataset, View
-from neuprim.core.errors import CheckpointError, ConfigError, DataError
+from neuprim.core.data_check import check_dataset
+from neuprim.core.errors import CheckpointError
 from neuprim.core.files import write_json, write_text
 from neuprim.core.primitives import Primitives
 from neuprim.core.render import choose_backend
-from neuprim.core.task import TaskSpec
+from neuprim.core.task import Loss, TaskSpec
 from neuprim.core.train.trainer import Trainer, initial_model
-from neuprim.evaluate import load_dataset
+from neuprim.core.uses import build_settings, loss_settings
+from neuprim.evaluate import LOGS, load_dataset
 from neuprim.measure import draw, measure, summary
+from neuprim.plugins.blame import blamed
+from neuprim.plugins.checked import check_fields, checked_loss
+from neuprim.plugins.mechanism import PluginError
 from neuprim.plugins.provenance import check_resumed
 from neuprim.plugins.registry import load_loss
 from neuprim.progress import RunProgress
 from neuprim.report import error_map, write_report
 from neuprim.warm import compiled, compiling, mark_compiled
 
-__all__ = ["make_trainer", "run", "warm_up"]
+__all__ = ["make_loss", "make_trainer", "run", "warm_up"]
 
 _COMPILING = "compiling kernels, once per installation (about a minute)"
 _CURVE_VIEWS = 5  # held-out views behind the curve's eval_psnr
@@ -54,18 +59,21 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
     task = task_of(config)
     config = replace(config, made_by=made_now(config, task))
     directory = config.output_dir
+    loss = make_loss(config, task)  # options that it refuses must not cost the loading of the data
+    suspects = suspects_of(config)
     with (
         compiling(config.renderer.backend != "reference") as kernels,
         RunProgress(console, f"{config.task}/{config.scene_name}") as progress,
+        suspects.watch(directory / LOGS),
     ):
         dataset = load_dataset(config, task, progress.preparing)
-        if len(dataset.test) == 0:
-            raise DataError(f"{dataset.name}: the test split is empty")
+        suspects.know(dataset)
+        check_dataset(dataset, task.conditions)
         channels = channels_of(task, dataset)
         if channels.partial:
             progress.note(f"shown: {channels.shown}; task {task.name!r} has no display that shows them all")
         progress.preparing("starting points", 0.0)
-        trainer = make_trainer(config, task, dataset)
+        trainer = make_trainer(config, task, dataset, loss)
         saved = directory / "checkpoint.safetensors"
         if config.resume and saved.exists():
             header, tensors = checkpoint.read(saved, "checkpoint")
@@ -87,26 +95,42 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
     return directory
 
 
-def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset) -> Trainer:
-    """A fresh model of a run's configuration and what fits it.
+def make_loss(config: RunConfig, task: TaskSpec) -> Loss:
+    """The loss of a run's configuration: the task's own, or the one that ``train.loss`` names.
 
     Raises:
-        ConfigError: a rate or starting value for something the model does not have, a loss that does not exist, or a colour of another
-            number of channels than the data.
-        DataError: the data set offers no starting point.
+        ConfigError: no such loss, or an option that it refuses.
+        PluginError: it is another package's and cannot be made.
     """
-    density, colour = task.build({**vars(config.model), "options": config.options}, dataset)
-    if colour.channels != dataset.channels:
-        raise ConfigError(
-            f"task {task.name!r} built a colour of {colour.channels} channels; expected {dataset.channels}, as in {dataset.name}"
-        )
+    chosen = None if config.train.loss is None else load_loss(config.train.loss)
+    party = suspects_of(config).loss
+    with blamed(party.origin, party.what, config.output_dir / LOGS) as guard:
+        made = (task.loss if chosen is None else chosen.make)(loss_settings(chosen or task, config.train, config.options))
+    if not callable(made):
+        raise PluginError(f"{party.what} of {party.origin.origin}: made a {type(made).__name__}; expected a function")
+    return checked_loss(made, guard)
+
+
+def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss | None = None) -> Trainer:
+    """A fresh model of a run's configuration and what fits it.
+
+    Args:
+        loss: as :func:`make_loss` makes it, which is called without one.
+
+    Raises:
+        ConfigError: a rate or starting value for something the model does not have.
+        DataError: the data set offers no starting point.
+        PluginError: the task of another package does not build what the data set needs.
+    """
+    origin = suspects_of(config).task.origin
+    with blamed(origin, f"build of task {task.name!r}", config.output_dir / LOGS):
+        density, colour = task.build(build_settings(task, config.model, config.options), dataset)
+    check_fields(density, colour, dataset, f"build of task {task.name!r} of {origin.origin}")
     model = initial_model(density, colour, dataset, config.model, config.seed)
     # A preset has rates for every density and colour of its task; the trainer refuses names that the model does not have.
     others = task.parameter_names() - model.params.keys()
     settings = replace(config.train, rates={k: v for k, v in config.train.rates.items() if k not in others})
-    factory = task.loss if config.train.loss is None else load_loss(config.train.loss).make
-    loss = factory({**vars(config.train), "options": config.options})
-    return Trainer(model, dataset, loss, settings, config.renderer, config.seed)
+    return Trainer(model, dataset, loss or make_loss(config, task), settings, config.renderer, config.seed)
 
 
 def _train(trainer: Trainer, config: RunConfig, dataset: Dataset, channels: Channels, progress: RunProgress) -> bool:

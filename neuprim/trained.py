@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from neuprim.config import scene_of
+from neuprim.config import scene_of, suspects_of
 from neuprim.core.data import Dataset
 from neuprim.core.extensions import TrainedModel
 from neuprim.core.files import cache_directory
 from neuprim.core.task import SceneContext
 from neuprim.core.volume_source import VolumeSource
-from neuprim.evaluate import load_dataset, load_run
+from neuprim.evaluate import LOGS, load_dataset, load_run
+from neuprim.plugins.blame import blamed
 
 __all__ = ["trained_model"]
 
@@ -29,9 +30,13 @@ def trained_model(run_dir: Path, progress: Progress = lambda text, fraction: Non
 
     def volume() -> VolumeSource | None:
         load = scene_of(config, task, file).spec.volume
-        return load(config.scene, SceneContext(config.seed, cache_directory() / "scenes", progress)) if load else None
+        if load is None:
+            return None
+        scene = suspects_of(config).scene
+        with blamed(scene.origin, f"volume of {scene.what}", run_dir / LOGS):
+            return load(config.scene, SceneContext(config.seed, cache_directory() / "scenes", progress))
 
     def dataset() -> Dataset:
-        return load_dataset(config, task, progress, file)
+        return load_dataset(config, task, progress, run_dir)
 
     return TrainedModel(run_dir, task, model, header, config.scene, config.renderer, dataset, volume)

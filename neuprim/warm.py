@@ -82,12 +82,14 @@ def main() -> None:
     """A training step on a few primitives: forward, backward, colours, loss, optimiser."""
     from neuprim.core.cameras import Camera, look_at
     from neuprim.core.cosine import CosineDensity
+    from neuprim.core.data import View
     from neuprim.core.fields import Constant
     from neuprim.core.geometry import GEOMETRY_SPECS, Geometry
     from neuprim.core.primitives import Lowered
     from neuprim.core.render import RenderSettings, render_lowered
     from neuprim.core.schema import InitContext, ParameterSpec
     from neuprim.core.sh_cpu import fused_colors
+    from neuprim.core.task import Supervision
     from neuprim.core.train.losses import photometric
     from neuprim.core.train.optimizer import RowAdam
 
@@ -105,7 +107,7 @@ def main() -> None:
     colour = Constant(fused_colors(params["means"], params["dc"], params["rest"], camera.position, 3) + 0.5)
     output = render_lowered(Lowered(geometry, density.lower(params, geometry, {}), colour), camera, RenderSettings(backend="cpu"))
     output.stats.pixel_error = torch.ones(output.rgb.shape[:2])
-    loss, _ = photometric({"ssim_weight": 0.2})(output.rgb, torch.zeros_like(output.rgb))
+    loss, _ = photometric({"ssim_weight": 0.2})(output.rgb, torch.zeros_like(output.rgb), Supervision(View("warm", camera)))
     loss.backward()
     RowAdam(specs, params).step(params, {spec.name: 1e-3 for spec in specs})
     mark_compiled("Constant")

@@ -4,7 +4,7 @@ from neuprim.config.composing import compose, compose_all, preset_settings
 from neuprim.config.groups import check_groups, check_scene, presets, task_choices
 from neuprim.config.overrides import expand_sweep
 from neuprim.config.record import RunConfig, RunSettings
-from neuprim.config.stored import made_now, scene_of, task_of
+from neuprim.config.stored import made_now, scene_of, suspects_of, task_of
 
 __all__ = [
     "RunConfig",
@@ -18,6 +18,7 @@ __all__ = [
     "preset_settings",
     "presets",
     "scene_of",
+    "suspects_of",
     "task_choices",
     "task_of",
 ]

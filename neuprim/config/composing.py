@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuprim import __version__
+from neuprim.config.declared import check_names, check_preset, check_typed, complete_options, options_of, unused
 from neuprim.config.groups import check_groups, check_scene, presets, task_choices
 from neuprim.config.outputs import output_directory
 from neuprim.config.overrides import Assignment, expand_sweep, parse, sweep_names, swept_keys
@@ -20,11 +21,14 @@ from neuprim.config.record import RunConfig, RunSettings
 from neuprim.config.resuming import not_installed
 from neuprim.config.schema import REQUIRED, build, defaults, is_free, like, setting_names
 from neuprim.core.errors import ConfigError, nearest
+from neuprim.core.uses import build_settings
+from neuprim.plugins.blame import blamed
 from neuprim.plugins.names import split
 from neuprim.plugins.provenance import MadeBy, Maker
 from neuprim.plugins.registry import LOSSES, TASKS, UnknownPlugin, find_scene, load_loss, load_task
 
 if TYPE_CHECKING:
+    from neuprim.core.extensions import LossExtension
     from neuprim.core.task import TaskSpec
 
 __all__ = ["compose", "compose_all", "preset_settings"]
@@ -85,11 +89,13 @@ def _composed(
         _check_key(assignment, base, scene_name)
     plain, full = _merge(base, values)
     settings = _settings(full)
-    spec.check(vars(settings.model))
-    loss = None
-    if settings.train.loss is not None:
-        load_loss(settings.train.loss)
-        loss = Maker.of(LOSSES.find(settings.train.loss))
+    loss = None if settings.train.loss is None else load_loss(settings.train.loss)
+    loss_maker = None if settings.train.loss is None else Maker.of(LOSSES.find(settings.train.loss))
+    check_typed(spec, loss, values)
+    options = _options(spec, loss, own.options, plain, full)
+    check_names(spec, settings)
+    with blamed(task_info, f"check of task {spec.name!r}"):
+        spec.check(build_settings(spec, settings.model, options))
     scene = _scene(full["scene"], base["scene"], declared_paths)
     directory = output_directory(settings.output_dir, f"{_in_path(task_word)}-{_in_path(scene_word)}", settings.resume, check_output)
     full["scene"] = scene
@@ -105,10 +111,11 @@ def _composed(
         output_dir=directory,
         seed=settings.seed,
         resume=settings.resume,
-        options=full["task"]["options"],
+        options=options,
+        unused=unused(spec, loss),
         overrides=list(overrides),
         non_default={**changed, **_differences(_typed(plain), _typed(full, settings))},
-        made_by=MadeBy(__version__, Maker.of(task_info), found.added_by and Maker.of(found.added_by, scene_name), loss),
+        made_by=MadeBy(__version__, Maker.of(task_info), found.added_by and Maker.of(found.added_by, scene_name), loss_maker),
     )
 
 
@@ -204,7 +211,8 @@ def _base(spec: TaskSpec, scene: str, preset: str, options: dict[str, Any], file
     merged = OmegaConf.merge(defaults(RunSettings), common, preset_node)
     base = {**_plain(merged, resolve=False), "scene": scene_node, "task": {"options": options}}
     try:
-        _settings(_plain(OmegaConf.create(base)))
+        name = _settings(_plain(OmegaConf.create(base))).train.loss
+        check_preset(spec, None if name is None else load_loss(name), preset_node)
     except ConfigError as error:
         raise ConfigError(f"{place}: {error}") from error
     return base, declared
@@ -280,6 +288,18 @@ def _check_key(assignment: Assignment, base: Mapping[str, Any], scene_name: str)
         raise ConfigError(f"{key}: no such setting of scene {scene_name!r}{hint}")
     inside = [n for n in names if n.startswith(head + ".")]
     raise ConfigError(f"{key}: no such setting" + nearest(key, inside or names))
+
+
+def _options(
+    spec: TaskSpec, loss: LossExtension | None, own: Mapping[str, Any], plain: dict[str, Any], full: dict[str, Any]
+) -> dict[str, Any]:
+    """All of ``task.options``, checked; ``plain`` and ``full`` get those without and with the user's values."""
+    declared = options_of(spec, loss)
+    owner = f"task {spec.name!r}" if loss is None or not loss.options else f"task {spec.name!r} with loss {loss.name!r}"
+    for tree, given in ((plain, own), (full, full["task"]["options"])):
+        tree["task"] = {"options": complete_options(declared, given, owner)}
+    options: dict[str, Any] = full["task"]["options"]
+    return options
 
 
 def _scene(node: Mapping[str, Any], declared: Mapping[str, Any], paths: Sequence[str]) -> dict[str, Any]:

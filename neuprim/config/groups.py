@@ -11,6 +11,7 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from typing import TYPE_CHECKING, Any
 
+from neuprim.config.declared import complete_options
 from neuprim.core.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -23,7 +24,11 @@ DEFAULT_PRESET = "quick"
 
 @dataclass(frozen=True)
 class TaskChoices:
-    """What ``task/NAME.yaml`` says: the scene and preset of a run that names none, and the task's own free settings."""
+    """What ``task/NAME.yaml`` says: the scene and preset of a run that names none, and defaults of the task's own options.
+
+    Attributes:
+        options: all that the task declares; those that the file does not name at their defaults.
+    """
 
     scene: str
     preset: str
@@ -34,7 +39,8 @@ def task_choices(spec: TaskSpec) -> TaskChoices:
     """Reads ``task/NAME.yaml``, which is a plain file without a defaults list.
 
     Raises:
-        ConfigError: it is not YAML, or has a key other than ``scene``, ``preset`` and ``options``.
+        ConfigError: it is not YAML, has a key other than ``scene``, ``preset`` and ``options``, or sets an option that the task does
+            not declare.
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
@@ -58,7 +64,10 @@ def task_choices(spec: TaskSpec) -> TaskChoices:
             raise ConfigError(f"task {spec.name!r}: {file}: {key}={value}: no such {key}" + nearest(str(value), names))
     if not isinstance(options, dict):
         raise ConfigError(f"task {spec.name!r}: {file}: options: expected a mapping")
-    return TaskChoices(scene, preset, {str(k): v for k, v in options.items()})
+    try:
+        return TaskChoices(scene, preset, complete_options(spec.options, options, "its TaskSpec", "options"))
+    except ConfigError as error:
+        raise ConfigError(f"task {spec.name!r}: {file}: {error}") from error
 
 
 def presets(spec: TaskSpec) -> list[str]:

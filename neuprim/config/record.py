@@ -14,6 +14,7 @@ from neuprim.config.schema import build
 from neuprim.core.errors import CheckpointError, ConfigError, nearest
 from neuprim.core.render.settings import RenderSettings
 from neuprim.core.train.settings import ModelSettings, TrainSettings
+from neuprim.core.uses import OPTIONAL
 from neuprim.plugins.names import split
 from neuprim.plugins.provenance import MadeBy
 
@@ -47,7 +48,8 @@ class RunConfig:
     Attributes:
         task, scene_name, preset: what was chosen.
         scene: the scene's own settings, as its loader takes them.
-        options: the task's own settings (``task.options``).
+        options: the task's own settings and those of its loss (``task.options``).
+        unused: names of the shared settings that nothing in this run reads; ``config.yaml`` does not show them.
         output_dir: the run's directory; it need not exist yet.
         seed: of every random number the run draws.
         resume: continue from the checkpoint in ``output_dir``, if there is one.
@@ -67,13 +69,14 @@ class RunConfig:
     seed: int = 0
     resume: bool = False
     options: dict[str, Any] = field(default_factory=dict)
+    unused: tuple[str, ...] = ()
     overrides: list[str] = field(default_factory=list)
     non_default: dict[str, tuple[Any, Any]] = field(default_factory=dict)
     made_by: MadeBy | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested values, in the layout of the command line's keys."""
-        return {
+        tree: dict[str, Any] = {
             "task": {"name": self.task, "options": self.options},
             "scene": {"name": self.scene_name, **self.scene},
             "preset": self.preset,
@@ -87,6 +90,10 @@ class RunConfig:
             "non_default": {key: list(pair) for key, pair in self.non_default.items()},
             **({} if self.made_by is None else {"made_by": self.made_by.to_dict()}),
         }
+        for name in self.unused:
+            group, _, key = name.partition(".")
+            del tree[group][key]
+        return tree
 
     def to_yaml(self) -> str:
         """The resolved configuration as YAML; :meth:`from_yaml` reads it back unchanged."""
@@ -141,6 +148,7 @@ class RunConfig:
             seed=common.seed,
             resume=common.resume,
             options=options,
+            unused=tuple(name for name in OPTIONAL if not _has(data, name)),
             overrides=overrides,
             non_default={str(key): (pair[0], pair[1]) for key, pair in non_default.items()},
             made_by=MadeBy.from_dict(data["made_by"]) if data.get("made_by") is not None else None,
@@ -182,6 +190,11 @@ def _read(file: Path) -> Mapping[str, Any]:
     if not isinstance(data, Mapping):
         raise CheckpointError(f"{file}: not a run's configuration (expected a mapping, found {type(data).__name__})")
     return data
+
+
+def _has(data: Mapping[str, Any], name: str) -> bool:
+    group, _, key = name.partition(".")
+    return key in (data.get(group) or {})
 
 
 def _node(data: Mapping[str, Any], key: str) -> Mapping[str, Any]:

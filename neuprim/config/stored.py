@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from neuprim import __version__
 from neuprim.config.record import RunConfig
+from neuprim.plugins.blame import Suspects
 from neuprim.plugins.names import qualified
 from neuprim.plugins.provenance import MadeBy, Maker, load_recorded
 from neuprim.plugins.registry import LOSSES, SCENES, TASKS, FoundScene, find_scene, load_task
@@ -14,7 +15,7 @@ from neuprim.plugins.registry import LOSSES, SCENES, TASKS, FoundScene, find_sce
 if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
 
-__all__ = ["made_now", "scene_of", "task_of"]
+__all__ = ["made_now", "scene_of", "suspects_of", "task_of"]
 
 
 def task_of(config: RunConfig, file: Path | None = None) -> TaskSpec:
@@ -48,3 +49,12 @@ def made_now(config: RunConfig, task: TaskSpec) -> MadeBy:
     task_info = TASKS.find(config.task if made is None else qualified(made.task.package, made.task.name))
     loss = None if config.train.loss is None else Maker.of(LOSSES.find(config.train.loss))
     return MadeBy(__version__, Maker.of(task_info), None if scene is None else Maker.of(scene, config.scene_name), loss)
+
+
+def suspects_of(config: RunConfig) -> Suspects:
+    """The plugins of a run, whose crashes are told in one line."""
+    made = config.made_by
+    if made is None:
+        return Suspects(config.task, config.scene_name, config.train.loss)
+    scene = config.scene_name if made.scene is None else qualified(made.scene.package, made.scene.name)
+    return Suspects(qualified(made.task.package, made.task.name), scene, config.train.loss)

@@ -166,10 +166,15 @@ class LossExtension:
     """A training loss for any task, chosen by ``train.loss=NAME``; group ``neuprim.losses``.
 
     Attributes:
-        make: what a task's own ``loss`` gets (the settings under ``train``, and ``task.options`` as "options") -> the loss.
+        make: the settings under ``train``, and this loss's options as "options" -> the loss.
+        options: name -> (default, one line of help), set as ``task.options.NAME`` while the loss is chosen; as
+            :attr:`~neuprim.core.task.TaskSpec.options`.
+        uses: the settings of :data:`neuprim.core.uses.OPTIONAL` under ``train`` that ``make`` reads.
     """
 
     api: int
     name: str
     summary: str
     make: Callable[[Mapping[str, Any]], Loss]
+    options: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
+    uses: tuple[str, ...] = ()

@@ -102,7 +102,8 @@ class Cosine:
 
     def rows(self, index: Tensor) -> Cosine:
         """Those of some primitives, (M,) int64, without gradient."""
-        return Cosine(*(x.detach()[index] for x in (self.W1, self.b1, self.w2, self.b2)), self.omega0)
+        W1, b1, w2, b2 = (x.detach()[index] for x in (self.W1, self.b1, self.w2, self.b2))
+        return Cosine(W1, b1, w2, b2, self.omega0)
 
 
 @dataclass(frozen=True)

@@ -3,25 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
 from neuprim.core.channels import Display
-from neuprim.core.data import Dataset
+from neuprim.core.data import Dataset, View
 from neuprim.core.environment import Environment, Illumination
 from neuprim.core.fields import ColourField, ConditionSpec, DensityField, Field
 from neuprim.core.volume_source import VolumeSource
 
-__all__ = ["API_VERSION", "Illuminate", "Loss", "SceneContext", "SceneSpec", "TaskSpec"]
+__all__ = ["API_VERSION", "Illuminate", "Loss", "SceneContext", "SceneSpec", "Supervision", "TaskSpec"]
 
 API_VERSION = 1
 """Version of the interfaces in ``neuprim.core``; a plugin names the one it was written for."""
 
-Loss = Callable[[Tensor, Tensor], tuple[Tensor, dict[str, float]]]
-"""(rendered (H, W, C), ground truth (H, W, C)) -> (scalar loss with gradient, named parts for the log)."""
+
+@dataclass(frozen=True)
+class Supervision:
+    """What a loss may look at beside the two images.
+
+    Attributes:
+        view: name, camera and conditions of the frame.
+        mask: (H, W) bool of the pixels that count, None for all; where it is False, ``rendered`` already is ``truth``.
+        alpha: (H, W) coverage 0..1 of the true image, which lies over this step's background; None for an opaque photograph.
+        progress: used fraction of the budget, 0..1.
+    """
+
+    view: View
+    mask: Tensor | None = None
+    alpha: Tensor | None = None
+    progress: float = 0.0
+
+
+Loss = Callable[[Tensor, Tensor, Supervision], tuple[Tensor, dict[str, float]]]
+"""(rendered (H, W, C), ground truth (H, W, C), :class:`Supervision`) -> (scalar loss with gradient, named parts for the log)."""
 
 Illuminate = Callable[[Environment, int, Mapping[str, Any]], Illumination]
 """(light from all around, number of lights that stand for it, what the data set said in :meth:`Dataset.facts`) -> frames to add up."""
@@ -68,10 +86,15 @@ class TaskSpec:
         name: what the user types after ``task=``.
         config_package: importable package holding its Hydra groups ``task/NAME.yaml``, ``scene/NAME/*.yaml`` and
             ``preset/NAME/*.yaml``.
-        build: (model settings, dataset) -> the density and colour fields.
-        loss: loss settings -> the training loss.
-        check: (model settings) raises :class:`~neuprim.core.errors.ConfigError` for choices the task does not have, before
+        build: (model settings, dataset) -> the density and colour fields. Of the settings in :data:`neuprim.core.uses.OPTIONAL` it
+            gets those that ``uses`` lists, and the task's options as "options".
+        loss: loss settings -> the training loss, which ``train.loss`` may replace. Gets ``train`` and "options", as ``build``.
+        check: (what ``build`` gets) raises :class:`~neuprim.core.errors.ConfigError` for choices the task does not have, before
             any data is loaded.
+        options: name -> (default, one line of help) of the task's own settings, the only ones under ``task.options``; values are
+            converted to the default's type. ``task/NAME.yaml`` may say other defaults.
+        uses: the shared settings of :data:`neuprim.core.uses.OPTIONAL` that ``build`` (``model.…``) and ``loss`` (``train.…``) read.
+            Others are refused when somebody sets them.
         environment: what an image of the light all around means to the task (``neuprim render --environment``); None for tasks that
             have no light. Images must be linear in it, and their opacity independent of it.
     """
@@ -98,6 +121,8 @@ class TaskSpec:
     """What pictures show: (H, W, C) colours in the data set's colour space -> (H, W, 3) sRGB values 0..1. It must take each pixel by
     itself, as it also gets the colours of primitives, as an image one pixel high. None: three channels are red, green and blue, one is
     grey, and of others the first three are shown."""
+    options: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
+    uses: tuple[str, ...] = ()
 
     def parameter_names(self) -> set[str]:
         """Names of the parameters that the task's fields have at any settings.
@@ -106,9 +131,9 @@ class TaskSpec:
         Fields that cannot be made without settings are left out.
         """
         names = set()
-        for field in (self.fields or {}).values():
+        for cls in (self.fields or {}).values():
             try:
-                names |= {spec.name for spec in field.every_parameter()}
+                names |= {spec.name for spec in cls.every_parameter()}
             except TypeError:  # a required setting
                 continue
         return names

@@ -10,6 +10,7 @@ from neuprim.core.channel_names import names_fault
 from neuprim.core.extensions import Exporter, Inspector, LossExtension, SceneExtension
 from neuprim.core.fields import ConditionSpec, Field
 from neuprim.core.task import SceneSpec, TaskSpec
+from neuprim.core.uses import OPTIONAL
 
 __all__ = ["fault"]
 
@@ -47,7 +48,9 @@ def fault(spec: Any) -> str | None:
         if not callable(getattr(spec, name)):
             return f"{name} is of type {type(getattr(spec, name)).__name__}; expected a function"
     if isinstance(spec, TaskSpec):
-        return _task(spec)
+        return _declared(spec, "model.", "train.") or _task(spec)
+    if isinstance(spec, LossExtension):
+        return _declared(spec, "train.")
     if isinstance(spec, SceneExtension):
         return _one(spec.scene, SceneSpec, "scene")
     if isinstance(spec, Exporter) and not isinstance(spec.options, Mapping):
@@ -92,3 +95,23 @@ def _one(member: Any, kind: type, where: str) -> str | None:
         return f"{where} is of type {type(member).__name__}; expected a {kind.__name__}"
     wrong = fault(member)
     return None if wrong is None else f"{where}.{wrong}"
+
+
+def _declared(spec: TaskSpec | LossExtension, *groups: str) -> str | None:
+    """What is wrong with ``options`` or ``uses``, which may name optional settings of these groups."""
+    if not isinstance(spec.options, Mapping):
+        return f"options is of type {type(spec.options).__name__}; expected a mapping of names to (default, one line of help)"
+    for name, entry in spec.options.items():
+        if not isinstance(name, str) or not name.isidentifier():
+            return f"options has {name!r}; expected a name of letters, digits and _"
+        if not isinstance(entry, tuple | list) or len(entry) != 2 or not isinstance(entry[1], str):
+            return f"options[{name!r}] is {entry!r}; expected (default, one line of help)"
+        if not isinstance(entry[0], bool | int | float | str | list | Mapping | None):
+            return f"options[{name!r}] has a default of type {type(entry[0]).__name__}; expected what a YAML file can hold"
+    known = [name for name in OPTIONAL if name.startswith(groups)]
+    if not isinstance(spec.uses, tuple | list):
+        return f"uses is of type {type(spec.uses).__name__}; expected a tuple of setting names"
+    for name in spec.uses:
+        if name not in known:
+            return f"uses has {name!r}; expected some of {', '.join(known)}"
+    return None

@@ -8,9 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from neuprim.core.cameras import Camera
+from neuprim.core.data import View
 from neuprim.core.metrics import ssim
+from neuprim.core.task import Supervision
 from neuprim.core.train.losses import photometric, photometric_reference, scale_anisotropy
 
+FRAME = Supervision(View("v", Camera(torch.eye(4), 1.0, 1.0, 0.5, 0.5, 1, 1)))
 SIZES = [(11, 11), (12, 40), (64, 77), (11, 200), (45, 13)]
 
 
@@ -25,7 +29,7 @@ def pair(height: int, width: int, channels: int, seed: int = 0) -> tuple[Tensor,
 
 def value_and_grad(loss, rendered: Tensor, truth: Tensor) -> tuple[float, Tensor, dict[str, float]]:  # type: ignore[no-untyped-def]
     leaf = rendered.clone().requires_grad_()
-    value, parts = loss(leaf, truth)
+    value, parts = loss(leaf, truth, FRAME)
     value.backward()
     assert leaf.grad is not None
     return value.item(), leaf.grad, parts
@@ -37,7 +41,7 @@ def value_and_grad(loss, rendered: Tensor, truth: Tensor) -> tuple[float, Tensor
 def test_fused_equals_kornia(size: tuple[int, int], channels: int, weight: float) -> None:
     rendered, truth = pair(*size, channels)
     fused = value_and_grad(photometric({"ssim_weight": weight}), rendered, truth)
-    exact = value_and_grad(lambda a, b: photometric_reference(a, b, weight), rendered.double(), truth.double())
+    exact = value_and_grad(lambda a, b, frame: photometric_reference(a, b, weight), rendered.double(), truth.double())
     assert fused[0] == pytest.approx(exact[0], abs=1e-6)
     assert fused[2] == pytest.approx(exact[2], abs=1e-6)
     assert (fused[1].double() - exact[1]).abs().max() <= 1e-5 * exact[1].abs().max()
@@ -46,7 +50,7 @@ def test_fused_equals_kornia(size: tuple[int, int], channels: int, weight: float
 
 def test_the_parts_are_what_their_names_say() -> None:
     rendered, truth = pair(30, 40, 3)
-    value, parts = photometric({"ssim_weight": 0.3})(rendered, truth)
+    value, parts = photometric({"ssim_weight": 0.3})(rendered, truth, FRAME)
     assert parts["l1"] == pytest.approx((rendered - truth).abs().mean().item(), rel=1e-5)
     assert parts["ssim"] == pytest.approx(ssim(rendered, truth), abs=1e-5)
     assert value.item() == pytest.approx(0.7 * parts["l1"] + 0.3 * (1 - parts["ssim"]), abs=1e-6)
@@ -68,7 +72,7 @@ def test_flat_images_stay_finite() -> None:
 @pytest.mark.parametrize("size", [(10, 40), (40, 10), (1, 1)])
 def test_small_images_use_l1_alone(size: tuple[int, int]) -> None:
     rendered, truth = pair(*size, 3)
-    value, parts = photometric({"ssim_weight": 0.2})(rendered, truth)
+    value, parts = photometric({"ssim_weight": 0.2})(rendered, truth, FRAME)
     assert value.item() == pytest.approx((rendered - truth).abs().mean().item())
     assert set(parts) == {"l1"}
 
@@ -84,7 +88,7 @@ def test_upstream_factor_reaches_the_gradient() -> None:
     rendered, truth = pair(15, 15, 3)
     _, once, _ = value_and_grad(photometric({"ssim_weight": 0.2}), rendered, truth)
     _, thrice, _ = value_and_grad(
-        lambda a, b: tuple(x if i else x * 3 for i, x in enumerate(photometric({"ssim_weight": 0.2})(a, b))), rendered, truth
+        lambda a, b, frame: tuple(x if i else x * 3 for i, x in enumerate(photometric({"ssim_weight": 0.2})(a, b, frame))), rendered, truth
     )
     assert torch.allclose(thrice, 3 * once)
 
@@ -94,7 +98,7 @@ def test_strided_images_are_read_right() -> None:
     loss = photometric({"ssim_weight": 0.2})
     strided = rendered.permute(1, 0, 2).contiguous().permute(1, 0, 2)
     assert not strided.is_contiguous()
-    assert loss(strided, truth)[0].item() == loss(rendered, truth)[0].item()
+    assert loss(strided, truth, FRAME)[0].item() == loss(rendered, truth, FRAME)[0].item()
 
 
 def test_spheres_have_no_anisotropy() -> None:

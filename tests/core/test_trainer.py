@@ -14,6 +14,7 @@ from torch import Tensor
 from neuprim.core import checkpoint
 from neuprim.core.data import Dataset, Pixels
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NonFiniteError
+from neuprim.core.task import Supervision
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer, initial_model
 from tests.core import tiny
@@ -162,10 +163,10 @@ def poisoned(name: str, row: int, at: int):  # type: ignore[no-untyped-def]
         grad[row].view(-1)[0] = float("nan")
         return grad
 
-    def loss(rendered: Tensor, truth: Tensor) -> tuple[Tensor, dict[str, float]]:
+    def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
         if trainer.step == at:
             trainer.model.params[name].register_hook(poison)
-        return plain_loss(rendered, truth)
+        return plain_loss(rendered, truth, frame)
 
     trainer.loss = loss
     return trainer

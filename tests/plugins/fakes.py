@@ -25,6 +25,8 @@ TASK = TaskSpec(
     scenes=(SceneSpec("ball", "one ball", lambda s, c: None), SceneSpec("files", "from files", lambda s, c: None)),
     build=lambda m, d: None,
     loss=lambda s: None,
+    options={"gain": (1.0, "of the amplifier")},
+    uses=("model.neurons",),
     conditions=(ConditionSpec("time", (), "1", (0.0, 1.0), lambda t: []), ConditionSpec("light_pos", (3,), "m", (0.0, 1.0), lambda t: [])),
 )
 """

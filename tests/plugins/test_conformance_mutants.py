@@ -19,7 +19,7 @@ from neuprim.core.gaussian import GaussianDensity
 from neuprim.core.geometry import Geometry
 from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import InitContext, ParameterSpec, Params
-from neuprim.core.task import SceneSpec, TaskSpec
+from neuprim.core.task import SceneSpec, Supervision, TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim.plugins.conformance import CHECKS, ConformanceError, named_checks
 from neuprim.plugins.conformance.example import Example
@@ -251,8 +251,8 @@ class Misfit(Example):
 def negative(settings: Mapping[str, Any]) -> Any:
     inner = photometric(settings)
 
-    def loss(rendered: Tensor, truth: Tensor) -> tuple[Tensor, dict[str, float]]:
-        value, parts = inner(rendered, truth)
+    def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
+        value, parts = inner(rendered, truth, frame)
         return -value, parts
 
     return loss
@@ -262,23 +262,23 @@ def uphill(settings: Mapping[str, Any]) -> Any:
     """Right values, gradients that point the wrong way."""
     inner = photometric(settings)
 
-    def loss(rendered: Tensor, truth: Tensor) -> tuple[Tensor, dict[str, float]]:
-        value, parts = inner(rendered, truth)
+    def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
+        value, parts = inner(rendered, truth, frame)
         return 2 * value.detach() - value, parts
 
     return loss
 
 
 def per_pixel(settings: Mapping[str, Any]) -> Any:
-    return lambda rendered, truth: ((rendered - truth).abs(), {})
+    return lambda rendered, truth, frame: ((rendered - truth).abs(), {})
 
 
 def detached(settings: Mapping[str, Any]) -> Any:
-    return lambda rendered, truth: ((rendered.detach() - truth).abs().mean(), {})
+    return lambda rendered, truth, frame: ((rendered.detach() - truth).abs().mean(), {})
 
 
 def wordy(settings: Mapping[str, Any]) -> Any:
-    return lambda rendered, truth: ((rendered - truth).abs().mean(), {"l1": "small"})
+    return lambda rendered, truth, frame: ((rendered - truth).abs().mean(), {"l1": "small"})
 
 
 GHOST = SceneSpec("ghost", "has no file", lambda s, c: None)  # type: ignore[arg-type, return-value]

@@ -36,14 +36,16 @@ LOSS = """
 from neuprim.core.extensions import LossExtension
 
 def make(settings):
-    weight = settings["options"].get("weight", 3.0)
-    assert settings["ssim_weight"] >= 0
-    def loss(rendered, truth):
+    weight = settings["options"]["weight"]
+    assert settings["ssim_weight"] >= 0 and isinstance(weight, float)
+    def loss(rendered, truth, frame):
         value = weight * (rendered - truth).square().mean()
         return value, {"mse": value.item()}
     return loss
 
-PLUGIN = LossExtension(api=1, name="extra", summary="mean squared error", make=make)
+PLUGIN = LossExtension(
+    api=1, name="extra", summary="mean squared error", make=make, options={"weight": (3.0, "of it")}, uses=("train.ssim_weight",)
+)
 """
 EXPORTER = """
 from neuprim.core.extensions import Exporter, ExportReport

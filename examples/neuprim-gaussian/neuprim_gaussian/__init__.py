@@ -42,4 +42,5 @@ TASK = TaskSpec(
     loss=photometric,
     check=_check,
     fields={"BellDensity": BellDensity, "ViewDependentColour": ViewDependentColour},
+    uses=("model.sh_degree", "train.ssim_weight"),  # of the settings that not every task has; others are refused
 )

@@ -1,17 +1,24 @@
-"""The photometric loss (1 - lambda) L1 + lambda (1 - SSIM)."""
+"""Losses of an image: the photometric one, (1 - lambda) L1 + lambda (1 - SSIM), and three for linear light of high dynamic range.
+
+Each factory takes the settings that a :class:`~neuprim.core.extensions.LossExtension` or a task's ``loss`` gets. Of what a step knows
+beside the images they read nothing: masked pixels are equal in both.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from kornia.metrics import ssim as kornia_ssim
 from torch import Tensor
 
-from neuprim.core.task import Loss
+from neuprim.core.task import Loss, Supervision
 
-__all__ = ["photometric", "photometric_reference", "scale_anisotropy"]
+__all__ = ["compressed", "l1", "photometric", "photometric_reference", "relative", "scale_anisotropy"]
+
+_MU = 16.0
+_DARK = 0.05
 
 
 def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -> tuple[Tensor, dict[str, float]]:
@@ -35,7 +42,7 @@ def photometric(settings: Mapping[str, Any]) -> Loss:
     """Loss of a run, from ``{"ssim_weight": lambda}``; fused on float32 CPU tensors, kornia elsewhere."""
     weight = float(settings["ssim_weight"])
 
-    def loss(rendered: Tensor, truth: Tensor) -> tuple[Tensor, dict[str, float]]:
+    def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
         if (
             rendered.device.type == "cpu"
             and rendered.dtype == torch.float32
@@ -47,6 +54,35 @@ def photometric(settings: Mapping[str, Any]) -> Loss:
 
             return photometric_fused(rendered, truth, weight)
         return photometric_reference(rendered, truth, weight)
+
+    return loss
+
+
+def l1(settings: Mapping[str, Any]) -> Loss:
+    """Mean absolute difference."""
+    return _named("l1", lambda rendered, truth: (rendered - truth).abs().mean())
+
+
+def compressed(settings: Mapping[str, Any]) -> Loss:
+    """L1 of log(1 + mu x) / log(1 + mu), mu = 16: shadows count more, highlights less."""
+
+    def measure(rendered: Tensor, truth: Tensor) -> Tensor:
+        scale = torch.log1p(torch.tensor(_MU))
+        a, b = (torch.log1p(_MU * x.clamp_min(0.0)) / scale for x in (rendered, truth))
+        return (a - b).abs().mean()
+
+    return _named("compressed", measure)
+
+
+def relative(settings: Mapping[str, Any]) -> Loss:
+    """Squared error over the squared rendered value (Mildenhall et al. 2022, RawNeRF), which carries no gradient itself."""
+    return _named("relative", lambda rendered, truth: ((rendered - truth) / (rendered.detach().clamp_min(0.0) + _DARK)).square().mean())
+
+
+def _named(name: str, measure: Callable[[Tensor, Tensor], Tensor]) -> Loss:
+    def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
+        value = measure(rendered, truth)
+        return value, {name: value.item()}
 
     return loss
 

@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from neuprim.core.data import Dataset
+from neuprim.core.data_check import check_pixels, check_points
 from neuprim.core.datasets.initial import subset
 from neuprim.core.datasets.points_file import read_points
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NonFiniteError, nearest
@@ -26,7 +27,7 @@ from neuprim.core.fields import ColourField, DensityField
 from neuprim.core.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.schema import InitContext
-from neuprim.core.task import Loss
+from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.losses import scale_anisotropy
 from neuprim.core.train.optimizer import RowAdam
 from neuprim.core.train.population import Change, make_population
@@ -72,6 +73,7 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
         cloud = (dataset.uniform_points if where == "box" else dataset.initial_points)(settings.primitives, generator)
     else:
         raise ConfigError(f"model.init.points={where!r}: expected matter, box or a .ply file")
+    check_points(cloud, settings.primitives, dataset)
     if len(cloud.means) == 0:
         raise DataError(f"{dataset.name}: no starting points found; expected points or images with visible content")
     if len(cloud.means) == 1:
@@ -159,16 +161,18 @@ class Trainer:
 
         index = self._next_view()
         view, pixels = self.dataset.train.view(index), self.dataset.train.pixels(index)
+        check_pixels("train", view, pixels, self.dataset.channels)
         background = self._background()
         truth = pixels.over(background)
         output = render(model, view.camera, view.conditions, self.renderer, background)
         rgb = output.rgb if pixels.mask is None else torch.where(pixels.mask[..., None], output.rgb, truth)
-        loss, parts = self.loss(rgb, truth)
+        loss, parts = self.loss(rgb, truth, Supervision(view, pixels.mask, pixels.alpha, progress))
         if self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from:
             loss = loss + self.settings.anisotropy_weight * scale_anisotropy(model.params["log_scales"])
         if not math.isfinite(loss.item()):
             model.check_finite()
-            raise NonFiniteError(f"loss is {loss.item()} at step {self.step} on view {view.name}")
+            spoiled = "" if bool(torch.isfinite(truth).all()) else ", whose pixels are NaN or infinite somewhere"
+            raise NonFiniteError(f"loss is {loss.item()} at step {self.step} on view {view.name}{spoiled}")
         with torch.no_grad():
             difference = rgb - truth
             channels = difference.shape[-1]

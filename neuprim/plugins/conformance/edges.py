@@ -12,6 +12,7 @@ from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.fields import ConditionSpec
 from neuprim.core.primitives import Primitives
 from neuprim.core.render import render
+from neuprim.core.uses import build_settings
 from neuprim.plugins.conformance.example import between, sample
 from neuprim.plugins.conformance.forms import camera_at
 from neuprim.plugins.conformance.subject import Subject, watched
@@ -144,10 +145,10 @@ _CASES: tuple[tuple[str, Callable[[Primitives], None], Callable[[View, Primitive
 
 def check_clear_errors(t: Subject) -> None:
     """A setting that the task does not have is a ConfigError that names it, before any data are loaded: typos cost no run."""
-    model = vars(t.settings.model)
-    t.task.check(model)
+    model = t.settings.model
+    t.task.check(build_settings(t.task, model, t.options))
     for group in ("density", "colour"):
-        wrong = {**model, group: {**model[group], "no_such_setting": 1}}
+        wrong = build_settings(t.task, replace(model, **{group: {**getattr(model, group), "no_such_setting": 1}}), t.options)
         where = f"TaskSpec.check with model.{group}.no_such_setting=1"
         try:
             t.task.check(wrong)

@@ -13,6 +13,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.geometry import GEOMETRY_SPECS
 from neuprim.core.schema import InitContext, ParameterSpec
 from neuprim.core.task import API_VERSION
+from neuprim.core.uses import build_settings
 from neuprim.plugins.conformance.subject import Subject
 from neuprim.plugins.members import fault
 
@@ -38,7 +39,7 @@ def check_files(t: Subject) -> None:
         for name in settings.train.rates:
             t.require(name in known, f"preset {preset}: train.rates.{name}", "no such parameter", f"one of {', '.join(sorted(known))}")
         try:
-            t.task.check(vars(settings.model))
+            t.task.check(build_settings(t.task, settings.model, choice.options))
         except ConfigError as error:
             t.require(False, f"preset {preset}", f"model settings that TaskSpec.check refuses ({error})", "settings that it accepts")
     for scene in t.task.scenes:

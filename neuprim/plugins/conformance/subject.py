@@ -23,6 +23,7 @@ from neuprim.core.schema import ParameterSpec, Params
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.settings import PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer, initial_model
+from neuprim.core.uses import build_settings, loss_settings
 from neuprim.plugins.conformance.example import Example
 
 __all__ = ["EXACT", "PRIMITIVES", "ConformanceError", "Frozen", "Subject", "watched"]
@@ -83,7 +84,7 @@ class Subject:
 
     @cached_property
     def options(self) -> dict[str, Any]:
-        """The task's own free settings at their defaults."""
+        """The task's own options at their defaults."""
         return task_choices(self.task).options
 
     @cached_property
@@ -93,7 +94,7 @@ class Subject:
 
     def fields(self) -> tuple[DensityField, ColourField]:
         """Freshly built fields."""
-        return self.task.build({**vars(self.settings.model), "options": self.options}, self.dataset)
+        return self.task.build(build_settings(self.task, self.settings.model, self.options), self.dataset)
 
     def specs(self) -> list[tuple[str, ParameterSpec]]:
         """("density" or "colour", spec) of every parameter beside the geometry's."""
@@ -122,7 +123,7 @@ class Subject:
         population = PopulationSettings(strategy=strategy, every=2, start=0.0, stop=1.0, fraction=0.2)
         rates = {name: rate for name, rate in train.rates.items() if name in model.params}
         short = TrainSettings(iterations=iterations, rates=rates, ssim_weight=train.ssim_weight, population=population)
-        loss = self.task.loss({**vars(short), "options": self.options})
+        loss = self.task.loss(loss_settings(self.task, short, self.options))
         return Trainer(model, self.dataset, loss, short, self.settings.renderer, seed)
 
     def views(self) -> list[View]:

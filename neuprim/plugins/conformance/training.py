@@ -9,11 +9,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from neuprim.core import checkpoint
+from neuprim.core import checkpoint, data_check
 from neuprim.core.channels import channels_of
+from neuprim.core.data import Dataset
 from neuprim.core.errors import CheckpointError
 from neuprim.core.render import render
+from neuprim.core.task import Supervision
 from neuprim.core.train.trainer import Trainer
+from neuprim.core.uses import loss_settings
 from neuprim.plugins.conformance.subject import Subject
 
 __all__ = ["check_channels", "check_dataset", "check_determinism", "check_learning", "check_loss", "check_resume", "check_save_load"]
@@ -35,6 +38,11 @@ def check_dataset(t: Subject) -> None:
                 t.require(spec.name in view.conditions, f"{where}: condition {spec.name!r}", "none", "one, as the task declares it")
                 shape = tuple(view.conditions[spec.name].shape)
                 t.require(shape == spec.shape, f"{where}: condition {spec.name!r}", f"shape {shape}", str(spec.shape))
+    try:
+        data_check.check_dataset(data, t.task.conditions)
+        data_check.check_points(data.initial_points(8, torch.Generator().manual_seed(1)), 8, data)
+    except data_check.DatasetFault as error:
+        t.require(False, "example", str(error), "what a run checks before it starts")
     a, b = (data.initial_points(8, torch.Generator().manual_seed(1)) for _ in range(2))
     t.require(1 <= len(a.means) <= 8, "example: initial_points(8)", f"{len(a.means)} points", "1 to 8")
     t.require(torch.equal(a.means, b.means), "example: initial_points", "other points for the same seed", "the same")
@@ -54,10 +62,11 @@ def check_channels(t: Subject) -> None:
 
 def check_loss(t: Subject) -> None:
     """The loss is one finite number with a gradient, least where image and truth agree, and its parts are numbers for the log."""
-    loss = t.task.loss({**vars(t.settings.train), "options": t.options})
+    loss = t.task.loss(loss_settings(t.task, t.settings.train, t.options))
+    frame = _supervision(t.dataset, 0)
     truth = t.dataset.train.pixels(0).over(t.dataset.background)
     off = (truth + 0.2 * torch.rand(truth.shape, generator=torch.Generator().manual_seed(2))).requires_grad_()
-    value, parts = loss(off, truth)
+    value, parts = loss(off, truth, frame)
     t.require(value.dim() == 0, "loss", f"shape {tuple(value.shape)}", "one number")
     t.require(math.isfinite(value.item()), "loss", value.item(), "a finite number")
     t.require(value.requires_grad, "loss", "no gradient", "one with respect to the rendered image")
@@ -66,8 +75,13 @@ def check_loss(t: Subject) -> None:
     t.require(fine, "gradient of the loss", "none, zero, NaN or infinity", "a finite one")
     for name, part in parts.items():
         t.require(isinstance(part, float) and math.isfinite(part), f"loss part {name!r}", repr(part), "a finite float")
-    least = loss(truth.clone().requires_grad_(), truth)[0].item()
+    least = loss(truth.clone().requires_grad_(), truth, frame)[0].item()
     t.require(least < value.item(), "loss of the truth itself", f"{least:g}", f"less than {value.item():g}, that of a wrong image")
+
+
+def _supervision(dataset: Dataset, index: int) -> Supervision:
+    pixels = dataset.train.pixels(index)
+    return Supervision(dataset.train.view(index), pixels.mask, pixels.alpha)
 
 
 def check_determinism(t: Subject) -> None:
@@ -124,7 +138,7 @@ def _mean_loss(trainer: Trainer) -> float:
     for i in range(len(views)):
         view = views.view(i)
         out = render(trainer.model, view.camera, view.conditions, trainer.renderer, background)
-        total += trainer.loss(out.rgb, views.pixels(i).over(background))[0].item()
+        total += trainer.loss(out.rgb, views.pixels(i).over(background), _supervision(trainer.dataset, i))[0].item()
     return total / len(views)
 
 

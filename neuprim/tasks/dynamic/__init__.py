@@ -79,4 +79,5 @@ TASK = TaskSpec(
     check=_check,
     conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_times),),
     fields={"TimeDensity": TimeDensity, "TimeHarmonics": TimeHarmonics},
+    uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),
 )

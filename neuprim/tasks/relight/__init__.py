@@ -11,11 +11,11 @@ from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
+from neuprim.core.train.losses import l1
 from neuprim.tasks.relight.colour import FORMS, VISIBILITY, LightNetwork
 from neuprim.tasks.relight.environment import illuminate
 from neuprim.tasks.relight.harmonics import LightHarmonics
 from neuprim.tasks.relight.lights import parse_intensities, parse_lights, typical_light
-from neuprim.tasks.relight.loss import hdr_loss
 
 __all__ = ["TASK"]
 
@@ -75,7 +75,7 @@ TASK = TaskSpec(
         SceneSpec("olat", "GS3 / NRHints layout: a light position per image, PNG or EXR: scene.path=DIR", _olat),
     ),
     build=_build,
-    loss=hdr_loss,
+    loss=l1,
     check=_check,
     conditions=(
         ConditionSpec("light", (3,), "position, scene units", (-1e6, 1e6), parse_lights),
@@ -83,4 +83,5 @@ TASK = TaskSpec(
     ),
     fields={"CosineDensity": CosineDensity, "LightNetwork": LightNetwork, "LightHarmonics": LightHarmonics},
     environment=illuminate,
+    uses=("model.neurons",),
 )

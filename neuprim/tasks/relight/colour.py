@@ -125,4 +125,4 @@ _DARKEST = 1e-3
 
 
 def _output(ctx: InitContext) -> float:
-    return float(ctx.settings.get("output", 0.05))  # type: ignore[arg-type]
+    return ctx.number("output", 0.05)

@@ -69,4 +69,5 @@ TASK = TaskSpec(
     loss=photometric,
     check=_check,
     fields={"CosineDensity": CosineDensity, "GaussianDensity": GaussianDensity, "SphericalHarmonics": SphericalHarmonics},
+    uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),
 )

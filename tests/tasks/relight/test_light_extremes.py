@@ -14,16 +14,18 @@ from neuprim.core.data import Pixels, View
 from neuprim.core.fields import RayNet
 from neuprim.core.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
+from neuprim.core.task import Supervision
+from neuprim.core.train.losses import compressed, l1, relative
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer, initial_model
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.relight.directions import unit
 from neuprim.tasks.relight.harmonics import LightHarmonics
-from neuprim.tasks.relight.loss import LOSSES, hdr_loss
 from tests import scenes
 from tests.core import tiny
 from tests.numerics.compare import row_errors, undecided, weights
 
+LOSSES = {"l1": l1, "compressed": compressed, "relative": relative}
 COUNT = 20
 UNSHADOWED, SHADOWED = "none", "pixel"  # LightNetwork's ``visibility``
 
@@ -149,7 +151,7 @@ def test_harmonics_know_the_direction_of_any_light() -> None:
 
 def losses(rendered: Tensor, truth: Tensor, name: str) -> tuple[Tensor, Tensor]:
     leaf = rendered.clone().requires_grad_()
-    value, parts = hdr_loss({"options": {"loss": name}})(leaf, truth)
+    value, parts = LOSSES[name]({})(leaf, truth, Supervision(View("v", scenes.camera())))
     value.backward()
     assert leaf.grad is not None and parts == {name: pytest.approx(value.item())}
     return value.detach(), leaf.grad
@@ -209,7 +211,7 @@ def fit(
     field = LightNetwork(3, visibility=UNSHADOWED)
     first = start or initial_model(CosineDensity(2), field, dataset, ModelSettings(primitives=12, neurons=2), 0)
     settings = TrainSettings(iterations=iterations, population=PopulationSettings(strategy="fixed"))
-    trainer = Trainer(first, dataset, hdr_loss({"options": {"loss": loss}}), settings, RenderSettings(backend="reference"), 0)
+    trainer = Trainer(first, dataset, LOSSES[loss]({}), settings, RenderSettings(backend="reference"), 0)
     return trainer, [report.loss for report in trainer.run()]
 
 

@@ -69,8 +69,8 @@ def test_light_from_all_around(finished: Path, tmp_path: Path, capsys: pytest.Ca
     [
         ["model.colour.form=multiplicative"],
         ["model.colour.form=harmonics", "model.colour.degree=3"],
-        ["model.colour.visibility=none", "task.options.loss=compressed"],
-        ["model.colour.hidden=0", "task.options.loss=relative"],
+        ["model.colour.visibility=none", "train.loss=compressed"],
+        ["model.colour.hidden=0", "train.loss=relative"],
         ["preset=paper", "train.population.every=5"],
     ],
 )
@@ -92,6 +92,8 @@ def test_wrong_choices(word: str, message: str) -> None:
         compose(["task=relight", word])
 
 
-def test_a_wrong_loss(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"task\.options\.loss=l2: no such loss"):
-        run(compose([*SCENE, *SMALL, "task.options.loss=l2", f"output_dir='{tmp_path / 'run'}'"]), Console(quiet=True))
+def test_a_wrong_loss() -> None:
+    with pytest.raises(ConfigError, match=r"train\.loss=l2: no such loss; did you mean 'l1'\?"):
+        compose(["task=relight", "train.loss=l2"], False)
+    with pytest.raises(ConfigError, match=r"task\.options\.loss: task 'relight' has no such option; did you mean 'train\.loss'\?"):
+        compose(["task=relight", "task.options.loss=compressed"], False)

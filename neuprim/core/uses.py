@@ -1,0 +1,75 @@
+"""Which settings a task or loss reads: its own options, and those of the shared settings that only some of them use.
+
+Most of ``model`` and ``train`` concerns every run, because the trainer reads it. The settings in :data:`OPTIONAL` are read by a task's
+``build`` or by a loss, if at all. Whoever reads one says so in ``uses``; setting one that nobody reads is refused, and a function that
+reads one which it did not declare does not get it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from neuprim.core.errors import ConfigError
+from neuprim.core.train.settings import ModelSettings, TrainSettings
+
+if TYPE_CHECKING:
+    from neuprim.core.extensions import LossExtension
+    from neuprim.core.task import TaskSpec
+
+__all__ = ["OPTIONAL", "Declared", "build_settings", "loss_settings"]
+
+OPTIONAL = ("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight")
+"""Shared settings that a task or loss uses only if it says so."""
+
+
+class Declared(dict[str, Any]):
+    """A group of settings as a plugin's function gets it; a setting that it forgot to declare is an error that says so.
+
+    Args:
+        owner: e.g. ``"task 'glow'"``.
+        group: dotted name of the group, e.g. ``"model"``.
+        member: of the plugin's description, where it declares what it reads.
+    """
+
+    def __init__(self, values: Mapping[str, Any], owner: str, group: str, member: str) -> None:
+        super().__init__(values)
+        self.owner, self.group, self.member = owner, group, member
+
+    def __missing__(self, key: str) -> Any:
+        if self.member == "uses" and f"{self.group}.{key}" not in OPTIONAL:
+            raise KeyError(key)
+        raise ConfigError(f"{self.owner} reads {self.group}.{key}, which its {self.member!r} does not declare")
+
+
+def build_settings(task: TaskSpec, model: ModelSettings, options: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What a task's ``build`` and ``check`` get: the model's settings that it uses, and its options as "options".
+
+    Args:
+        options: values by name; what is missing takes its default, others are left out.
+    """
+    return _group("model", vars(model), task.uses, task.options, options, f"task {task.name!r}")
+
+
+def loss_settings(owner: TaskSpec | LossExtension, train: TrainSettings, options: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What makes a loss: the training settings that it uses, and its options as "options".
+
+    Args:
+        owner: of the loss: the task, or what ``train.loss`` names.
+        options: as of :func:`build_settings`.
+    """
+    who = f"the loss of task {owner.name!r}" if hasattr(owner, "build") else f"loss {owner.name!r}"
+    return _group("train", vars(train), owner.uses, owner.options, options, who)
+
+
+def _group(
+    name: str,
+    values: Mapping[str, Any],
+    uses: tuple[str, ...],
+    declared: Mapping[str, tuple[Any, str]],
+    options: Mapping[str, Any],
+    owner: str,
+) -> Declared:
+    used = {k: v for k, v in values.items() if f"{name}.{k}" not in OPTIONAL or f"{name}.{k}" in uses}
+    own = {key: options.get(key, default) for key, (default, _) in declared.items()}
+    return Declared({**used, "options": Declared(own, owner, "task.options", "options")}, owner, name, "uses")

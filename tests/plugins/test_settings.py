@@ -1,0 +1,345 @@
+"""Settings that a task or a loss declares, and those that nobody would read: refused before any data is loaded."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from neuprim.cli import main
+from neuprim.config import RunConfig, compose
+from neuprim.core.data import Dataset
+from neuprim.core.errors import ConfigError
+from neuprim.core.task import Supervision
+from neuprim.core.train.losses import photometric
+from neuprim.core.train.settings import ModelSettings, TrainSettings
+from neuprim.core.uses import OPTIONAL, build_settings, loss_settings
+from neuprim.plugins.conformance import ConformanceError, named_checks
+from neuprim.plugins.members import fault
+from neuprim.plugins.registry import list_losses, load_loss, load_task
+from neuprim.run import make_loss, run
+from neuprim.tasks.static import TASK
+from tests.plugins.fakes import install, site, toy
+from tests.plugins.test_extensions import LOSS, add
+
+__all__ = ["site", "toy"]
+
+
+def toys(*words: str) -> RunConfig:
+    return compose(["task=toy", *words], False)
+
+
+# ---------------------------------------------------------------- task.options
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["task.options.gian=3"], "task.options.gian: task 'toy' has no such option; did you mean 'gain'?"),
+        (["+task.options.gian=3"], "task.options.gian: task 'toy' has no such option; did you mean 'gain'?"),
+        (["task.options={gian: 3}"], "task.options.gian: task 'toy' has no such option; did you mean 'gain'?"),
+        (["task.options.neurons=3"], "task.options.neurons: task 'toy' has no such option; did you mean 'model.neurons'?"),
+        (["task.options.gain=high"], "task.options.gain=high: expected a finite number"),
+        (["task.options.gain=null"], "task.options.gain=null: expected a finite number"),
+        (["task.options.gain.of=3"], "task.options.gain={'of': 3}: expected a finite number"),
+        (["task.options=3"], "task.options=3: expected entries, each as task.options.KEY=VALUE"),
+        (["task.options=null"], "task.options=null: expected entries"),
+    ],
+)
+def test_wrong_options_are_refused(toy: Path, words: list[str], text: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        toys(*words)
+    assert text in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("task", ["static", "dynamic", "relight"])
+def test_built_in_tasks_refuse_misspelt_options(task: str) -> None:
+    with pytest.raises(ConfigError, match=rf"task\.options\.anything: task '{task}' has no such option; it has none"):
+        compose([f"task={task}", "task.options.anything=1"], False)
+
+
+def test_options_are_complete_typed_and_shown(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert toys().options == {"gain": 1.0} and toys().non_default == {}
+    changed = toys("task.options.gain=3")
+    assert changed.options == {"gain": 3.0} and isinstance(changed.options["gain"], float)
+    assert changed.non_default == {"task.options.gain": (1.0, 3.0)}
+    (toy / "conf/task/toy.yaml").write_text("scene: ball\n")
+    assert toys().options == {"gain": 1.0}, "the default of the TaskSpec"
+    (toy / "conf/task/toy.yaml").write_text("scene: ball\noptions: {gain: 2}\n")
+    assert toys().options == {"gain": 2.0}, "the default of the file"
+    assert toys("task.options.gain=2").non_default == {}
+    assert main(["run", "task=toy", "--cfg"]) == 0
+    assert "  options:\n    gain: 2.0\n" in capsys.readouterr().out
+    assert main(["tasks"]) == 0
+    assert "options     task.options.gain=1.0  of the amplifier" in capsys.readouterr().out
+
+
+def test_options_that_only_the_yaml_file_has(toy: Path) -> None:
+    (toy / "conf/task/toy.yaml").write_text("scene: ball\noptions: {gian: 2}\n")
+    with pytest.raises(
+        ConfigError, match=r"task 'toy': task/toy.yaml: options.gian: its TaskSpec has no such option; did you mean 'gain'\?"
+    ):
+        toys()
+    (toy / "conf/task/toy.yaml").write_text("scene: ball\noptions: {gain: loud}\n")
+    with pytest.raises(ConfigError, match=r"task/toy.yaml: options.gain=loud: expected a finite number"):
+        toys()
+
+
+def test_check_sees_the_options(toy: Path) -> None:
+    source = (toy / "__init__.py").read_text()
+    check = """
+def check(model):
+    if model["options"]["gain"] > 5:
+        from neuprim.core.errors import ConfigError
+        raise ConfigError(f"task.options.gain={model['options']['gain']}: expected at most 5")
+"""
+    (toy / "__init__.py").write_text(check + source.replace("loss=lambda", "check=check, loss=lambda"))
+    assert toys("task.options.gain=5").options == {"gain": 5.0}
+    with pytest.raises(ConfigError, match=r"task.options.gain=6.0: expected at most 5"):
+        toys("task.options.gain=6")
+
+
+# ---------------------------------------------------------------- options of losses
+
+
+def test_a_losss_options_belong_to_task_options_while_it_is_chosen(toy: Path, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    add(site, "loss", package="fake_loss")
+    assert toys("train.loss=extra").options == {"gain": 1.0, "weight": 3.0}
+    assert toys("train.loss=extra").non_default == {"train.loss": (None, "extra")}
+    config = toys("train.loss=extra", "task.options.weight=5")
+    assert config.non_default == {"train.loss": (None, "extra"), "task.options.weight": (3.0, 5.0)}
+    with pytest.raises(ConfigError, match=r"task.options.weight: task 'toy' has no such option"):
+        toys("task.options.weight=5")
+    with pytest.raises(ConfigError, match=r"task.options.wieght: task 'toy' with loss 'extra' has no such option; did you mean 'weight'"):
+        toys("train.loss=extra", "task.options.wieght=5")
+    settings = loss_settings(load_loss("extra"), config.train, config.options)
+    assert settings["options"] == {"weight": 5.0}, "its own only"
+    assert build_settings(load_task("toy"), config.model, config.options)["options"] == {"gain": 1.0}
+    assert main(["tasks"]) == 0
+    assert "    task.options.weight=3.0  of it" in capsys.readouterr().out
+
+
+def test_an_option_that_task_and_loss_both_have(toy: Path, site: Path) -> None:
+    add(site, "loss", LOSS.replace('"weight"', '"gain"'), package="fake_loss")
+    with pytest.raises(ConfigError, match=r"train.loss=extra: the loss and task 'toy' both have an option 'gain'"):
+        toys("train.loss=extra")
+
+
+def test_options_that_a_loss_refuses_cost_no_loading_of_data(site: Path, tmp_path: Path) -> None:
+    picky = LOSS.replace(
+        "    assert",
+        "    from neuprim.core.errors import ConfigError\n    if weight < 0: raise ConfigError('weight: expected more')\n    assert",
+    )
+    add(site, "loss", picky, package="fake_loss")
+    words = [
+        "task=static",
+        "scene=blender",
+        "scene.path=not_there",
+        "train.loss=extra",
+        "task.options.weight=-1",
+        f"output_dir='{tmp_path / 'run'}'",
+    ]
+    with pytest.raises(ConfigError, match="weight: expected more"):
+        run(compose(words), Console(quiet=True))
+
+
+# ---------------------------------------------------------------- shared settings that not everybody uses
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["task=toy", "model.sh_degree=2"], "model.sh_degree: task 'toy' does not use this setting; it uses model.neurons"),
+        (["task=toy", "model={sh_every: 0}"], "model.sh_every: task 'toy' does not use this setting; it uses model.neurons"),
+        (["task=relight", "train.ssim_weight=0.5"], "train.ssim_weight: task 'relight' does not use this setting; it uses model.neurons"),
+        (["task=relight", "model.sh_degree=1"], "model.sh_degree: task 'relight' does not use this setting"),
+        (["task=static", "train.loss=l1", "train.ssim_weight=0.5"], "train.ssim_weight: loss 'l1' does not use this setting"),
+    ],
+)
+def test_unused_settings_are_refused_when_typed(toy: Path, words: list[str], text: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        compose(words, False)
+    assert str(caught.value) == text or (text in str(caught.value) and text.endswith("setting"))
+
+
+def test_unused_settings_are_refused_in_a_preset(toy: Path) -> None:
+    (toy / "conf/preset/toy/quick.yaml").write_text("model: {sh_degree: 2}\n")
+    with pytest.raises(
+        ConfigError, match=r"preset/toy/quick.yaml: model.sh_degree: task 'toy' does not use this setting; it uses model.neurons"
+    ):
+        toys()
+    (toy / "conf/preset/toy/quick.yaml").write_text("train: {ssim_weight: 0.1}\n")
+    with pytest.raises(ConfigError, match=r"preset/toy/quick.yaml: train.ssim_weight: task 'toy'"):
+        toys()
+    (toy / "conf/preset/toy/quick.yaml").write_text("train: {ssim_weight: 0.1, loss: photometric}\n")
+    assert toys().train.ssim_weight == 0.1, "the preset's loss uses it"
+
+
+def test_used_settings_are_taken(toy: Path) -> None:
+    assert toys("model.neurons=3").model.neurons == 3
+    assert compose(["task=relight", "train.loss=photometric", "train.ssim_weight=0.5"], False).train.ssim_weight == 0.5
+    assert compose(["task=static", "train.loss=l1"], False).train.loss == "l1", "though its preset has a weight for its own loss"
+
+
+def test_what_is_not_used_is_not_shown(toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = toys()
+    assert config.unused == ("model.sh_degree", "model.sh_every", "train.ssim_weight")
+    assert main(["run", "task=toy", "--cfg"]) == 0
+    shown = capsys.readouterr().out
+    assert "neurons: 8" in shown
+    assert not any(name.partition(".")[2] in shown for name in config.unused)
+    (tmp_path / "config.yaml").write_text(config.to_yaml())
+    assert RunConfig.from_yaml(tmp_path / "config.yaml") == config
+    assert "ssim_weight: 0.2" in toys("train.loss=photometric").to_yaml()
+    assert compose(["task=static"], False).unused == ()
+
+
+def test_run_directories_from_before_still_load(tmp_path: Path) -> None:
+    """A file that shows settings which its task does not use, and the word that chose a loss."""
+    tree = compose(["task=relight"], False).to_dict()
+    tree["task"]["options"], tree["model"]["sh_degree"], tree["train"]["ssim_weight"] = {"loss": "compressed"}, 3, 0.2
+    (tmp_path / "config.yaml").write_text(json.dumps(tree))
+    old = RunConfig.from_yaml(tmp_path)
+    assert old.options == {"loss": "compressed"} and old.unused == ("model.sh_every",)
+    assert build_settings(load_task("relight"), old.model, old.options)["options"] == {}
+    assert callable(make_loss(old, load_task("relight")))
+
+
+@pytest.mark.parametrize("task", ["static", "dynamic", "relight"])
+def test_names_of_initial_values_and_rates_are_checked_before_data(task: str) -> None:
+    with pytest.raises(ConfigError, match=r"model.init.alhpa: no such setting; did you mean 'alpha'"):
+        compose([f"task={task}", "model.init.alhpa=0.3"], False)
+    with pytest.raises(ConfigError, match=r"train.rates.mean: no such parameter; did you mean 'means'"):
+        compose([f"task={task}", "train.rates.mean=0.3"], False)
+
+
+# ---------------------------------------------------------------- what functions get
+
+
+def test_functions_get_what_they_declare_and_no_more() -> None:
+    shy = replace(TASK, uses=("model.neurons",), options={"gain": (1.0, "x")})
+    model = build_settings(shy, ModelSettings(neurons=3), {"else": 2})
+    assert model["neurons"] == 3 and model["options"] == {"gain": 1.0} and model["primitives"] == 2000
+    assert "sh_degree" not in model and model.get("sh_degree", 7) == 7
+    with pytest.raises(ConfigError, match=r"task 'static' reads model.sh_degree, which its 'uses' does not declare"):
+        model["sh_degree"]
+    with pytest.raises(ConfigError, match=r"task 'static' reads task.options.width, which its 'options' does not declare"):
+        model["options"]["width"]
+    with pytest.raises(KeyError):
+        model["no_such_setting"]
+    train = loss_settings(shy, TrainSettings(), {})
+    with pytest.raises(ConfigError, match=r"the loss of task 'static' reads train.ssim_weight, which its 'uses' does not declare"):
+        train["ssim_weight"]
+
+
+def test_conformance_notices_settings_that_are_read_and_not_declared() -> None:
+    def build(model: Mapping[str, Any], dataset: Dataset) -> Any:
+        return relight.build({**model, "colour": {"hidden": model["sh_degree"]}}, dataset)
+
+    relight = load_task("relight")
+    with pytest.raises(
+        ConformanceError, match=r"fields: stopped by ConfigError: task 'relight' reads model.sh_degree, which its 'uses' does"
+    ):
+        named_checks(replace(relight, build=build))["fields"]()
+    with pytest.raises(ConformanceError, match=r"loss: stopped by ConfigError: the loss of task 'relight' reads train.ssim_weight, which"):
+        named_checks(replace(relight, loss=photometric))["loss"]()
+    with pytest.raises(ConformanceError, match=r"files: stopped by ConfigError: preset.*model.neurons: task 'static' does not use this"):
+        named_checks(replace(TASK, uses=()))["files"]()
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"options": 3}, "options is of type int; expected a mapping"),
+        ({"options": {"gain": 1.0}}, "options['gain'] is 1.0; expected (default, one line of help)"),
+        ({"options": {"gain": (1.0, None)}}, "options['gain'] is (1.0, None); expected (default, one line of help)"),
+        ({"options": {"a b": (1.0, "x")}}, "options has 'a b'; expected a name"),
+        ({"options": {"gain": (object, "x")}}, "options['gain'] has a default of type type; expected what a YAML file can hold"),
+        ({"uses": 3}, "uses is of type int; expected a tuple"),
+        ({"uses": ("model.primitives",)}, "uses has 'model.primitives'; expected some of model.neurons"),
+        ({"uses": ("neurons",)}, "uses has 'neurons'; expected some of"),
+    ],
+)
+def test_declarations_are_checked_when_a_plugin_is_loaded(changes: dict[str, Any], text: str) -> None:
+    for spec in (TASK, load_loss("photometric")):
+        assert text in (fault(replace(spec, **changes)) or "").replace("some of train.ssim_weight", "some of model.neurons")
+    assert (
+        fault(replace(load_loss("photometric"), uses=("model.neurons",))) == "uses has 'model.neurons'; expected some of train.ssim_weight"
+    )
+    assert fault(replace(TASK, uses=OPTIONAL)) is None
+
+
+# ---------------------------------------------------------------- one list of losses
+
+
+def test_all_built_in_losses_serve_any_task() -> None:
+    """Needs an installation of this version: losses come through its entry points."""
+    assert {"compressed", "l1", "photometric", "relative"} <= {info.name for info in list_losses()}
+    rendered, truth = torch.full((4, 4, 3), 0.5, requires_grad=True), torch.full((4, 4, 3), 0.25)
+    from tests.core.tiny import camera
+
+    frame = Supervision(_view(camera(0.0, 0.0)))
+    found = {}
+    for name in ("compressed", "l1", "relative"):
+        value, parts = load_loss(name).make(loss_settings(load_loss(name), TrainSettings(), {}))(rendered, truth, frame)
+        assert parts == {name: value.item()}
+        found[name] = value.item()
+        for task in ("static", "dynamic", "relight"):
+            assert compose([f"task={task}", f"train.loss={name}"], False).train.loss == name
+    expected = {
+        "l1": 0.25,
+        "relative": (0.25 / 0.55) ** 2,
+        "compressed": float(torch.tensor([9.0, 5.0]).log().diff().abs() / torch.tensor(17.0).log()),
+    }
+    assert found == pytest.approx(expected, rel=1e-5)
+
+
+def _view(camera: Any) -> Any:
+    from neuprim.core.data import View
+
+    return View("v", camera)
+
+
+def test_a_loss_sees_view_mask_alpha_and_progress() -> None:
+    from tests.core import tiny
+
+    seen: list[tuple[Tensor, Tensor, Supervision]] = []
+    data: Dataset = tiny.TwoPrimitives(random_background=True)
+    mask = torch.ones(tiny.SIZE, tiny.SIZE, dtype=torch.bool)
+    mask[:, 12:] = False
+    data.train.images = [replace(p, mask=mask) for p in data.train.images]  # type: ignore[attr-defined]
+    trainer = tiny.trainer(data, 8)
+
+    def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, Mapping[str, float]]:
+        seen.append((rendered.detach(), truth, frame))
+        return (rendered - truth).abs().mean(), {}
+
+    trainer.loss = loss  # type: ignore[assignment]
+    names = [report.view for report in trainer.run()]
+    assert [frame.view.name for _, _, frame in seen] == names
+    assert [frame.progress for _, _, frame in seen] == [i / 8 for i in range(8)]
+    for rendered, truth, frame in seen:
+        index = int(frame.view.name[1:])
+        assert frame.view.camera == data.train.view(index).camera and frame.view.conditions == {}
+        assert frame.mask is mask and frame.alpha is data.train.pixels(index).alpha
+        assert torch.equal(rendered[~mask], truth[~mask]), "masked pixels contribute nothing"
+        assert not torch.equal(rendered[mask], truth[mask])
+
+
+# ---------------------------------------------------------------- scenes of other packages
+
+
+def test_a_scene_of_another_package_keeps_its_tasks_declarations(toy: Path, site: Path) -> None:
+    text = 'from neuprim.core.extensions import SceneExtension\nfrom neuprim.core.task import SceneSpec\nPLUGIN = SceneExtension(api=1, task="toy", scene=SceneSpec("far", "x", print), config_package="far_scene.conf")\n'
+    files = {"far_scene/__init__.py": text, "far_scene/conf/__init__.py": "", "far_scene/conf/scene/toy/far.yaml": "{}"}
+    install(site, "far-scene", {"toy.far": "far_scene:PLUGIN"}, files, group="neuprim.scenes")
+    assert toys("scene=far").options == {"gain": 1.0}
+    with pytest.raises(ConfigError, match=r"model.sh_degree: task 'toy' does not use this setting"):
+        toys("scene=far", "model.sh_degree=1")

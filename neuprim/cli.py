@@ -79,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(words: list[str]) -> int:
-    parser, commands = _parsers(with_tasks=words[:1] == ["run"], export=words[1:] if words[:1] == ["export"] else ())
+    parser, commands = _parsers(with_tasks=words[:1] == ["run"], asked=words[1:] if words[:1] == ["export"] else ())
     if not words:
         parser.print_help()
         return 0
@@ -100,7 +100,7 @@ def _dispatch(words: list[str]) -> int:
     return call(args)
 
 
-def _parsers(with_tasks: bool, export: Sequence[str] = ()) -> tuple[Parser, dict[str, argparse.ArgumentParser]]:
+def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[str, argparse.ArgumentParser]]:
     parser = Parser(prog="neuprim", description="Radiance fields made of splattable neural primitives.", allow_abbrev=False)
     parser.add_argument("--version", action="version", version=f"neuprim {__version__}")
     sub = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -137,7 +137,7 @@ def _parsers(with_tasks: bool, export: Sequence[str] = ()) -> tuple[Parser, dict
     render.add_argument("--frames", type=arguments.count, default=60, metavar="N", help="frames of an orbit (default: 60)")
     add_environment_flags(render)
 
-    export = command("export", _export, "write a run's model in another format", export_help(export))
+    export = command("export", _export, "write a run's model in another format", export_help(asked))
     export.usage = "neuprim export RUN_DIR --format NAME [KEY=VALUE ...] [--CONDITION TEXT ...] [--out PATH] [--force] [--json]"
     export.add_argument("run_dir", type=Path, metavar="RUN_DIR")
     export.add_argument("--format", required=True, metavar="vdb|ply|gaussian-ply|mesh|npz", help="or a plugin's")

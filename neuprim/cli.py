@@ -7,28 +7,24 @@ neuprim keeps its traceback. Heavy modules are imported by the subcommands that 
 from __future__ import annotations
 
 import argparse
-import errno
 import os
+import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from neuprim import __version__, arguments
-from neuprim.core.errors import ConfigError, NeuprimError, nearest
+from neuprim.core.errors import DISK, ConfigError, NeuprimError, nearest
 from neuprim.core.notices import warnings_as_lines
 from neuprim.environment_flags import add_environment_flags, environment_of
+from neuprim.export_help import export_help
 
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
+    from neuprim.core.task import TaskSpec
 
 __all__ = ["main"]
-
-DISK = (
-    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO),
-    *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
-)
-"""What a disk or a path may refuse wherever a command reads or writes; a missing file is left out, as it may well be a bug."""
 
 COMMON_KEYS = """\
 commonest keys:
@@ -69,8 +65,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except NeuprimError as error:
         print(f"neuprim: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("neuprim: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"neuprim: interrupted{stop}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # `neuprim tasks | head`; the interpreter's own flush at exit must not fail either
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -85,21 +81,20 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(words: list[str]) -> int:
-    parser, commands = _parsers(with_tasks=words[:1] == ["run"])
+    parser, commands = _parsers(with_tasks=words[:1] == ["run"], asked=words[1:] if words[:1] == ["export"] else ())
     if not words:
         parser.print_help()
         return 0
     if not words[0].startswith("-") and words[0] not in commands:
         raise ConfigError(f"{words[0]}: no such command{nearest(words[0], commands)}")
     args, rest = parser.parse_known_args(words)
-    if args.command == "export":
-        args.options += [word for word in rest if not word.startswith("-")]
-        rest = [word for word in rest if word.startswith("-")]
     if args.command == "run":
         args.overrides += [word for word in rest if not word.startswith("-")]  # argparse gives up on words after a flag
         rest = [word for word in rest if word.startswith("-")]
     if args.command in ("render", "inspect"):
         args.conditions, rest = _conditions(args.run_dir, rest, args.command, commands[args.command])
+    if args.command == "export":
+        args.options, rest = _export_words(args.run_dir, rest, commands[args.command]), []
     if rest:
         known = [flag for flag in commands[args.command]._option_string_actions if flag.startswith("--")]
         raise ConfigError(f"{rest[0]}: no such argument of `neuprim {args.command}`{nearest(rest[0], known)}")
@@ -107,7 +102,7 @@ def _dispatch(words: list[str]) -> int:
     return call(args)
 
 
-def _parsers(with_tasks: bool) -> tuple[Parser, dict[str, argparse.ArgumentParser]]:
+def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[str, argparse.ArgumentParser]]:
     parser = Parser(prog="neuprim", description="Radiance fields made of splattable neural primitives.", allow_abbrev=False)
     parser.add_argument("--version", action="version", version=f"neuprim {__version__}")
     sub = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -130,7 +125,8 @@ def _parsers(with_tasks: bool) -> tuple[Parser, dict[str, argparse.ArgumentParse
         "render",
         _render,
         "draw images of a run",
-        "Each condition of the run's task (time, light, ...) is a flag, given after RUN_DIR: --NAME TEXT.",
+        "Each condition of the run's task (time, light, ...) is a flag, given after RUN_DIR: --time 0.5; a number may also be a list or a "
+        "range, --time 0.2,0.8 or --time 0:1:20, one frame each.",
     )
     render.add_argument("run_dir", type=Path, metavar="RUN_DIR")
     render.add_argument("--camera", required=True, metavar="orbit|test|FILE.json", help="which cameras")
@@ -143,9 +139,9 @@ def _parsers(with_tasks: bool) -> tuple[Parser, dict[str, argparse.ArgumentParse
     render.add_argument("--frames", type=arguments.count, default=60, metavar="N", help="frames of an orbit (default: 60)")
     add_environment_flags(render)
 
-    export = command("export", _export, "write a run's model in another format", "Formats and their options: docs/export.md.")
+    export = command("export", _export, "write a run's model in another format", export_help(asked))
+    export.usage = "neuprim export RUN_DIR --format NAME [KEY=VALUE ...] [--CONDITION TEXT ...] [--out PATH] [--force] [--json]"
     export.add_argument("run_dir", type=Path, metavar="RUN_DIR")
-    export.add_argument("options", nargs="*", metavar="KEY=VALUE", help="options of the format, and conditions (time=0.5, light=1,2,3)")
     export.add_argument("--format", required=True, metavar="vdb|ply|gaussian-ply|mesh|npz", help="or a plugin's")
     export.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR/export)")
     export.add_argument("--force", action="store_true", help="replace files that exist")
@@ -181,6 +177,7 @@ def _parsers(with_tasks: bool) -> tuple[Parser, dict[str, argparse.ArgumentParse
     inspect.add_argument("--up", choices=("x", "y", "z"), help="the upward axis (default: the scene's, or z)")
     inspect.add_argument("--size", type=arguments.size, metavar="WxH", help="pixels of the picture or window")
     inspect.add_argument("--out", type=Path, metavar="FILE", help=".png, .webp, .gif, .mp4, .html or .vdb (default: a window)")
+    inspect.add_argument("--force", action="store_true", help="replace files that exist")
 
     vdb = command("vdb", _vdb, "look into OpenVDB files", "`info` lists grids: type, transform, bounds, active voxels, values, memory.")
     vdb.add_argument("action", choices=("info",), metavar="info", help="what to do")
@@ -209,23 +206,31 @@ def _run(args: argparse.Namespace) -> int:
         print("---\n".join(config.to_yaml() for config in configs), end="")
         return 0
     if len(configs) == 1:
-        print(_fit(configs[0]))
+        print(_fit(configs[0], args.overrides))
         return 0
     failed = 0
     for number, config in enumerate(configs, 1):
         print(f"[{number}/{len(configs)}] {config.output_dir}", flush=True)
         try:
-            print(_fit(config), flush=True)
+            print(_fit(config, args.overrides), flush=True)
         except NeuprimError as error:  # the other combinations are still worth having
             failed += 1
             print(f"neuprim: error: {config.output_dir}: {' '.join(str(error).split())}", file=sys.stderr)
     return 2 if failed else 0
 
 
-def _fit(config: RunConfig) -> Path:
+def _fit(config: RunConfig, words: list[str]) -> Path:
+    """The run's directory; an interruption says where it is and what goes on with it, or with the sweep that ``words`` began."""
     from neuprim.run import run
 
-    return run(config)
+    try:
+        return run(config)
+    except KeyboardInterrupt:
+        from neuprim.config.overrides import resuming
+
+        there = "has the run up to here" if (config.output_dir / "checkpoint.safetensors").exists() else "has no checkpoint yet"
+        command = shlex.join(["neuprim", "run", *resuming(words, config.output_dir)])
+        raise KeyboardInterrupt(f"; {config.output_dir} {there}; to go on:\n  {command}") from None
 
 
 def _eval(args: argparse.Namespace) -> int:
@@ -286,7 +291,7 @@ def _inspect(args: argparse.Namespace) -> int:
     names = [name.strip() for name in args.show.split(",") if name.strip()]
     names += ["primitives"] * args.primitives + ["primitive"] * (args.primitive is not None)
     options, box = ViewOptions(tuple(args.level), args.primitive), None if args.box is None else corners(args.box)
-    more = {"options": options, "against": args.against, "out": args.out, "size": args.size, "up": args.up}
+    more = {"options": options, "against": args.against, "out": args.out, "size": args.size, "up": args.up, "overwrite": args.force}
     for path in inspect_run(Request(run_dir, names or ["volume"], args.conditions, args.grid, box, **more)):
         print(path)
     return 0
@@ -325,18 +330,40 @@ def _conditions(run_dir: Path, words: list[str], command: str, known: argparse.A
     """Condition name -> text, from the flags that the run's task defines, and the words that are none of them."""
     if not words:
         return {}, []
+    from neuprim.core.conditions import split_words
+
+    task = _task_of(run_dir)
+    found, rest = split_words(words, task.conditions)
+    if rest:
+        raise _no_such(rest[0], command, known, task)
+    return found, []
+
+
+def _export_words(run_dir: Path, words: list[str], known: argparse.ArgumentParser) -> list[str]:
+    """The options and conditions of ``neuprim export``; refuses flags that are neither its own nor conditions."""
+    if any(word.startswith("-") for word in words):
+        from neuprim.core.conditions import split_words
+
+        task = _task_of(run_dir)
+        _, rest = split_words(words, task.conditions, bare=False)
+        for word in rest:
+            if word.startswith("-"):
+                raise _no_such(word, "export", known, task)
+    return words
+
+
+def _task_of(run_dir: Path) -> TaskSpec:
     from neuprim.config import RunConfig, task_of
 
     file = _run_directory(run_dir) / "config.yaml"
-    spec = task_of(RunConfig.from_yaml(file), file)
-    parser = Parser(prog=f"neuprim {command}", add_help=False, allow_abbrev=False)
-    for condition in spec.conditions:
-        parser.add_argument("--" + condition.name.replace("_", "-"), dest=condition.name)
-    args, rest = parser.parse_known_args(words)
-    if rest:
-        flags = [flag for flag in (*known._option_string_actions, *parser._option_string_actions) if flag.startswith("--")]
-        raise ConfigError(f"{rest[0]}: no such argument of `neuprim {command}` for task {spec.name!r}{nearest(rest[0], flags)}")
-    return {name: text for name, text in vars(args).items() if text is not None}, []
+    return task_of(RunConfig.from_yaml(file), file)
+
+
+def _no_such(word: str, command: str, known: argparse.ArgumentParser, task: TaskSpec) -> ConfigError:
+    from neuprim.core.conditions import flag
+
+    flags = [f for f in (*known._option_string_actions, *(flag(spec.name) for spec in task.conditions)) if f.startswith("--")]
+    return ConfigError(f"{word}: no such argument of `neuprim {command}` for task {task.name!r}{nearest(word, flags)}")
 
 
 def _run_directory(path: Path) -> Path:

@@ -16,6 +16,7 @@ from neuprim.core import images
 from neuprim.core.camera_file import read_cameras
 from neuprim.core.channels import Channels, channels_of, stored_channels
 from neuprim.core.checkpoint import load_model
+from neuprim.core.conditions import flag, read_conditions
 from neuprim.core.data import Dataset, View
 from neuprim.core.data_check import check_dataset
 from neuprim.core.datasets.records import Record
@@ -159,7 +160,7 @@ def render_run(
     if lights:  # these replace the views' own; the first stands for all where only their presence counts
         views = [replace(v, conditions={**v.conditions, **lights[0]}) for v in views]
     with watch:
-        views, animated = with_conditions(views, task, conditions)
+        views, animated = with_conditions(views, task, conditions, tell)
     format = format or _format_of(out, animated)
     if channels.partial and format not in _RAW:
         tell(f"shown: {channels.shown}; --format exr and npy hold all channels")
@@ -232,7 +233,7 @@ def _illumination(
     found = task.environment(read_environment(choice.path, up, choice.rotation, choice.scale), choice.samples, facts)
     clash = sorted(conditions.keys() & found.conditions[0].keys())
     if clash:
-        raise ConfigError(f"--{clash[0].replace('_', '-')} and --environment: give one of them")
+        raise ConfigError(f"{flag(clash[0])} and --environment: give one of them")
     return found
 
 
@@ -241,17 +242,20 @@ def _format_of(out: Path | None, animated: bool) -> str:
     return suffix if suffix in FORMATS else "webp" if animated else "png"
 
 
-def with_conditions(views: list[View], task: TaskSpec, texts: Mapping[str, str]) -> tuple[list[View], bool]:
+def with_conditions(
+    views: list[View], task: TaskSpec, texts: Mapping[str, str], warn: Callable[[str], None] = lambda text: None
+) -> tuple[list[View], bool]:
     """Views with the conditions the user gave, and whether one of these is animated; an animated condition repeats or stretches the
     cameras to its length.
 
     Raises:
-        ConfigError: a view lacks a condition that the task needs.
+        ConfigError: a view lacks a condition that the task needs, or as :func:`neuprim.core.conditions.read_conditions`.
     """
     animated = False
+    given = read_conditions(task.conditions, texts, warn)
     for spec in task.conditions:
-        if spec.name in texts:
-            values = spec.parse(texts[spec.name])
+        if spec.name in given:
+            values = given[spec.name]
             if len(values) == 1:
                 views = [replace(v, conditions={**v.conditions, spec.name: values[0]}) for v in views]
             else:
@@ -261,7 +265,7 @@ def with_conditions(views: list[View], task: TaskSpec, texts: Mapping[str, str])
                 views = [replace(v, name=f"{v.name}_{i:03d}", conditions={**v.conditions, spec.name: x}) for i, (v, x) in enumerate(pick)]
         for v in views:
             if spec.name not in v.conditions:
-                raise ConfigError(f"view {v.name} has no {spec.name}, which task {task.name!r} needs; give --{spec.name}")
+                raise ConfigError(f"view {v.name} has no {spec.name}, which task {task.name!r} needs; give {flag(spec.name)}")
     return views, animated
 
 

@@ -7,6 +7,7 @@ import math
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,15 @@ from rich.console import Console
 
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint
+from neuprim.core.conditions import flag, named, read_conditions, split_words
+from neuprim.core.drafts import Draft, drafted, refuse_taken
 from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
+from neuprim.core.fields import ConditionSpec
 from neuprim.evaluate import load_run
 from neuprim.export_record import record_export
-from neuprim.plugins.registry import UnknownPlugin, load_exporter
+from neuprim.plugins.crashes import origin, reported
+from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin, load_exporter
 from neuprim.trained import trained_model
 
 __all__ = ["export_run", "import_model", "import_run", "print_report"]
@@ -30,38 +35,80 @@ __all__ = ["export_run", "import_model", "import_run", "print_report"]
 def export_run(
     run_dir: Path, name: str, out: Path | None = None, words: Sequence[str] = (), overwrite: bool = False, console: Console | None = None
 ) -> ExportReport:
-    """Write a run's model in a format.
+    """Write a run's model in a format: whole, or not at all, and over files that exist only with ``overwrite``, whoever's format it is.
 
     Args:
-        words: ``KEY=VALUE`` options of the exporter, and conditions of the task.
+        words: ``KEY=VALUE`` options of the exporter, and conditions of the task, also as ``--NAME TEXT``.
         console: where progress goes; None: nowhere.
 
     Raises:
-        NeuprimError: no such run, format or option, or something that the format cannot hold.
+        NeuprimError: no such run, format or option, something that the format cannot hold, files in its way, or an exporter that crashed.
     """
     exporter = load_exporter(name)
+    final = _destination(run_dir, exporter, out)
+    refuse_taken(final, overwrite)
     shown = _Progress(console)
     run = trained_model(run_dir, shown)
-    options, conditions = _options(words, exporter, [spec.name for spec in run.task.conditions])
-    job = ExportJob(run, out, options, conditions, overwrite, shown)
-    return record_export(name, job, exporter.write(job))
+    options, conditions = _options(words, exporter, run.task.conditions)
+    notes: list[str] = []
+    read_conditions(run.task.conditions, conditions, notes.append)
+    with drafted(final, overwrite) as draft:
+        job = ExportJob(run, draft.out, options, conditions, shown)
+        with reported(EXPORTERS, name, [run_dir / "logs", final.absolute().parent]):
+            report = exporter.write(job)
+        files = _files(report, draft, name)
+        draft.publish()
+    report = replace(report, files=files, notes=(*notes, *(draft.words(note) for note in report.notes)))
+    return record_export(name, job, report)
 
 
-def _options(words: Sequence[str], exporter: Exporter, offered: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
-    options: dict[str, Any] = {}
-    conditions: dict[str, str] = {}
-    for word in words:
+def _destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
+    """What the user named, or the exporter's own name for it in the run."""
+    if out is None:
+        return run_dir / "export" / (exporter.default or exporter.name + "".join(exporter.suffixes[:1]))
+    fits = any(out.name.lower().endswith(suffix) and len(out.name) > len(suffix) for suffix in exporter.suffixes)
+    if exporter.suffixes and (not fits or out.is_dir()):
+        raise ConfigError(f"--out {out}: expected a file name with {' or '.join(exporter.suffixes)}")
+    return out
+
+
+def _files(report: Any, draft: Draft, name: str) -> tuple[Path, ...]:
+    """Where the files of a report will be."""
+    who = f"exporter {name!r} of {origin(EXPORTERS, name).origin}"
+    if not isinstance(report, ExportReport):
+        raise PluginError(f"{who}: write returned {type(report).__name__}; expected an ExportReport")
+    files = []
+    for path in map(Path, report.files):
+        place = draft.place(path)
+        if place is None:
+            raise PluginError(f"{who}: wrote {path} instead of {draft.out}, past everything that keeps files from being replaced")
+        if not path.exists():
+            raise PluginError(f"{who}: reports {path}, which it did not write")
+        files.append(place)
+    return tuple(files)
+
+
+def _options(words: Sequence[str], exporter: Exporter, specs: Sequence[ConditionSpec]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Every option of the exporter, and the texts of the conditions; where both have one name, ``NAME=`` means the option."""
+    options = {name: default for name, (default, _) in exporter.options.items()}
+    conditions, rest = split_words(words, specs, bare=False)
+    if conditions and not exporter.conditions:
+        raise ConfigError(f"{flag(next(iter(conditions)))}: --format {exporter.name} takes no conditions")
+    given = set()
+    for word in rest:
         key, equals, text = word.partition("=")
         if not equals or not key:
             raise ConfigError(f"{word!r}: expected KEY=VALUE")
-        if key in options or key in conditions:
+        condition = named(key, specs) if exporter.conditions and key not in exporter.options else None
+        if key in given or (condition or "") in conditions:
             raise ConfigError(f"{key}: given twice")
-        if exporter.conditions and key in offered and key not in exporter.options:
-            conditions[key] = text
+        if condition is not None:
+            conditions[condition] = text
         elif key in exporter.options:
+            given.add(key)
             options[key] = _scalar(text)
         else:
-            known = [*exporter.options, *(offered if exporter.conditions else ())]
+            known = [*exporter.options, *((spec.name for spec in specs) if exporter.conditions else ())]
             raise ConfigError(f"{key}: no such option of --format {exporter.name}{nearest(key, known) or '; it has none'}")
     return options, conditions
 
@@ -123,7 +170,11 @@ def import_run(path: Path, out: Path, name: str | None = None) -> Path:
         raise DataError(f"{path}: no such file")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"--out {out}: exists and is not an empty folder")
-    return import_model(_reader(path, name).read(path), path, out)  # type: ignore[misc]
+    reader = _reader(path, name)
+    assert reader.read is not None
+    with reported(EXPORTERS, name or reader.name, [out.absolute().parent]):
+        stored = reader.read(path)
+    return import_model(stored, path, out)
 
 
 def _reader(path: Path, name: str | None) -> Exporter:

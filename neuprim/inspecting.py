@@ -14,16 +14,19 @@ from torch import Tensor
 from neuprim.core import images
 from neuprim.core.density_grid import POINTS_LIMIT, agreement, density_grid, lattice
 from neuprim.core.density_truth import DensityTruth
+from neuprim.core.drafts import refuse_taken
 from neuprim.core.errors import BackendUnavailable, ConfigError
+from neuprim.core.extensions import Inspector
 from neuprim.core.fields import Conditions
 from neuprim.core.film import write_film
+from neuprim.plugins.crashes import is_ours, reported
 from neuprim.plugins.inspect.against import open_truth, pair, write_volume
 from neuprim.plugins.inspect.field import FieldFrame, ViewOptions
 from neuprim.plugins.inspect.frames import box_of, condition_frames, in_words, round_up
 from neuprim.plugins.inspect.headless import has_display, prepare_headless, require_pyvista
 from neuprim.plugins.inspect.page import write_page
 from neuprim.plugins.inspect.window import Window, panels_of
-from neuprim.plugins.registry import load_inspector
+from neuprim.plugins.registry import INSPECTORS, load_inspector
 from neuprim.trained import trained_model
 
 __all__ = ["OUTPUTS", "Request", "inspect_run"]
@@ -47,6 +50,7 @@ class Request:
         box: (2, 3) scene units; None: around the truth, or around what the model absorbs.
         against: an OpenVDB file or folder, or "scene".
         up: "x", "y" or "z"; None: the scene's setting, or z.
+        overwrite: whether files that exist may be replaced.
         say: prints a line.
     """
 
@@ -60,6 +64,7 @@ class Request:
     out: Path | None = None
     size: tuple[int, int] | None = None
     up: str | None = None
+    overwrite: bool = False
     say: Callable[[str], None] = print
 
 
@@ -69,13 +74,14 @@ def inspect_run(request: Request) -> list[Path]:
     Several frames become numbered files for .png and .vdb, an animation for .webp, .gif and .mp4, and a slider in a page or a window.
 
     Raises:
-        ConfigError, DataError, CheckpointError: the user's words or files.
+        ConfigError, DataError, CheckpointError: the user's words or files, files in the way.
+        PluginError: an inspector that crashed.
         BackendUnavailable: pyvista is missing, VTK cannot draw here, or there is no display and no ``out``.
     """
     kind = "" if request.out is None else request.out.suffix.lower()
     if request.out is not None and kind not in OUTPUTS:
         raise ConfigError(f"--out {request.out}: expected a name that ends in {', '.join(OUTPUTS)}")
-    inspectors = [load_inspector(name) for name in dict.fromkeys(request.show)]
+    inspectors = [_watched(load_inspector(name), name, request) for name in dict.fromkeys(request.show)]
     if request.out is None and not has_display():
         raise BackendUnavailable("there is no display to open a window on; give --out FILE.png, .webp, .html or .vdb")
     if kind not in (".html", ".vdb"):
@@ -92,7 +98,7 @@ def inspect_run(request: Request) -> list[Path]:
         write_page(request.out, film, inspectors)
         return [request.out]
     if kind == ".vdb":
-        return _each(request, film, ".vdb", lambda path, frame: write_volume(path, frame))
+        return _each(request, film, lambda path, frame: write_volume(path, frame))
     window = Window(panels_of(inspectors, request.against is not None), film.up, bool(kind), request.size)
     try:
         if not kind:
@@ -103,6 +109,25 @@ def inspect_run(request: Request) -> list[Path]:
         window.close()
 
 
+def _watched(inspector: Inspector, name: str, request: Request) -> Inspector:
+    """The inspector, whose crashes are reported."""
+    folders = [request.run_dir / "logs", *([] if request.out is None else [request.out.absolute().parent])]
+
+    def add(plotter: Any, frame: FieldFrame) -> None:
+        with reported(INSPECTORS, name, folders):
+            inspector.add(plotter, frame)
+
+    return inspector if is_ours(INSPECTORS, name) else replace(inspector, add=add)
+
+
+def _paths(out: Path, count: int) -> list[Path]:
+    """The files to write: of several frames numbered ones, or a film or page of all."""
+    suffix = out.suffix.lower()
+    if count == 1 or suffix not in (".png", ".vdb"):
+        return [out]
+    return [out.with_name(f"{out.stem}_{i:04d}{suffix}") for i in range(count)]
+
+
 def _pictures(request: Request, film: _Film, window: Window, kind: str) -> list[Path]:
     assert request.out is not None
 
@@ -111,16 +136,16 @@ def _pictures(request: Request, film: _Film, window: Window, kind: str) -> list[
         return torch.from_numpy(window.picture().copy()).float() / 255.0
 
     if kind == ".png":
-        return _each(request, film, ".png", lambda path, frame: images.write_png(path, drawn(frame)))
+        return _each(request, film, lambda path, frame: images.write_png(path, drawn(frame)))
     request.out.parent.mkdir(parents=True, exist_ok=True)
     write_film(request.out, [drawn(film.frame(i)) for i in range(len(film))], min(24.0, max(len(film) / 4.0, 4.0)))
     return [request.out]
 
 
-def _each(request: Request, film: _Film, suffix: str, write: Callable[[Path, FieldFrame], Any]) -> list[Path]:
+def _each(request: Request, film: _Film, write: Callable[[Path, FieldFrame], Any]) -> list[Path]:
     assert request.out is not None
     request.out.parent.mkdir(parents=True, exist_ok=True)
-    paths = [request.out if len(film) == 1 else request.out.with_name(f"{request.out.stem}_{i:04d}{suffix}") for i in range(len(film))]
+    paths = _paths(request.out, len(film))
     for i, path in enumerate(paths):
         write(path, film.frame(i))
     return paths
@@ -137,13 +162,15 @@ class _Film:
         self.up = request.up or str(run.scene.get("up", "z"))
         self.up = self.up if self.up in ("x", "y", "z") else "z"
         self.options, self.name = request.options, request.run_dir.resolve().name
-        wanted = condition_frames(run.task.conditions, request.conditions)
+        wanted = condition_frames(run.task.conditions, request.conditions, request.say)
         pairs: list[tuple[Conditions, int]] = [(conditions, -1) for conditions in wanted]
         if request.against is not None:
             self.truth, words = open_truth(request.against, run.volume)
             request.say(words)
             pairs = pair(wanted, self.truth, bool(request.conditions))
         self.pairs = pairs
+        for path in [] if request.out is None else _paths(request.out, len(pairs)):
+            refuse_taken(path, request.overwrite)
         box = request.box if request.box is not None else self._box()
         if request.grid**3 > POINTS_LIMIT:
             raise ConfigError(f"--grid {request.grid}: expected at most {round(POINTS_LIMIT ** (1 / 3))}")

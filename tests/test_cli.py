@@ -1,4 +1,5 @@
 import errno
+import shlex
 import subprocess
 import sys
 import types
@@ -155,6 +156,47 @@ def test_interrupt_is_130_and_a_bug_keeps_its_traceback(calls: list[Any], monkey
         main(["run", "task=toy"])
 
 
+def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
+    calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The words that it prints, read by a shell, are a command that resumes."""
+    started: list[RunConfig] = []
+
+    def stop(config: RunConfig) -> Path:
+        config.output_dir.mkdir(parents=True, exist_ok=True)
+        if config.seed == 3:
+            (config.output_dir / "checkpoint.safetensors").touch()
+        started.append(config)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys.modules["neuprim.run"], "run", stop)
+    nasty = "it's a=b, $c"
+    quoted = "output_dir='it\\'s a=b, $c'"
+    for words, where, there in (
+        (
+            ["task=toy", "seed=3", "train.rates={means: 1e-3, other: 2}", "+task.options.a='x y'"],
+            "outputs/toy-ball",
+            "has the run up to here",
+        ),
+        (["task=toy", "seed=4", quoted], nasty, "has no checkpoint yet"),
+        (["task=toy", "seed=3", "resume=false", "output_dir=o"], "o", "has the run up to here"),
+        (
+            ["-m", "task=toy", "seed=3,4", "model.primitives=2,3"],
+            "outputs/toy-ball-sweep/seed-3_model.primitives-2",
+            "has the run up to here",
+        ),
+    ):
+        assert main(["run", *words]) == 130
+        first, second = capsys.readouterr().err.splitlines()
+        assert first == f"neuprim: interrupted; {where} {there}; to go on:"
+        assert second.startswith("  neuprim run ")
+        assert main(shlex.split(second)[1:]) == 130
+        assert capsys.readouterr().err.splitlines()[1] == second, "the same words again"
+        before, after = started[-2:]
+        assert after.resume and not before.resume and after.output_dir == before.output_dir == Path(where)
+        assert (after.seed, after.train, after.model, after.options) == (before.seed, before.train, before.model, before.options)
+
+
 def test_a_disk_that_refuses_is_no_bug(calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     def full(config: RunConfig) -> Path:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -193,6 +235,9 @@ def test_render(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     flags = ["--camera", "cams.json", "--size", "640x480", "--format", "exr", "--out", "o", "--frames", "3", "--fps", "12"]
     assert main(["render", "r", *flags, "--time", "0:1", "--light-pos=-1,0,2"]) == 0
     assert calls[-1] == (Path("r"), "cams.json", (640, 480), "exr", Path("o"), 3, {"time": "0:1", "light_pos": "-1,0,2"}, 12.0)
+    for words in (["--light_pos", "-1,0,2"], ["--light-pos", "-1,0,2"], ["light-pos=-1,0,2"], ["--light_pos=-1,0,2"]):
+        assert main(["render", "r", "--camera", "orbit", *words]) == 0
+        assert calls[-1][6] == {"light_pos": "-1,0,2"}
     flags = ["--camera", "orbit", "--environment", "sky.exr", "--environment-samples", "9", "--environment-rotation=-45"]
     assert main(["render", "r", *flags]) == 0
     assert calls[-1][-1] == EnvironmentFile(Path("sky.exr"), 9, -45.0, 1.0)

@@ -115,7 +115,9 @@ def _composed(
         unused=unused(spec, loss),
         overrides=list(overrides),
         non_default={**changed, **_differences(_typed(plain), _typed(full, settings))},
-        made_by=MadeBy(__version__, Maker.of(task_info), found.added_by and Maker.of(found.added_by, scene_name), loss_maker),
+        made_by=MadeBy(
+            __version__, Maker.of(task_info), None if found.added_by is None else Maker.of(found.added_by, scene_name), loss_maker
+        ),
     )
 
 

@@ -6,11 +6,12 @@ import itertools
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from neuprim.core.errors import ConfigError
 
-__all__ = ["Assignment", "expand_sweep", "parse", "sweep_names"]
+__all__ = ["Assignment", "assigned", "expand_sweep", "parse", "resuming", "sweep_names", "swept_keys"]
 
 NOT_SWEPT = ("output_dir", "resume")
 MAX_RUNS = 10_000
@@ -75,6 +76,24 @@ def sweep_names(overrides: Sequence[str], combinations: Sequence[Sequence[str]])
             number += 1
         names.append(name if number == 1 else f"{name}-{number}")
     return names
+
+
+def assigned(key: str, value: str) -> str:
+    """``key=value`` as :func:`parse` reads it back, the value quoted where it would be taken for something else than text."""
+    plain = f"{key}={value}"
+    try:
+        if value and parse([plain])[0].value == value:
+            return plain
+    except ConfigError:
+        pass
+    return f"{key}='" + re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + ("\\'" if m[2] else ""), value) + "'"
+
+
+def resuming(overrides: Sequence[str], directory: Path) -> list[str]:
+    """The words after ``neuprim run`` that go on with what ``overrides`` began: a run in ``directory``, or the sweep it is a part of."""
+    kept = [word for word in overrides if word.partition("=")[0].strip().lstrip("+") not in NOT_SWEPT]
+    sweep = bool(swept_keys(overrides))
+    return [*(["-m"] if sweep else []), *kept, assigned("output_dir", str(directory.parent if sweep else directory)), "resume=true"]
 
 
 def swept_keys(overrides: Iterable[str]) -> list[str]:

@@ -6,9 +6,26 @@ The command line prints these as one line and exits with status 2; anything else
 from __future__ import annotations
 
 import difflib
+import errno
 from collections.abc import Iterable
 
-__all__ = ["BackendUnavailable", "CheckpointError", "ConfigError", "DataError", "FormError", "NeuprimError", "NonFiniteError", "nearest"]
+__all__ = [
+    "DISK",
+    "BackendUnavailable",
+    "CheckpointError",
+    "ConfigError",
+    "DataError",
+    "FormError",
+    "NeuprimError",
+    "NonFiniteError",
+    "nearest",
+]
+
+DISK = (
+    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO),
+    *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
+)
+"""What a disk or a path may refuse wherever a command reads or writes; a missing file is left out, as it may well be a bug."""
 
 
 class NeuprimError(Exception):

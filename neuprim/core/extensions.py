@@ -6,15 +6,19 @@ through the same groups as anybody's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from torch import Tensor
 
 from neuprim.core.channels import Channels, stored_channels
+from neuprim.core.conditions import export_frames
 from neuprim.core.data import Dataset
+from neuprim.core.errors import ConfigError
 from neuprim.core.primitives import Primitives
 from neuprim.core.render.settings import RenderSettings
 from neuprim.core.task import Loss, SceneSpec, TaskSpec
@@ -60,19 +64,61 @@ class ExportJob:
     """One call of ``neuprim export``.
 
     Attributes:
-        out: file or folder the user named, or None for the exporter's default name inside the run directory.
-        options: ``KEY=VALUE`` words of the user, numbers and booleans as such; only names that the exporter has.
-        conditions: condition name -> text, as ``render`` takes it; empty unless the exporter takes conditions.
-        overwrite: whether files that exist may be replaced.
+        out: the file to write, or the folder to make; files beside it count too. It has the name that the user will find but lies in a
+            private folder: what is written there is moved to its place when all is done and if nothing is in the way there, so an
+            exporter need not know about ``--force``, and one that fails leaves nothing behind.
+        options: every option of the exporter: what the user gave, numbers and booleans as such, or else its default.
+        conditions: condition name -> text, already read and held against its range once; empty unless the exporter takes conditions.
         progress: called with (text, fraction 0..1).
     """
 
     run: TrainedModel
-    out: Path | None = None
+    out: Path
     options: Mapping[str, Any] = field(default_factory=dict)
     conditions: Mapping[str, str] = field(default_factory=dict)
-    overwrite: bool = False
     progress: Callable[[str, float], None] = lambda text, fraction: None
+
+    def frames(self, several: bool = False) -> list[dict[str, Tensor]]:
+        """Every condition of the task per frame that the user asked for; one frame unless ``several``, and for tasks without conditions.
+
+        Raises:
+            ConfigError: a condition is missing, or has several values where one is wanted.
+        """
+        return export_frames(self.run.task.conditions, self.conditions, several)
+
+    def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float | None:
+        """An option that is a finite number from ``low`` to ``high``, or None where it is not set.
+
+        Raises:
+            ConfigError: it is something else.
+        """
+        value = self.options[name]
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not (math.isfinite(value) and low <= value <= high):
+            raise ConfigError(f"{name}={value}: expected a number from {low:g} to {high:g}")
+        return float(value)
+
+    def count(self, name: str, low: int, high: int) -> int | None:
+        """As :meth:`number`, a whole one."""
+        value = self.number(name, low, high)
+        if value is not None and not value.is_integer():
+            raise ConfigError(f"{name}={value}: expected a whole number from {low} to {high}")
+        return None if value is None else int(value)
+
+    def choice(self, name: str, *offered: str) -> str:
+        """An option that is one of those offered; raises as :meth:`number`."""
+        value = self.options[name]
+        if value not in offered:
+            raise ConfigError(f"{name}={value}: expected {' or '.join(offered)}")
+        return str(value)
+
+    def flag(self, name: str) -> bool:
+        """An option that is true or false; raises as :meth:`number`."""
+        value = self.options[name]
+        if not isinstance(value, bool):
+            raise ConfigError(f"{name}={value}: expected true or false")
+        return value
 
 
 @dataclass(frozen=True)
@@ -80,7 +126,7 @@ class ExportReport:
     """What was written, and what it lost.
 
     Attributes:
-        files: in order.
+        files: in order; each is :attr:`ExportJob.out`, in it, or beside it.
         lossless: whether importing restores the model exactly.
         errors: named numbers of the export against the model, e.g. ``{"psnr": 31.2}``; empty where none is defined.
         notes: one line each, for the user (conventions, frames, what is left out).
@@ -112,11 +158,15 @@ class Exporter:
     """A format of ``neuprim export --format NAME``; group ``neuprim.exporters``.
 
     Attributes:
-        options: option name -> (default, one line of help).
-        write: does it, atomically; raises a :class:`~neuprim.core.errors.NeuprimError` for what the format cannot hold.
+        options: option name -> (default, one line of help); shown by ``neuprim export --format NAME --help``.
+        write: writes :attr:`ExportJob.out`; raises a :class:`~neuprim.core.errors.NeuprimError` for what the format cannot hold.
         conditions: whether it takes values of the task's conditions (``time=0.5``).
         read: for lossless formats, ``neuprim import``: what ``write`` wrote, from an untrusted file; raises
             :class:`~neuprim.core.errors.DataError`. Chosen by the file's suffix, which is then the exporter's name.
+        default: name of the file or folder in ``RUN_DIR/export`` where the user names none; "" for the exporter's name with the first
+            suffix.
+        suffixes: what the name of its one file may end in, as ``(".glb", ".ply")``; other names, and folders, are refused before it is
+            called. Empty: it takes any name, also that of a folder.
     """
 
     api: int
@@ -126,6 +176,8 @@ class Exporter:
     options: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
     conditions: bool = False
     read: Callable[[Path], StoredModel] | None = None
+    default: str = ""
+    suffixes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,13 @@ Conditions = Mapping[str, Tensor]
 class ConditionSpec:
     """A quantity a frame depends on besides its camera; command-line flags derive from these.
 
-    ``parse`` turns the text of ``--NAME TEXT`` into one tensor per frame of an animation.
+    Attributes:
+        range: lowest and highest value of every element. Numbers that are not finite are refused by every command; for numbers beyond
+            the range there is a warning.
+        parse: the text of ``--NAME TEXT`` -> one tensor of ``shape`` per frame of an animation; raises
+            :class:`~neuprim.core.errors.ConfigError`. Where ``shape`` is ``()`` it is asked for each element of a list ``A,B,C``, and
+            need not know ranges ``A:B:COUNT`` (:mod:`neuprim.core.conditions`).
+        strict: whether numbers beyond the range are refused.
     """
 
     name: str
@@ -55,6 +61,7 @@ class ConditionSpec:
     unit: str
     range: tuple[float, float]
     parse: Callable[[str], list[Tensor]]
+    strict: bool = False
 
 
 # ---------------------------------------------------------------- closed forms of density

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
+from pathlib import PurePath
 from typing import Any
 
 from neuprim.core.channel_names import names_fault
@@ -53,8 +54,30 @@ def fault(spec: Any) -> str | None:
         return _declared(spec, "train.")
     if isinstance(spec, SceneExtension):
         return _one(spec.scene, SceneSpec, "scene")
-    if isinstance(spec, Exporter) and not isinstance(spec.options, Mapping):
+    if isinstance(spec, ConditionSpec):
+        return _condition(spec)
+    return _exporter(spec) if isinstance(spec, Exporter) else None
+
+
+def _condition(spec: ConditionSpec) -> str | None:
+    ends = spec.range
+    numbers = isinstance(ends, tuple | list) and len(ends) == 2 and all(isinstance(end, int | float) for end in ends)
+    if not numbers or not ends[0] < ends[1]:
+        return f"range is {ends!r}; expected a lower and a higher number"
+    return None
+
+
+def _exporter(spec: Exporter) -> str | None:
+    if not isinstance(spec.options, Mapping):
         return f"options is of type {type(spec.options).__name__}; expected a mapping"
+    for name, value in spec.options.items():
+        if not isinstance(value, tuple | list) or len(value) != 2 or not isinstance(value[1], str):
+            return f"options[{name!r}] is {value!r}; expected (default, one line of help)"
+    if not isinstance(spec.default, str) or PurePath(spec.default).name != spec.default or spec.default == "..":
+        return f"default is {spec.default!r}; expected the name of a file or folder"
+    suffixes = spec.suffixes
+    if not isinstance(suffixes, tuple | list) or not all(isinstance(s, str) and s.startswith(".") and s == s.lower() for s in suffixes):
+        return f"suffixes is {suffixes!r}; expected a tuple of such as '.json', in lower case"
     return None
 
 

@@ -17,10 +17,11 @@ from rich.console import Console
 from neuprim.cli import _parsers
 from neuprim.config import compose, compose_all
 from neuprim.core.camera_file import read_cameras
+from neuprim.core.conditions import read_conditions, split_words
 from neuprim.core.errors import NeuprimError
 from neuprim.core.fields import ConditionSpec
 from neuprim.core.vdb import Grid, scale_transform, write_vdb
-from neuprim.plugins.registry import survey
+from neuprim.plugins.registry import load_exporter, survey
 from neuprim.run import run
 from tests.docs.pages import PAGES, ROOT, Block, blocks, commands, name_of
 
@@ -138,13 +139,13 @@ def test_json_blocks_are_json_and_the_cameras_are_cameras(tmp_path: Path) -> Non
 
 
 @pytest.fixture(scope="module")
-def conditions() -> dict[str, ConditionSpec]:
-    """Flag of ``neuprim render`` and ``inspect`` -> the condition that defines it."""
+def conditions() -> list[ConditionSpec]:
+    """The conditions of all tasks."""
     specs = [report.spec for report in survey()]
-    return {"--" + c.name.replace("_", "-"): c for spec in specs if spec is not None for c in spec.conditions}
+    return [c for spec in specs if spec is not None for c in spec.conditions]
 
 
-def check(words: list[str], conditions: dict[str, ConditionSpec]) -> None:
+def check(words: list[str], conditions: list[ConditionSpec]) -> None:
     """Raises where the command line or the configuration would refuse ``neuprim WORDS``."""
     parser, known = _parsers(with_tasks=False)
     args, rest = parser.parse_known_args(words)
@@ -153,21 +154,26 @@ def check(words: list[str], conditions: dict[str, ConditionSpec]) -> None:
         settings = [word for word in rest if not word.startswith("-")]
         rest = [word for word in rest if word.startswith("-")]
         (compose_all if args.multirun else compose)(settings, False)
-    if args.command in ("render", "inspect"):
-        while rest and rest[0] in conditions:
-            if not PLACEHOLDER.search(rest[1]):
-                assert conditions[rest[0]].parse(rest[1])
-            rest = rest[2:]
+    if args.command in ("render", "inspect", "export"):
+        given, rest = split_words(rest, conditions)
+        assert (
+            read_conditions(conditions, {name: text for name, text in given.items() if not PLACEHOLDER.search(text)}, pytest.fail)
+            is not None
+        )
+    if args.command == "export":
+        options = load_exporter(args.format).options if not PLACEHOLDER.search(args.format) else {}
+        rest = [word for word in rest if word.partition("=")[0] not in options]
     assert rest == [], f"{rest} is no argument of neuprim {args.command}"
     assert args.command in known
 
 
 @pytest.mark.parametrize("block", [b for b in SHELL if any(commands(b, "neuprim"))], ids=place)
-def test_commands(block: Block, conditions: dict[str, ConditionSpec], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands(block: Block, conditions: list[ConditionSpec], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     unknown = OF_THE_READER.get(name_of(block.page), set())
     for words in commands(block, "neuprim"):
-        check([STAND_INS.get(word, word) for word in words if word not in unknown], conditions)
+        words = [STAND_INS.get(word, word) for word in words if word not in unknown]
+        check([word for word in words if word != "--help"], conditions)
 
 
 @pytest.mark.parametrize(
@@ -179,10 +185,12 @@ def test_commands(block: Block, conditions: dict[str, ConditionSpec], tmp_path: 
         "neuprim run task=static --cgf",
         "neuprim render RUN_DIR --camera orbit --sise 3x3",
         "neuprim render RUN_DIR --camera orbit --time 2",
+        "neuprim export RUN_DIR --format vdb gird=8",
+        "neuprim export RUN_DIR --format vdb --time 2",
         "neuprim evla RUN_DIR",
     ],
 )
-def test_a_wrong_command_is_noticed(line: str, conditions: dict[str, ConditionSpec]) -> None:
+def test_a_wrong_command_is_noticed(line: str, conditions: list[ConditionSpec]) -> None:
     (words,) = commands(Block(ROOT / "x.md", 1, "sh", f"cd x && .venv/bin/{line}  # text\n", None), "neuprim")
     with pytest.raises((AssertionError, NeuprimError)):
         check(words, conditions)

@@ -193,6 +193,8 @@ MEMBERS = [
         "None), ConditionSpec",
         "TaskSpec.conditions[0].parse is of type NoneType; expected a function",
     ),
+    ("task", '"1", (0.0, 1.0)', '"1", None', "TaskSpec.conditions[0].range is None; expected a lower and a higher number"),
+    ("task", '"m", (0.0, 1.0)', '"m", (1.0, 1.0)', "TaskSpec.conditions[1].range is (1.0, 1.0); expected a lower and a higher number"),
     ("task", "loss=lambda s: None,", "loss=print, fields={'X': int},", "fields['X'] is <class 'int'>; expected a subclass"),
     ("task", "loss=lambda s: None,", "loss=print, fields={'X': DensityField},", "fields['X'] lacks the methods density, lower"),
     ("task", "loss=lambda s: None,", "loss=print, example=3,", "TaskSpec.example is of type int"),
@@ -209,6 +211,10 @@ MEMBERS = [
     ("loss", ", make=make", "", "TypeError"),
     ("exporter", "write=lambda job: ExportReport((), False)", "write=0", "Exporter.write is of type int; expected a function"),
     ("exporter", 'options={"size": (1, "of it")}', "options=3", "Exporter.options is of type int; expected a mapping"),
+    ("exporter", 'options={"size": (1, "of it")}', "options={'size': 1}", "options['size'] is 1; expected (default, one line of help)"),
+    ("exporter", 'options={"size": (1, "of it")}', "default='../x'", "Exporter.default is '../x'; expected the name of a file or folder"),
+    ("exporter", 'options={"size": (1, "of it")}', "suffixes='.json'", "Exporter.suffixes is '.json'; expected a tuple"),
+    ("exporter", 'options={"size": (1, "of it")}', "suffixes=('.JSON',)", "expected a tuple of such as '.json', in lower case"),
     ("inspector", "add=lambda plotter, frame: None", "add='x'", "Inspector.add is of type str; expected a function"),
 ]
 

@@ -158,7 +158,7 @@ def test_the_numbers_are_those_of_the_data_set(run_dir: Path, tmp_path: Path) ->
     config, task, model, _ = load_run(run_dir)
     expected = {f["frame"]: f for f in load_dataset(config, task).diagnose(model)["sigma_frames"]}
     for against in (str(run_dir.parent / "files"), "scene"):
-        _, said = look(run_dir, conditions={"time": "0:1:20"}, grid=8, against=against, out=tmp_path / "x.vdb")
+        _, said = look(run_dir, conditions={"time": "0:1:20"}, grid=8, against=against, out=tmp_path / "x.vdb", overwrite=True)
         assert len(expected) == 3 and len(said) == 5
         for number, line in zip(runs.NUMBERS, said[1:], strict=False):
             wanted = f"correlation {expected[number]['correlation']:.4f}  relative_l2 {expected[number]['relative_l2']:.4f}"
@@ -169,7 +169,7 @@ def test_one_file_has_its_own_time_or_the_users(run_dir: Path, tmp_path: Path) -
     file = str(run_dir.parent / "files" / "ball_6.vdb")
     _, own = look(run_dir, grid=8, against=file, out=tmp_path / "a.vdb")
     assert "ball_6.vdb  time 1 " in own[1]
-    _, asked = look(run_dir, grid=8, against=file, conditions={"time": "0.25"}, out=tmp_path / "a.vdb")
+    _, asked = look(run_dir, grid=8, against=file, conditions={"time": "0.25"}, out=tmp_path / "b.vdb")
     assert "ball_6.vdb  time 0.25 " in asked[1]
 
 

@@ -27,7 +27,6 @@ from neuprim.core.ply import write_ply
 from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
 from neuprim.plugins.export.appearance import Harmonics, comparison_views, harmonics_of, rgb_of
-from neuprim.plugins.export.common import Options, conditions_of, target
 from neuprim.plugins.export.gaussians import Gaussians, draw_gaussians, fit_gaussians
 
 __all__ = ["EXPORTER", "LAYOUT"]
@@ -48,10 +47,8 @@ LAYOUT = (
 
 
 def _write(job: ExportJob) -> ExportReport:
-    options = Options(job, OPTIONS)
-    size, which = options.choice("size", "auto", "footprint", "moments"), options.choice("views", "auto", "test", "orbit")
-    path = target(job, "gaussians.ply", (".ply",))
-    (conditions,) = conditions_of(job)
+    size, which = job.choice("size", "auto", "footprint", "moments"), job.choice("views", "auto", "test", "orbit")
+    (conditions,) = job.frames()
     channels, rgb = job.run.channels, rgb_of(job.run)
     job.progress("fitting Gaussians", 0.0)
     colours = harmonics_of(job.run, conditions).picked(rgb)
@@ -62,7 +59,7 @@ def _write(job: ExportJob) -> ExportReport:
     scores = {name: _psnrs(job, fit, colours, images, rgb, name) for name, fit in fits.items()}
     size = max(scores, key=lambda name: float(np.mean(scores[name])))
     gaussians, errors = fits[size], {"psnr": float(np.mean(scores[size])), "psnr_worst": float(np.min(scores[size]))}
-    write_ply(path, _rows(gaussians, colours), ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"])
+    write_ply(job.out, _rows(gaussians, colours), ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"])
     space = channels.color_space
     notes = [
         f"{len(gaussians.means)} Gaussians, size={size}; PSNR of them drawn as the 3DGS rasteriser does, against the model's images, {seen}, {space} values",
@@ -76,7 +73,7 @@ def _write(job: ExportJob) -> ExportReport:
         notes.append(f"colours: {channels.shown}")
     if space == "linear":
         notes.append("colours are linear, viewers take them for sRGB: they look darker there")
-    return ExportReport((path,), False, errors, tuple(notes))
+    return ExportReport((job.out,), False, errors, tuple(notes))
 
 
 def _rows(gaussians: Gaussians, colours: Harmonics) -> np.ndarray:
@@ -121,5 +118,12 @@ def _background(job: ExportJob) -> Tensor:
 
 
 EXPORTER = Exporter(
-    API_VERSION, "gaussian-ply", "one fitted Gaussian per primitive, in the layout of 3D Gaussian splatting; lossy", _write, OPTIONS, True
+    API_VERSION,
+    "gaussian-ply",
+    "one fitted Gaussian per primitive, in the layout of 3D Gaussian splatting; lossy",
+    _write,
+    OPTIONS,
+    conditions=True,
+    default="gaussians.ply",
+    suffixes=(".ply",),
 )

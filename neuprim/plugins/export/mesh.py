@@ -35,7 +35,7 @@ from neuprim.core.files import atomic_path
 from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
 from neuprim.plugins.export.appearance import Harmonics, comparison_views, harmonics_of, rgb_of
-from neuprim.plugins.export.common import Options, conditions_of, model_box, target
+from neuprim.plugins.export.common import model_box
 
 __all__ = ["EXPORTER", "best_level"]
 
@@ -54,18 +54,17 @@ _TO_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
 def _write(job: ExportJob) -> ExportReport:
-    options = Options(job, OPTIONS)
-    path = target(job, "mesh.glb", _SUFFIXES)
-    (conditions,) = conditions_of(job)
+    path = job.out
+    (conditions,) = job.frames()
     channels = job.run.channels
     rgb = None if channels.own is not None else rgb_of(job.run, f", and task {job.run.task.name!r} has no display that makes these")
     contour = _contour()
-    smooth, keep, up = options.number("smooth", 0, 4) or 0.0, options.number("keep", 0, 1) or 0.0, options.choice("up", "z", "y")
+    smooth, keep, up = job.number("smooth", 0, 4) or 0.0, job.number("keep", 0, 1) or 0.0, job.choice("up", "z", "y")
     seen = harmonics_of(job.run, conditions)
     job.progress("sampling the density", 0.0)
-    sigma, scene_from_index = _sample(job, conditions, options.count("grid", 8, 1024) or 192)
+    sigma, scene_from_index = _sample(job, conditions, job.count("grid", 8, 1024) or 192)
     step = float(scene_from_index[0, 0])
-    given = options.number("level", 1e-9, 1e9)
+    given = job.number("level", 1e-9, 1e9)
     level = best_level(sigma, step) if given is None else given
     notes = [f"surface at an extinction of {level:.4g} per scene unit" + ", chosen by silhouettes" * (given is None)]
     field = ndimage.gaussian_filter(sigma, smooth) if smooth else sigma
@@ -234,5 +233,12 @@ def _silhouettes(job: ExportJob, conditions: Conditions, mesh: Any) -> float:
 
 
 EXPORTER = Exporter(
-    API_VERSION, "mesh", "an isosurface of the density with vertex colours: .glb, .ply or .obj; lossy", _write, OPTIONS, conditions=True
+    API_VERSION,
+    "mesh",
+    "an isosurface of the density with vertex colours: .glb, .ply or .obj; lossy",
+    _write,
+    OPTIONS,
+    conditions=True,
+    default="mesh.glb",
+    suffixes=_SUFFIXES,
 )

@@ -17,7 +17,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
 from neuprim.core.files import atomic_path
 from neuprim.core.task import API_VERSION
-from neuprim.plugins.export.common import pack_header, target, unpack_header
+from neuprim.plugins.export.common import pack_header, unpack_header
 
 __all__ = ["EXPORTER"]
 
@@ -26,12 +26,11 @@ _ARRAY_HEADER = 4096
 
 
 def _write(job: ExportJob) -> ExportReport:
-    path = target(job, "model.npz", (".npz",))
     arrays = {name: value.detach().float().contiguous().numpy() for name, value in job.run.model.params.items()}
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+    with atomic_path(job.out) as temporary, open(temporary, "wb") as file:
         np.savez(file, header=np.array(pack_header(job)), **arrays)  # type: ignore[arg-type]
     note = "holds the text of config.yaml, paths to the run's data included; `neuprim import` makes a run directory of it"
-    return ExportReport((path,), True, notes=(note,))
+    return ExportReport((job.out,), True, notes=(note,))
 
 
 def _read(path: Path) -> StoredModel:
@@ -77,4 +76,12 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path, most: i
     return result
 
 
-EXPORTER = Exporter(API_VERSION, "npz", "the whole model as numpy arrays; lossless, `neuprim import` reads it", _write, read=_read)
+EXPORTER = Exporter(
+    API_VERSION,
+    "npz",
+    "the whole model as numpy arrays; lossless, `neuprim import` reads it",
+    _write,
+    read=_read,
+    default="model.npz",
+    suffixes=(".npz",),
+)

@@ -19,7 +19,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
 from neuprim.core.ply import read_ply, write_ply
 from neuprim.core.task import API_VERSION
-from neuprim.plugins.export.common import pack_header, target, unpack_header
+from neuprim.plugins.export.common import pack_header, unpack_header
 
 __all__ = ["EXPORTER"]
 
@@ -27,7 +27,6 @@ _MARK = "neuprim "
 
 
 def _write(job: ExportJob) -> ExportReport:
-    path = target(job, "model.ply", (".ply",))
     columns = {axis: job.run.model.params["means"].detach()[:, i].numpy() for i, axis in enumerate("xyz")}
     for name, value in job.run.model.params.items():
         flat = value.detach().float().reshape(job.run.model.count, -1).numpy()
@@ -35,9 +34,9 @@ def _write(job: ExportJob) -> ExportReport:
     rows = np.empty(job.run.model.count, [(name, "<f4") for name in columns])
     for name, column in columns.items():
         rows[name] = column
-    write_ply(path, rows, [_MARK + pack_header(job)])
+    write_ply(job.out, rows, [_MARK + pack_header(job)])
     note = "holds the text of config.yaml, paths to the run's data included; `neuprim import` makes a run directory of it"
-    return ExportReport((path,), True, notes=(note,))
+    return ExportReport((job.out,), True, notes=(note,))
 
 
 def _read(path: Path) -> StoredModel:
@@ -59,5 +58,11 @@ def _read(path: Path) -> StoredModel:
 
 
 EXPORTER = Exporter(
-    API_VERSION, "ply", "the whole model, one vertex per primitive; lossless, `neuprim import` reads it", _write, read=_read
+    API_VERSION,
+    "ply",
+    "the whole model, one vertex per primitive; lossless, `neuprim import` reads it",
+    _write,
+    read=_read,
+    default="model.ply",
+    suffixes=(".ply",),
 )

@@ -27,7 +27,7 @@ from neuprim.core.fields import Conditions
 from neuprim.core.task import API_VERSION
 from neuprim.core.vdb import Grid, Tiles, read_grid, scale_transform, write_vdb
 from neuprim.core.volume_source import Placement, VolumeSource
-from neuprim.plugins.export.common import Options, conditions_of, free, model_box, target
+from neuprim.plugins.export.common import model_box
 
 __all__ = ["EXPORTER", "sampled_grid"]
 
@@ -54,11 +54,10 @@ class _Frame:
 
 
 def _write(job: ExportJob) -> ExportReport:
-    options = Options(job, OPTIONS)
-    source, placement, notes = _origin(job, options.flag("source"))
+    source, placement, notes = _origin(job, job.flag("source"))
     frames = _frames(job, placement, source)
     paths = _paths(job, frames)
-    units = options.choice("units", "auto", "source", "world", "scene")
+    units = job.choice("units", "auto", "source", "world", "scene")
     if units == "auto":
         units = "source" if placement else "world"
     if units == "source" and placement is None:
@@ -67,11 +66,11 @@ def _write(job: ExportJob) -> ExportReport:
     per_world = abs(np.linalg.det(scene_from_world[:3, :3])) ** (1 / 3)
     factor = {"source": 1 / placement.sigma_per_unit if placement else 1.0, "world": per_world, "scene": 1.0}[units]
     box = np.stack([v.numpy() for v in model_box(job, [f.conditions for f in frames])])
-    threshold = options.number("threshold", 0.0, 1e9)
+    threshold = job.number("threshold", 0.0, 1e9)
     threshold = 1e-3 / float((box[1] - box[0]).max()) * factor if threshold is None else threshold
-    name = str(job.options.get("name", "density"))
-    own = options.number("grid") is None and options.number("voxel_size") is None and source is not None
-    fallback = _transform(options, box, scene_from_world)
+    name = str(job.options["name"])
+    own = job.number("grid") is None and job.number("voxel_size") is None and source is not None
+    fallback = _transform(job, box, scene_from_world)
     metadata = {"neuprim_units": units, "neuprim_sigma_per_unit": 1 / factor, "neuprim_threshold": threshold}
     errors: dict[str, float] = {}
     for i, (frame, path) in enumerate(zip(frames, paths, strict=True)):
@@ -80,7 +79,7 @@ def _write(job: ExportJob) -> ExportReport:
         transform = fallback if transform is None else transform
         grid = sampled_grid(job, frame.conditions, transform, scene_from_world, name, factor, threshold)
         more = {f"neuprim_{key}": float(v) for key, v in frame.conditions.items() if v.numel() == 1}
-        grid = replace(grid, half=options.flag("half"), metadata={**metadata, **more})
+        grid = replace(grid, half=job.flag("half"), metadata={**metadata, **more})
         write_vdb(path, [grid])
         if source is not None and frame.source is not None:
             errors |= _errors(job, source, frame, path, scene_from_world, factor)
@@ -125,7 +124,7 @@ def _frames(job: ExportJob, placement: Placement | None, source: VolumeSource | 
     if not job.run.task.conditions:
         return [_Frame(0, {})]
     if job.conditions or placement is None:
-        frames = [_Frame(i, c) for i, c in enumerate(conditions_of(job, several=True))]
+        frames = [_Frame(i, c) for i, c in enumerate(job.frames(several=True))]
         return [_Frame(f.number, f.conditions, _same(f.conditions, source)) for f in frames]
     times = placement.times
     return [
@@ -145,21 +144,23 @@ def _same(conditions: Conditions, source: VolumeSource | None) -> int | None:
 
 
 def _paths(job: ExportJob, frames: list[_Frame]) -> list[Path]:
-    if not job.run.task.conditions or (len(frames) == 1 and job.out is not None and job.out.suffix.lower() == ".vdb"):
-        return [target(job, "density.vdb", (".vdb",))]
-    folder = job.out if job.out is not None else job.run.directory / "export" / "vdb"
-    if folder.suffix.lower() == ".vdb" or folder.is_file():
-        raise ConfigError(f"--out {folder}: {len(frames)} frames; expected a folder")
+    """One file under its own name, or files in a folder."""
+    suffix = job.out.suffix.lower()
+    if suffix == ".vdb":
+        if len(frames) > 1:
+            raise ConfigError(f"--out {job.out}: {len(frames)} frames; expected a folder")
+        return [job.out]
+    if not job.run.task.conditions:
+        if suffix:
+            raise ConfigError(f"--out {job.out}: expected a file name with .vdb, or a folder")
+        return [job.out / "density.vdb"]
     width = max(4, len(str(max(f.number for f in frames))))
-    paths = [folder / f"density_{f.number:0{width}d}.vdb" for f in frames]
-    for path in paths:
-        free(job, path)
-    return paths
+    return [job.out / f"density_{f.number:0{width}d}.vdb" for f in frames]
 
 
-def _transform(options: Options, box: np.ndarray, scene_from_world: np.ndarray) -> np.ndarray:
+def _transform(job: ExportJob, box: np.ndarray, scene_from_world: np.ndarray) -> np.ndarray:
     """(4, 4) index to world of the user's voxels, with the origin of both in one place."""
-    count, size = options.count("grid", 8, 2048), options.number("voxel_size", 1e-9, 1e9)
+    count, size = job.count("grid", 8, 2048), job.number("voxel_size", 1e-9, 1e9)
     if count is not None and size is not None:
         raise ConfigError("grid and voxel_size: expected one of them")
     corners = np.linalg.inv(scene_from_world)[:3, :3] @ (box[1] - box[0])
@@ -244,7 +245,7 @@ def _errors(
 
     name = f"frame_{source.placement.numbers[frame.source]:04d}"
     result = {f"{name}.correlation": both["correlation"], f"{name}.relative_l2": both["relative_l2"]}
-    grid = read_grid(path, str(job.options.get("name", "density")))
+    grid = read_grid(path, str(job.options["name"]))
     if grid.bounds is None:
         return result
     chain = np.linalg.inv(scene_from_world @ grid.transform) @ matrix.numpy()
@@ -255,4 +256,6 @@ def _errors(
     return {**result, f"{name}.file_correlation": written["correlation"], f"{name}.file_relative_l2": written["relative_l2"]}
 
 
-EXPORTER = Exporter(API_VERSION, "vdb", "the density as OpenVDB, one file per frame; lossy (sampled)", _write, OPTIONS, conditions=True)
+EXPORTER = Exporter(
+    API_VERSION, "vdb", "the density as OpenVDB, one file per frame; lossy (sampled)", _write, OPTIONS, conditions=True, default="vdb"
+)

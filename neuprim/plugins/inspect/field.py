@@ -12,6 +12,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.channels import Channels
+from neuprim.core.conditions import flag
 from neuprim.core.density_grid import density_grid
 from neuprim.core.errors import ConfigError
 from neuprim.core.fields import Conditions
@@ -163,7 +164,7 @@ class FieldFrame:
         """
         missing = [name for name in self.needed if name not in self.conditions]
         if missing:
-            raise ConfigError(f"the primitives' colours depend on the {missing[0]}; give --{missing[0].replace('_', '-')}")
+            raise ConfigError(f"the primitives' colours depend on the {missing[0]}; give {flag(missing[0])}")
         low, high = self.box
         center = torch.from_numpy((low + high) / 2).float()
         eye = center + torch.tensor([1.0, -1.6, 0.7]) * float(np.linalg.norm(high - low))

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuprim.core.conditions import Warn, flag, read_conditions
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.fields import Conditions, ConditionSpec
 from neuprim.core.primitives import Primitives
@@ -23,22 +24,22 @@ class Given(dict[str, Tensor]):
     """Conditions of a frame; one that is asked for and was not given is the user's to give."""
 
     def __missing__(self, name: str) -> Tensor:
-        raise ConfigError(f"this needs the {name}; give --{name.replace('_', '-')}")
+        raise ConfigError(f"this needs the {name}; give {flag(name)}")
 
 
-def condition_frames(specs: Sequence[ConditionSpec], texts: Mapping[str, str]) -> list[Conditions]:
+def condition_frames(specs: Sequence[ConditionSpec], texts: Mapping[str, str], warn: Warn = lambda text: None) -> list[Conditions]:
     """One entry per frame. A number may be several, as "0:1:5" or "0,0.5"; the middle of its range where it is not given.
 
     Of two animated conditions the shorter is stretched. What is not a number and was not given is left out.
 
     Raises:
-        ConfigError: a text that the condition does not take.
+        ConfigError: as :func:`neuprim.core.conditions.read_conditions`.
     """
+    given = read_conditions(specs, texts, warn)
     found: dict[str, list[Tensor]] = {}
     for spec in specs:
-        text = texts.get(spec.name)
-        if text is not None:
-            found[spec.name] = [value for part in (text.split(",") if not spec.shape else [text]) for value in spec.parse(part)]
+        if spec.name in given:
+            found[spec.name] = given[spec.name]
         elif not spec.shape and all(map(math.isfinite, spec.range)):
             found[spec.name] = [torch.tensor(sum(spec.range) / 2)]
     count = max((len(values) for values in found.values()), default=1)

@@ -7,12 +7,10 @@ import math
 import torch
 from torch import Tensor
 
+from neuprim.core.conditions import FRAMES
 from neuprim.core.errors import ConfigError
 
-__all__ = ["FRAMES", "parse_times"]
-
-FRAMES = 60
-"""Frames of a range that does not say how many."""
+__all__ = ["parse_times"]
 
 
 def parse_times(text: str) -> list[Tensor]:

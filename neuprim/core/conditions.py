@@ -1,0 +1,194 @@
+"""What a user may write for a condition of a task: one grammar for every command, and for exporters of anybody's.
+
+A condition is given as ``--NAME TEXT``, ``--NAME=TEXT`` or ``NAME=TEXT``, with ``-`` or ``_`` inside its name. For a condition that is
+one number the text may be a number, a list ``A,B,C`` of them, ``FIRST:LAST`` or ``FIRST:LAST:COUNT``, one frame each; what one number
+is, the task's own :attr:`ConditionSpec.parse <neuprim.core.fields.ConditionSpec>` says. The text of any other condition is the task's
+altogether, as ``x,y,z`` or ``orbit`` for a light.
+
+Values are held against the condition's range here, so that no command and no exporter can forget to.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from neuprim.core.errors import ConfigError, NeuprimError
+from neuprim.core.fields import ConditionSpec
+
+__all__ = ["FRAMES", "Warn", "export_frames", "flag", "named", "read_conditions", "split_words"]
+
+FRAMES = 60
+"""Frames of a range that does not say how many."""
+
+_MOST = 100_000
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_RANGE = re.compile(rf"({_NUMBER}):({_NUMBER})(?::([+-]?\d+))?")
+
+Warn = Callable[[str], None]
+"""Called with one line for the user."""
+
+
+def _silent(text: str) -> None:
+    pass
+
+
+# ---------------------------------------------------------------- names
+
+
+def flag(name: str) -> str:
+    """How messages name a condition: ``"--light-intensity"`` for ``light_intensity``; every command takes it."""
+    return "--" + name.replace("_", "-")
+
+
+def named(word: str, specs: Sequence[ConditionSpec]) -> str | None:
+    """The name of the condition that ``word`` means, with ``-`` or ``_``; None if there is none."""
+    return next((spec.name for spec in specs if spec.name.replace("-", "_") == word.replace("-", "_")), None)
+
+
+def split_words(words: Sequence[str], specs: Sequence[ConditionSpec], bare: bool = True) -> tuple[dict[str, str], list[str]]:
+    """Condition name -> text out of the words of a command, and the words that are about something else, in their order.
+
+    Args:
+        bare: whether ``NAME=TEXT`` counts too, beside ``--NAME TEXT`` and ``--NAME=TEXT``.
+
+    Raises:
+        ConfigError: a condition without a text, or given twice.
+    """
+    found: dict[str, str] = {}
+    rest: list[str] = []
+    queue = list(words)
+    while queue:
+        word = queue.pop(0)
+        key, equals, text = word.partition("=")
+        is_flag = key.startswith("--")
+        name = named(key.removeprefix("--"), specs) if is_flag or (bare and equals) else None
+        if name is None:
+            rest.append(word)
+            continue
+        if is_flag and not equals:
+            if not queue or queue[0].startswith("--"):
+                raise ConfigError(f"{word}: expected a value after it")
+            text = queue.pop(0)
+        if name in found:
+            raise ConfigError(f"{flag(name)}: given twice")
+        found[name] = text
+    return found, rest
+
+
+# ---------------------------------------------------------------- values
+
+
+def read_conditions(specs: Sequence[ConditionSpec], texts: Mapping[str, str], warn: Warn = _silent) -> dict[str, list[Tensor]]:
+    """Name -> values, one per frame, of the conditions that were given, in the task's order.
+
+    Args:
+        warn: called with one line for each condition that leaves its range; those of strict ones are refused.
+
+    Raises:
+        ConfigError: a text that the condition does not take, values that are not finite, or beyond the range of a strict condition.
+    """
+    return {spec.name: _read(spec, texts[spec.name], warn) for spec in specs if spec.name in texts}
+
+
+def _read(spec: ConditionSpec, text: str, warn: Warn) -> list[Tensor]:
+    parts = [part.strip() for part in text.split(",")] if not spec.shape else [text]
+    values = [value for part in parts for value in _values(spec, part)]
+    if len(values) > _MOST:
+        raise ConfigError(f"{flag(spec.name)} {text[:40]}...: {len(values)} values; expected at most {_MOST}")
+    _check_range(spec, text, values, warn)
+    return values
+
+
+def _values(spec: ConditionSpec, text: str) -> list[Tensor]:
+    """One number or one range, as the task reads it; a range that the task does not read is made of numbers that it does."""
+    try:
+        return _parsed(spec, text)
+    except NeuprimError:
+        found = None if spec.shape else _RANGE.fullmatch(text)
+        if found is None:
+            raise
+        first, last = float(found[1]), float(found[2])
+        try:
+            for end in (first, last):
+                _parsed(spec, _plain(end))
+        except NeuprimError:
+            pass  # the task's message about the whole text says more than one about an end
+        else:
+            count = FRAMES if found[3] is None else int(found[3])
+            if not 2 <= count <= _MOST:
+                raise ConfigError(f"{flag(spec.name)} {text}: expected FIRST:LAST or FIRST:LAST:COUNT, 2 to {_MOST} frames") from None
+            numbers = (first + (last - first) * i / (count - 1) for i in range(count))
+            return [value for x in numbers for value in _parsed(spec, _plain(x))]
+        raise
+
+
+def _parsed(spec: ConditionSpec, text: str) -> list[Tensor]:
+    try:
+        values = spec.parse(text)
+    except ValueError as error:  # as float("x") raises it; the text is the user's
+        raise ConfigError(f"{flag(spec.name)} {text}: cannot be read ({' '.join(str(error).split())})") from error
+    if not values:
+        raise ConfigError(f"{flag(spec.name)} {text}: stands for no value; expected at least one")
+    return list(values)
+
+
+def _plain(number: float) -> str:
+    """As a user would write it: whole numbers without a point, others exact."""
+    return repr(number).removesuffix(".0")
+
+
+def _check_range(spec: ConditionSpec, text: str, values: Sequence[Tensor], warn: Warn) -> None:
+    """Elementwise; the range's ends are rounded as the values are, so that 0.3 lies within 0 to 0.3."""
+    low, high = spec.range
+    shown = f"{flag(spec.name)} {text}"
+    for value in values:
+        if not bool(torch.isfinite(value).all()):
+            raise ConfigError(f"{shown}: {_first(value, ~torch.isfinite(value)):g}; expected finite numbers")
+    for value in values:
+        ends = torch.tensor([low, high], dtype=value.dtype if value.is_floating_point() else torch.float64)
+        outside = (value < ends[0]) | (value > ends[1])
+        if bool(outside.any()):
+            line = f"{shown}: {_first(value, outside):g} is outside its range, {low:g} to {high:g} ({spec.unit})"
+            if spec.strict:
+                raise ConfigError(f"{line}; expected values within it")
+            warn(f"warning: {line}")
+            return
+
+
+def _first(value: Tensor, where: Tensor) -> float:
+    return float(value[where].flatten()[0])
+
+
+# ---------------------------------------------------------------- frames of an export
+
+
+def export_frames(specs: Sequence[ConditionSpec], texts: Mapping[str, str], several: bool = False) -> list[dict[str, Tensor]]:
+    """One mapping of every condition of the task per frame that was asked for; only one frame unless ``several``.
+
+    Raises:
+        ConfigError: a condition is missing, has several values where one is wanted, or as :func:`read_conditions`.
+    """
+    for spec in specs:
+        if spec.name not in texts:
+            raise ConfigError(f"{spec.name}=: required, as the model depends on it ({spec.unit}); for example {spec.name}={_example(spec)}")
+    found = read_conditions(specs, texts)
+    counts = {name: len(values) for name, values in found.items() if len(values) > 1}
+    if counts and (not several or len(set(counts.values())) > 1):
+        name = next(iter(counts))
+        expected = "one value" if not several else "as many values for each"
+        raise ConfigError(f"{name}={texts[name]}: {counts[name]} values; expected {expected}")
+    frames = max(counts.values(), default=1)
+    return [{name: values[i if len(values) > 1 else 0] for name, values in found.items()} for i in range(frames)]
+
+
+def _example(spec: ConditionSpec) -> str:
+    """A text that is within the range."""
+    low, high = spec.range
+    usual = 1.0 if spec.shape else 0.5
+    value = usual if low <= usual <= high else (low + high) / 2
+    return ",".join([_plain(value)] * math.prod(spec.shape))

@@ -1,0 +1,192 @@
+"""The grammar of conditions, and what is within their range."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from neuprim.core.conditions import FRAMES, export_frames, flag, named, read_conditions, split_words
+from neuprim.core.errors import ConfigError
+from neuprim.core.fields import ConditionSpec
+
+
+def number(text: str) -> list[Tensor]:
+    """What the documentation tells authors to write."""
+    try:
+        return [torch.tensor(float(text))]
+    except ValueError:
+        raise ConfigError(f"--wavelength-shift {text}: expected a number from 0 to 1") from None
+
+
+def vector(text: str) -> list[Tensor]:
+    values = [torch.tensor([float(x) for x in part.split(",")]) for part in text.split(";")]
+    assert all(len(v) == 3 for v in values)
+    return values
+
+
+SHIFT = ConditionSpec("wavelength_shift", (), "of the spectrum", (0.0, 1.0), number)
+SUN = ConditionSpec("sun", (3,), "m", (-2.0, 2.0), vector)
+SPECS = (SHIFT, SUN)
+
+
+def shifts(text: str, spec: ConditionSpec = SHIFT) -> list[float]:
+    return [float(value) for value in read_conditions([spec], {spec.name: text})[spec.name]]
+
+
+# ---------------------------------------------------------------- words
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--wavelength-shift", "0.3"],
+        ["--wavelength_shift", "0.3"],
+        ["--wavelength-shift=0.3"],
+        ["--wavelength_shift=0.3"],
+        ["wavelength-shift=0.3"],
+        ["wavelength_shift=0.3"],
+    ],
+)
+def test_every_spelling_is_the_same(words: list[str]) -> None:
+    assert split_words(["a", *words, "b=1", "--c"], SPECS) == ({"wavelength_shift": "0.3"}, ["a", "b=1", "--c"])
+
+
+def test_words_of_others_keep_their_order_and_negative_values_are_values() -> None:
+    found, rest = split_words(["--wavelength-shift", "-0.5", "x", "--y", "z=1", "--sun", "-1,0,2"], SPECS)
+    assert found == {"wavelength_shift": "-0.5", "sun": "-1,0,2"} and rest == ["x", "--y", "z=1"]
+    assert split_words(["sun=1,2,3", "--sun", "0,0,0"], SPECS, bare=False) == ({"sun": "0,0,0"}, ["sun=1,2,3"])
+    assert flag("wavelength_shift") == "--wavelength-shift" and named("wavelength-shift", SPECS) == "wavelength_shift"
+    assert named("shift", SPECS) is None
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--sun"], "--sun: expected a value after it"),
+        (["--sun", "--camera"], "--sun: expected a value after it"),
+        (["sun=1,1,1", "--sun=0,0,0"], "--sun: given twice"),
+        (["--wavelength-shift=0", "wavelength_shift=0"], "--wavelength-shift: given twice"),
+    ],
+)
+def test_a_condition_is_given_once_with_a_value(words: list[str], text: str) -> None:
+    with pytest.raises(ConfigError, match=text):
+        split_words(words, SPECS)
+
+
+# ---------------------------------------------------------------- texts
+
+
+def test_one_number_a_list_a_range_and_any_mixture() -> None:
+    assert shifts("0.25") == [0.25] and shifts("0.25, 1,0") == [0.25, 1.0, 0.0]
+    assert shifts("0:1:5") == [0.0, 0.25, 0.5, 0.75, 1.0] and shifts("1:0:3") == [1.0, 0.5, 0.0]
+    assert shifts("0:1") == pytest.approx([i / (FRAMES - 1) for i in range(FRAMES)], abs=1e-7)
+    assert shifts("0:0.5:2,1,.5:1e0:2") == [0.0, 0.5, 1.0, 0.5, 1.0]
+
+
+def test_whole_numbers_stay_whole_for_a_parser_that_wants_them() -> None:
+    frame = ConditionSpec("frame", (), "1", (0, 100), lambda text: [torch.tensor(int(text))])
+    assert shifts("0:30:4", frame) == [0, 10, 20, 30]
+
+
+def test_a_task_that_reads_ranges_itself_is_asked_first() -> None:
+    def cubes(text: str) -> list[Tensor]:
+        return [torch.tensor(0.125), torch.tensor(1.0)] if ":" in text else number(text)
+
+    assert shifts("0.5:1:9,0", replace(SHIFT, parse=cubes)) == [0.125, 1.0, 0.0]
+
+
+def test_other_shapes_are_the_tasks_altogether() -> None:
+    found = read_conditions(SPECS, {"sun": "1,2,0;0,0,1"})
+    assert list(found) == ["sun"] and [v.tolist() for v in found["sun"]] == [[1, 2, 0], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("x", "--wavelength-shift x: expected a number from 0 to 1"),
+        ("0,x", "--wavelength-shift x: expected a number"),
+        ("0:x", "--wavelength-shift 0:x: expected a number"),
+        ("0:1:1", r"--wavelength-shift 0:1:1: expected FIRST:LAST or FIRST:LAST:COUNT, 2 to 100000"),
+        ("0:1:100001", "expected FIRST:LAST or FIRST:LAST:COUNT"),
+        ("0:1:2.5", "--wavelength-shift 0:1:2.5: expected a number"),
+        ("", "--wavelength-shift : expected a number"),
+        ("0:1:60000,0:1:60000", "120000 values; expected at most 100000"),
+    ],
+)
+def test_what_cannot_be_read(text: str, expected: str) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        shifts(text)
+
+
+def test_a_parser_that_does_not_say_what_is_wrong() -> None:
+    with pytest.raises(ConfigError, match=r"--sun x,y,z: cannot be read .*could not convert string to float: 'x'"):
+        read_conditions([SUN], {"sun": "x,y,z"})
+    with pytest.raises(ConfigError, match="--sun 1: stands for no value"):
+        read_conditions([replace(SUN, parse=lambda text: [])], {"sun": "1"})
+
+
+# ---------------------------------------------------------------- ranges
+
+
+def warnings(texts: dict[str, str], specs: Sequence[ConditionSpec] = SPECS) -> list[str]:
+    said: list[str] = []
+    read_conditions(specs, texts, said.append)
+    return said
+
+
+def test_beyond_the_range_there_is_one_warning_per_condition() -> None:
+    assert warnings({"wavelength_shift": "0:1", "sun": "2,-2,0"}) == []
+    assert warnings({"wavelength_shift": "0,5,7", "sun": "0,0,-2.5"}) == [
+        "warning: --wavelength-shift 0,5,7: 5 is outside its range, 0 to 1 (of the spectrum)",
+        "warning: --sun 0,0,-2.5: -2.5 is outside its range, -2 to 2 (m)",
+    ]
+
+
+def test_the_ends_are_within_in_the_precision_of_the_values() -> None:
+    assert float(torch.tensor(0.3)) > 0.3
+    assert warnings({"wavelength_shift": "0.1,0.3"}, [replace(SHIFT, range=(0.1, 0.3))]) == []
+    assert len(warnings({"wavelength_shift": "0.30001"}, [replace(SHIFT, range=(0.1, 0.3))])) == 1
+
+
+def test_a_strict_task_has_it_refused() -> None:
+    strict = replace(SHIFT, strict=True)
+    with pytest.raises(ConfigError, match=r"^--wavelength-shift 7: 7 is outside its range, 0 to 1 \(of the spectrum\); expected values"):
+        shifts("7", strict)
+    with pytest.raises(ConfigError, match="--wavelength-shift 0:2:3: 2 is outside"):
+        shifts("0:2:3", strict)
+    assert shifts("0:1:2", strict) == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "-inf", "0,nan"])
+def test_numbers_that_are_not_finite_are_always_refused(text: str) -> None:
+    endless = replace(SHIFT, range=(-math.inf, math.inf))
+    with pytest.raises(ConfigError, match="expected finite numbers"):
+        shifts(text, endless)
+    assert shifts("1e30", endless) == [pytest.approx(1e30)]
+
+
+# ---------------------------------------------------------------- frames of an export
+
+
+def test_an_export_has_every_condition_in_each_frame() -> None:
+    frames = export_frames(SPECS, {"sun": "1,2,0", "wavelength_shift": "0,1"}, several=True)
+    assert [(float(f["wavelength_shift"]), f["sun"].tolist()) for f in frames] == [(0.0, [1, 2, 0]), (1.0, [1, 2, 0])]
+    assert export_frames((), {}) == [{}]
+    for texts, several, expected in (
+        ({"wavelength_shift": "0,1", "sun": "0,0,0"}, False, "wavelength_shift=0,1: 2 values; expected one value"),
+        ({"wavelength_shift": "0:1:3", "sun": "1,2,0;0,0,0"}, True, "3 values; expected as many values for each"),
+        ({"wavelength_shift": "0"}, True, r"sun=: required, as the model depends on it \(m\); for example sun=1,1,1"),
+    ):
+        with pytest.raises(ConfigError, match=expected):
+            export_frames(SPECS, texts, several)
+
+
+def test_the_example_is_within_the_range() -> None:
+    for ends, expected in (((0.0, 1.0), "x=0.5"), ((400.0, 700.0), "x=550")):
+        with pytest.raises(ConfigError, match=f"for example {expected}$"):
+            export_frames([ConditionSpec("x", (), "nm", ends, number)], {})

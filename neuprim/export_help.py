@@ -43,11 +43,11 @@ def _of_all() -> Iterator[str]:
 
 
 def _of_one(name: str) -> Iterator[str]:
-    from neuprim.plugins.crashes import origin
+    from neuprim.plugins.blame import origin_of
     from neuprim.plugins.registry import EXPORTERS, load_exporter
 
     exporter = load_exporter(name)
-    yield f"--format {name}  ({origin(EXPORTERS, name).origin}): {exporter.summary}"
+    yield f"--format {name}  ({origin_of(EXPORTERS, name).origin}): {exporter.summary}"
     rows = [(f"{option}={_shown(default)}", help_) for option, (default, help_) in exporter.options.items()]
     yield f"options of --format {name}, with their defaults:" if rows else f"--format {name} has no options"
     indent = 4 + max((len(first) for first, _ in rows), default=0)

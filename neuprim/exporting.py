@@ -23,7 +23,8 @@ from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredMod
 from neuprim.core.fields import ConditionSpec
 from neuprim.evaluate import load_run
 from neuprim.export_record import record_export
-from neuprim.plugins.crashes import origin, reported
+from neuprim.plugins.blame import origin_of
+from neuprim.plugins.crashes import reported
 from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin, load_exporter
 from neuprim.trained import trained_model
 
@@ -74,7 +75,7 @@ def _destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
 
 def _files(report: Any, draft: Draft, name: str) -> tuple[Path, ...]:
     """Where the files of a report will be."""
-    who = f"exporter {name!r} of {origin(EXPORTERS, name).origin}"
+    who = f"exporter {name!r} of {origin_of(EXPORTERS, name).origin}"
     if not isinstance(report, ExportReport):
         raise PluginError(f"{who}: write returned {type(report).__name__}; expected an ExportReport")
     files = []

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import sys
 import tempfile
-import time
 import traceback
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ from neuprim.core.errors import DataError, NeuprimError
 from neuprim.plugins.mechanism import Group, PluginError, PluginInfo
 from neuprim.plugins.names import normalised, split
 from neuprim.plugins.registry import LOSSES, SCENES, TASKS
+from neuprim.plugins.tracebacks import written
 
 __all__ = ["Suspects", "blamed", "origin_of"]
 
@@ -161,14 +161,8 @@ def _kept(what: str, origin: PluginInfo, error: BaseException | None, folder: Pa
     """Writes the traceback; says where."""
     python = ".".join(map(str, sys.version_info[:3]))
     content = f"{what} of {origin.origin} ({origin.target}), Python {python}\n\n{''.join(traceback.format_exception(error))}"
-    name = f"traceback-{time.strftime('%Y%m%d-%H%M%S')}-"
     begun = folder is not None and folder.parent.is_dir() and any(folder.parent.iterdir())
-    try:
-        if begun and folder is not None:
-            folder.mkdir(exist_ok=True)
-        handle, path = tempfile.mkstemp(suffix=".txt", prefix=name if begun else f"neuprim-{name}", dir=folder if begun else None)
-        with open(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
-            file.write(content)
-    except OSError as problem:
-        return f"its traceback could not be written ({' '.join(str(problem).split())})"
-    return f"traceback: {path}"
+    path = written(
+        content, f"{origin.distribution}-{what}", [*([folder.absolute()] if begun and folder is not None else []), Path(tempfile.gettempdir())]
+    )
+    return "its traceback could not be written anywhere" if path is None else f"traceback: {path}"

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 import tempfile
-import time
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,23 +11,16 @@ from typing import Any
 
 from neuprim import __version__
 from neuprim.core.errors import DISK, NeuprimError
-from neuprim.plugins.registry import Group, PluginError, PluginInfo
+from neuprim.plugins.blame import origin_of
+from neuprim.plugins.registry import Group, PluginError
+from neuprim.plugins.tracebacks import written
 
-__all__ = ["is_ours", "origin", "reported"]
-
-_OURS = "neuprim"
-
-
-def origin(group: Group[Any], name: str) -> PluginInfo:
-    """The package that ``name`` comes from, typed as NAME or PACKAGE:NAME; neuprim's own where it is among several."""
-    package, _, plain = name.rpartition(":")
-    found = [info for info in group.listed() if info.name == plain and package in ("", info.distribution)]
-    return min(found, key=lambda info: info.distribution != _OURS, default=PluginInfo(plain, "an unknown package", "", ""))
+__all__ = ["is_ours", "reported"]
 
 
 def is_ours(group: Group[Any], name: str) -> bool:
     """Whether a plugin is neuprim's own, so that a bug in it is a bug of neuprim."""
-    return origin(group, name).distribution == _OURS
+    return origin_of(group, name).built_in
 
 
 @contextmanager
@@ -51,31 +42,12 @@ def reported(group: Group[Any], name: str, folders: Sequence[Path]) -> Iterator[
     except NeuprimError:
         raise
     except (Exception, SystemExit) as error:
-        info = origin(group, name)
-        if info.distribution == _OURS or (isinstance(error, OSError) and error.errno in DISK):
+        info = origin_of(group, name)
+        if info.built_in or (isinstance(error, OSError) and error.errno in DISK):
             raise
         text = f"{group.kind} {info.name!r} of {info.origin}, neuprim {__version__}\n\n{''.join(traceback.format_exception(error))}"
-        path = _written(text, f"{group.kind}-{info.name}", [*folders, Path(tempfile.gettempdir())])
+        path = written(text, f"{group.kind}-{info.name}", [*folders, Path(tempfile.gettempdir())])
         if path is None:
             raise
         said = ": ".join(part for part in (type(error).__name__, " ".join(str(error).split())) if part)
         raise PluginError(f"{group.kind} {info.name!r} of {info.origin} crashed: {said}; traceback in {path}") from error
-
-
-def _written(text: str, name: str, folders: Sequence[Path]) -> Path | None:
-    """Where the text was written; None if nowhere."""
-    stem = f"{re.sub(r'[^A-Za-z0-9_-]+', '_', name)}-{time.strftime('%Y%m%d-%H%M%S')}"
-    for folder in folders:
-        for number in range(1, 100):  # several in one second
-            path = folder / (f"{stem}.txt" if number == 1 else f"{stem}-{number}.txt")
-            try:
-                folder.mkdir(parents=True, exist_ok=True)
-                with open(path, "x", encoding="utf-8", newline="\n") as file:
-                    file.write(text)
-                return path
-            except FileExistsError:
-                if not folder.is_dir():
-                    break
-            except OSError:
-                break
-    return None

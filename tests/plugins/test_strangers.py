@@ -15,7 +15,7 @@ from neuprim.core.vdb import read_grid
 from neuprim.exporting import export_run, import_run
 from neuprim.inspecting import Request, inspect_run
 from neuprim.plugins import crashes
-from neuprim.plugins.crashes import origin
+from neuprim.plugins.blame import origin_of
 from neuprim.plugins.export import npz
 from neuprim.plugins.registry import EXPORTERS, PluginError
 from tests.plugins import marked
@@ -301,7 +301,7 @@ def test_where_the_run_cannot_be_written_the_traceback_lies_elsewhere(site: Path
 
 def test_a_traceback_that_can_be_kept_nowhere_is_not_hidden(site: Path, run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     add(site, "exporter", EXPORTER.replace("return", "raise ZeroDivisionError\n    return", 1))
-    monkeypatch.setattr(crashes, "_written", lambda *_: None)
+    monkeypatch.setattr(crashes, "written", lambda *_: None)
     with pytest.raises(ZeroDivisionError):
         export_run(run_dir, "centres")
 
@@ -363,8 +363,8 @@ def test_the_package_of_a_name_that_two_have(site: Path) -> None:
     add(site, "exporter", EXPORTER.replace("centres", "npz"))
     info = next((site / "strange_exporter-0.3.dist-info").glob("entry_points.txt"))
     info.write_text(info.read_text().replace("centres =", "npz ="))
-    assert origin(EXPORTERS, "npz").distribution == "neuprim"
-    assert origin(EXPORTERS, "strange-exporter:npz").origin == "strange-exporter 0.3"
+    assert origin_of(EXPORTERS, "npz").distribution == "neuprim"
+    assert origin_of(EXPORTERS, "strange-exporter:npz").origin == "strange-exporter 0.3"
 
 
 def test_an_inspector_of_strangers_still_draws(site: Path, run_dir: Path, tmp_path: Path) -> None:

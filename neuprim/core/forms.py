@@ -154,7 +154,8 @@ def _expected(shapes: tuple[Shape, ...], sizes: Sizes) -> str:
     known, free = [x for x in letters if x in sizes], [x for x in letters if x not in sizes]
     if not free:
         numbers = [tuple(sizes[d][0] if isinstance(d, str) else d for d in shape) for shape in shapes]
-        origins = " and ".join(f"{sizes[x][1]} has {x}={sizes[x][0]}" for x in known)
+        tensors = dict.fromkeys(sizes[x][1] for x in known)
+        origins = " and ".join(f"{t} has " + " and ".join(f"{x}={sizes[x][0]}" for x in known if sizes[x][1] == t) for t in tensors)
         return " or ".join(map(str, numbers)) + (f", as {origins}" if origins else "")
     text = " or ".join(str(shape).replace("'", "") for shape in shapes)
     origins = " and ".join(f"{x}={sizes[x][0]} as in {sizes[x][1]}" for x in known)

@@ -41,10 +41,12 @@ def ring_camera(angle: float, height: float, distance: float = DISTANCE) -> Came
 
 
 class _Views(ViewSet):
-    def __init__(self, split: str, cameras: list[Camera], conditions: tuple[ConditionSpec, ...], generator: torch.Generator) -> None:
+    def __init__(
+        self, split: str, cameras: list[Camera], conditions: tuple[ConditionSpec, ...], generator: torch.Generator, channels: int
+    ) -> None:
         self.views = [View(f"{split}{i}", c, {s.name: sample(s, generator) for s in conditions}) for i, c in enumerate(cameras)]
         settings = RenderSettings(backend="reference")
-        frames = [render_lowered(_truth(), c, settings) for c in cameras]
+        frames = [render_lowered(_truth(channels), c, settings) for c in cameras]
         self.images = [Pixels(f.rgb, f.alpha) for f in frames]
 
     def __len__(self) -> int:
@@ -60,14 +62,14 @@ class _Views(ViewSet):
 class Example(Dataset):
     """Six training and two test views of 10 x 9 pixels, background grey, sRGB; conditions as the task declares them."""
 
-    def __init__(self, conditions: tuple[ConditionSpec, ...]) -> None:
+    def __init__(self, conditions: tuple[ConditionSpec, ...], channels: int = 3) -> None:
         generator = torch.Generator().manual_seed(7)
-        self.name, self.channels, self.color_space, self.data_source = "conformance example", 3, "srgb", "generated"
+        self.name, self.channels, self.color_space, self.data_source = "conformance example", channels, "srgb", "generated"
         ring = [ring_camera(1.1 * i, 0.6 * math.sin(2.0 * i)) for i in range(8)]
-        self.train, self.test = (_Views(n, c, conditions, generator) for n, c in (("train", ring[:6]), ("test", ring[6:])))
+        self.train, self.test = (_Views(n, c, conditions, generator, channels) for n, c in (("train", ring[:6]), ("test", ring[6:])))
         self.conditions = conditions
         self.extent = camera_extent(ring[:6])
-        self.background, self.random_background, self.downsampling = torch.full((3,), 0.3), False, "none"
+        self.background, self.random_background, self.downsampling = torch.full((channels,), 0.3), False, "none"
         self.up, self.center = torch.tensor([0.0, 0.0, 1.0]), torch.zeros(3)
         self.bounds = torch.tensor([[-0.8] * 3, [0.8] * 3])
 
@@ -78,14 +80,15 @@ class Example(Dataset):
             if spec.shape == ():
                 low, high = between(spec)
                 found[spec.name] = low + (high - low) * torch.rand(count, generator=generator)
-        return PointCloud(means, 0.2 + 0.6 * torch.rand(count, 3, generator=generator), found)
+        return PointCloud(means, 0.2 + 0.6 * torch.rand(count, self.channels, generator=generator), found)
 
 
-def _truth() -> Lowered:
+def _truth(channels: int) -> Lowered:
     geometry = Geometry(
         torch.tensor([[-0.35, 0.0, 0.0], [0.4, 0.1, 0.05], [0.0, -0.2, 0.4]]),
         torch.tensor([[0.4, 0.25, 0.3], [0.3, 0.35, 0.25], [0.2, 0.3, 0.2]]).log(),
         torch.tensor([[1.0, 0.1, 0.2, 0.0], [0.9, 0.0, -0.3, 0.2], [1.0, 0.0, 0.0, 0.0]]),
     )
     flat = Cosine(torch.zeros(3, 0, 3), torch.zeros(3, 0), torch.zeros(3, 0), torch.tensor([[2.5], [2.0], [1.5]]))
-    return Lowered(geometry, flat, Constant(torch.tensor([[0.9, 0.15, 0.1], [0.1, 0.3, 0.85], [0.2, 0.7, 0.3]])))
+    rgb = torch.tensor([[0.9, 0.15, 0.1], [0.1, 0.3, 0.85], [0.2, 0.7, 0.3]])
+    return Lowered(geometry, flat, Constant(rgb[:, torch.arange(channels) % 3]))

@@ -147,4 +147,5 @@ def _refuses_foreign(t: Subject, path: Path) -> None:
             checkpoint.load_model(other, t.task)
         except CheckpointError:
             continue
-        t.require(False, f"a model file with an unknown {kind} setting", "it was loaded", "CheckpointError")
+        where = f"{header[kind]['class']}(no_such_setting=1), as a model file has it"
+        t.require(False, where, "it was loaded", "CheckpointError, because the class refuses settings that it does not have")

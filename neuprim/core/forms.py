@@ -20,6 +20,7 @@ from torch import Tensor
 from neuprim.core.errors import FormError
 from neuprim.core.fields import MOST_UNITS, Constant, Cosine, DensityField, Field, Opaque, OpaqueColour, RayNet
 from neuprim.core.geometry import Geometry
+from neuprim.core.schema import InitContext, ParameterSpec
 
 if TYPE_CHECKING:
     from neuprim.core.primitives import Lowered
@@ -35,6 +36,7 @@ __all__ = [
     "check_result",
     "check_rows",
     "check_shape",
+    "check_start",
     "check_sum",
     "check_tensors",
     "method",
@@ -285,6 +287,20 @@ def check_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:
         raise FormError(f"{who} returned shape {tuple(value.shape)}; expected {shape}, a row for each of the {shape[0]} that it was given")
     found = f"{value.dtype} {value.layout} on {value.device}" if isinstance(value, Tensor) else f"type {type(value).__name__}"
     raise FormError(f"{who} returned {found}; expected a dense tensor of real numbers on the cpu")
+
+
+def check_start(spec: ParameterSpec, context: InitContext, who: str) -> Tensor:
+    """The float32 start value (N, *shape) that a parameter's own initialiser draws.
+
+    Raises:
+        FormError: it is of another shape; names ``who`` and the parameter.
+    """
+    value, shape = spec.init(context), (context.count, *spec.shape)
+    if not isinstance(value, Tensor):
+        raise FormError(f"{who}: {spec.name}: init returned type {type(value).__name__}; expected a torch tensor")
+    if value.shape != shape:
+        raise FormError(f"{who}: {spec.name}: init returned shape {tuple(value.shape)}; expected {shape}")
+    return value.float().contiguous()
 
 
 def check_tensors(found: Any, like: Mapping[str, Tensor], who: str) -> dict[str, Tensor]:

@@ -19,8 +19,6 @@ from neuprim.core.render import RenderSettings, RenderStats, render_lowered
 
 __all__ = ["Rasterized", "rasterize"]
 
-_PLACE, _NEURONS = ("means", "log_scales", "quats"), ("W1", "b1", "w2", "b2")
-
 
 @dataclass(frozen=True)
 class Rasterized:
@@ -162,23 +160,24 @@ def _check_tensor(name: str, value: Any) -> None:
         raise DataError(f"rasterize: {name} has {fault}")
 
 
-def _check_primitives(tensors: dict[str, Tensor], omega0: float) -> tuple[int, int]:
+def _check_primitives(t: dict[str, Tensor], omega0: float) -> tuple[int, int]:
     """(N, channels) of tensors that fit together."""
-    for name, value in tensors.items():
+    for name, value in t.items():
         _check_tensor(name, value)
-        if value.dtype != tensors["means"].dtype:
-            raise _wrong(name, f"dtype {value.dtype}", f"{tensors['means'].dtype}, as means has")
+        if value.dtype != t["means"].dtype:
+            raise _wrong(name, f"dtype {value.dtype}", f"{t['means'].dtype}, as means has")
     sizes: Sizes = {}
-    for form in (Geometry(*(tensors[k] for k in _PLACE)), Cosine(*(tensors[k] for k in _NEURONS), omega0)):
+    density = Cosine(t["W1"], t["b1"], t["w2"], t["b2"], omega0)
+    for form in (Geometry(t["means"], t["log_scales"], t["quats"]), density):
         fault = misfit(form, sizes)
         if fault is not None:
             raise DataError(f"rasterize: {fault}")
-    n, colors = sizes["N"][0], tuple(tensors["colors"].shape)
+    n, colors = sizes["N"][0], tuple(t["colors"].shape)
     if len(colors) not in (2, 3) or colors[-2] != n or colors[-1] < 1:
         raise _wrong("colors", f"shape {colors}", f"(N, channels) or (C, N, channels) with N={n} as in means and channels >= 1")
-    for name, row, numbers in _non_finite(tensors):
+    for name, row, numbers in _non_finite(t):
         raise NonFiniteError(f"rasterize: {name} of primitive {row} is not finite: {numbers}")
-    zero = ~tensors["quats"].detach().any(-1)
+    zero = ~t["quats"].detach().any(-1)
     if bool(zero.any()):
         raise NonFiniteError(f"rasterize: quats of primitive {int(zero.nonzero()[0])} is zero; expected a non-zero quaternion")
     return n, colors[-1]

@@ -20,6 +20,7 @@ from torch import Tensor
 from neuprim.core.errors import FormError
 from neuprim.core.fields import MOST_UNITS, Constant, Cosine, DensityField, Field, Opaque, OpaqueColour, RayNet, Shading
 from neuprim.core.geometry import Geometry
+from neuprim.core.schema import InitContext, ParameterSpec
 
 if TYPE_CHECKING:
     from neuprim.core.primitives import Lowered
@@ -36,6 +37,7 @@ __all__ = [
     "check_rows",
     "check_shading",
     "check_shape",
+    "check_start",
     "check_sum",
     "check_tensors",
     "method",
@@ -155,7 +157,8 @@ def _expected(shapes: tuple[Shape, ...], sizes: Sizes) -> str:
     known, free = [x for x in letters if x in sizes], [x for x in letters if x not in sizes]
     if not free:
         numbers = [tuple(sizes[d][0] if isinstance(d, str) else d for d in shape) for shape in shapes]
-        origins = " and ".join(f"{sizes[x][1]} has {x}={sizes[x][0]}" for x in known)
+        tensors = dict.fromkeys(sizes[x][1] for x in known)
+        origins = " and ".join(f"{t} has " + " and ".join(f"{x}={sizes[x][0]}" for x in known if sizes[x][1] == t) for t in tensors)
         return " or ".join(map(str, numbers)) + (f", as {origins}" if origins else "")
     text = " or ".join(str(shape).replace("'", "") for shape in shapes)
     origins = " and ".join(f"{x}={sizes[x][0]} as in {sizes[x][1]}" for x in known)
@@ -300,6 +303,20 @@ def check_shading(found: Any, count: int, who: str) -> Shading:
     if found.primitives is not None:
         check_result(found.primitives, (count,), f"{who}: primitives")
     return found
+
+
+def check_start(spec: ParameterSpec, context: InitContext, who: str) -> Tensor:
+    """The float32 start value (N, *shape) that a parameter's own initialiser draws.
+
+    Raises:
+        FormError: it is of another shape; names ``who`` and the parameter.
+    """
+    value, shape = spec.init(context), (context.count, *spec.shape)
+    if not isinstance(value, Tensor):
+        raise FormError(f"{who}: {spec.name}: init returned type {type(value).__name__}; expected a torch tensor")
+    if value.shape != shape:
+        raise FormError(f"{who}: {spec.name}: init returned shape {tuple(value.shape)}; expected {shape}")
+    return value.float().contiguous()
 
 
 def check_tensors(found: Any, like: Mapping[str, Tensor], who: str) -> dict[str, Tensor]:

@@ -11,7 +11,17 @@ from torch import Tensor
 
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.fields import ColourField, Conditions, Constant, DensityField, LoweredColour, LoweredDensity, RayNet, Shade
-from neuprim.core.forms import check_colour, check_density, check_geometry, check_result, check_rows, check_shading, method, source
+from neuprim.core.forms import (
+    check_colour,
+    check_density,
+    check_geometry,
+    check_result,
+    check_rows,
+    check_shading,
+    check_start,
+    method,
+    source,
+)
 from neuprim.core.geometry import GEOMETRY_SPECS, Geometry
 from neuprim.core.ray_cameras import AnyCamera
 from neuprim.core.schema import InitContext, ParameterSpec
@@ -109,9 +119,14 @@ class Primitives:
 
     @classmethod
     def initialise(cls, density: DensityField, colour: ColourField, context: InitContext) -> Primitives:
-        """Fresh primitives from the specs' own initialisers."""
-        specs = (*GEOMETRY_SPECS, *density.parameters(), *colour.parameters())
-        return cls(density, colour, {s.name: s.init(context).float().contiguous() for s in specs})
+        """Fresh primitives from the specs' own initialisers.
+
+        Raises:
+            FormError: one of them returned something of another shape.
+        """
+        own = [("starting points", spec) for spec in GEOMETRY_SPECS]
+        own += [(method(field, "parameters"), spec) for field in (density, colour) for spec in field.parameters()]
+        return cls(density, colour, {spec.name: check_start(spec, context, who) for who, spec in own})
 
     @property
     def count(self) -> int:

@@ -163,6 +163,8 @@ def _kept(what: str, origin: PluginInfo, error: BaseException | None, folder: Pa
     content = f"{what} of {origin.origin} ({origin.target}), Python {python}\n\n{''.join(traceback.format_exception(error))}"
     begun = folder is not None and folder.parent.is_dir() and any(folder.parent.iterdir())
     path = written(
-        content, f"{origin.distribution}-{what}", [*([folder.absolute()] if begun and folder is not None else []), Path(tempfile.gettempdir())]
+        content,
+        f"{origin.distribution}-{what}",
+        [*([folder.absolute()] if begun and folder is not None else []), Path(tempfile.gettempdir())],
     )
     return "its traceback could not be written anywhere" if path is None else f"traceback: {path}"

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import pytest
 import torch
 
 from neuprim.core.cosine import CosineDensity
-from neuprim.core.errors import NonFiniteError
+from neuprim.core.errors import FormError, NonFiniteError
 from neuprim.core.geometry import GEOMETRY_SPECS, Geometry, quaternion_to_matrix
 from neuprim.core.primitives import Primitives
-from neuprim.core.schema import InitContext
+from neuprim.core.schema import InitContext, ParameterSpec
 from neuprim.tasks.static.fields import SphericalHarmonics
 
 
@@ -51,6 +54,27 @@ def test_a_fresh_model_stands_on_its_points() -> None:
     assert torch.equal(model.geometry.rotations, torch.eye(3).expand(4, 3, 3))
     assert all(v.dtype == torch.float32 and v.is_contiguous() for v in model.params.values())
     assert list(model.params) == [s.name for s in model.specs]
+
+
+@pytest.mark.parametrize(
+    ("init", "message"),
+    [
+        (lambda c: torch.zeros(c.count), r"init returned shape \(4,\); expected \(4, 1\)"),
+        (lambda c: [0.0] * c.count, r"init returned type list; expected a torch tensor"),
+    ],
+)
+def test_a_start_value_of_another_shape_names_field_and_parameter(init: Any, message: str) -> None:
+    class Waves(CosineDensity):
+        def parameters(self) -> list[ParameterSpec]:
+            found = super().parameters()
+            return [*found[:-1], replace(found[-1], init=init)]
+
+    context = InitContext(torch.zeros(4, 3), torch.ones(4), torch.rand(4, 3), torch.Generator())
+    with pytest.raises(FormError, match=rf"^density field Waves: parameters: b2: {message}"):
+        Primitives.initialise(Waves(), SphericalHarmonics(0), context)
+    context.means = torch.zeros(4, 2)
+    with pytest.raises(FormError, match=r"^starting points: means: init returned shape \(4, 2\); expected \(4, 3\)"):
+        Primitives.initialise(CosineDensity(), SphericalHarmonics(0), context)
 
 
 def test_initialising_twice_gives_the_same_model() -> None:

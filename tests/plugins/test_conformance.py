@@ -9,7 +9,9 @@ from dataclasses import replace
 
 import pytest
 
+from neuprim.core.errors import ConfigError
 from neuprim.plugins.conformance import CHECKS, ConformanceError, check_task, checks, named_checks
+from neuprim.plugins.conformance.subject import Subject
 from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.relight import TASK as RELIGHT
 from neuprim.tasks.static import TASK as STATIC
@@ -49,6 +51,15 @@ def test_relight_with_shadows(check: Check) -> None:
     check()
 
 
+@pytest.mark.parametrize("channels", [1, 5])
+def test_relighting_takes_rgb_only(channels: int) -> None:
+    """A light's intensity has three numbers."""
+    with pytest.raises(
+        ConfigError, match=f"^conformance example: {channels} colour channels; task relight expects 3, as light_intensity has"
+    ):
+        Subject(RELIGHT).with_channels(channels).fields()
+
+
 def test_every_check_says_what_it_demands() -> None:
     for name, check in CHECKS.items():
         text = check.__doc__ or ""
@@ -63,15 +74,18 @@ def test_check_task_lists_every_failure() -> None:
     assert all(line.startswith("task 'static': ") for line in lines)
     failed = {line.split(": ")[1] for line in lines}
     assert {"members", "fields", "save_load", "clear_errors"} <= failed
-    assert not {"gradients", "split", "resume", "extremes"} & failed
+    assert not {"gradients", "on_split", "resume", "extremes"} & failed
 
 
 def test_an_unforeseen_error_names_task_and_check() -> None:
     def build(model: object, dataset: object) -> None:
         raise RuntimeError("boom\nboom")
 
-    with pytest.raises(ConformanceError, match=r"task 'static': split: stopped by RuntimeError: boom boom") as caught:
-        named_checks(replace(STATIC, build=build))["split"]()  # type: ignore[arg-type]
+    with pytest.raises(
+        ConformanceError,
+        match=r"task 'static': on_split: stopped by RuntimeError: boom boom in test_.*build \(test_conformance\.py, line \d+\)",
+    ) as caught:
+        named_checks(replace(STATIC, build=build))["on_split"]()  # type: ignore[arg-type]
     assert isinstance(caught.value.__cause__, RuntimeError)
 
 

@@ -177,6 +177,23 @@ class Grey(SphericalHarmonics):
         return Constant(super().lower(params, geometry, camera, conditions).rgb.mean(-1, keepdim=True))
 
 
+class FirstThree(SphericalHarmonics):
+    """Of data with more channels it draws the first three only."""
+
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
+        return Constant(super().lower(params, geometry, camera, conditions).rgb[:, :3])
+
+
+def at_most_three(model: Mapping[str, Any], dataset: Any) -> Any:
+    return CosineDensity(2), SphericalHarmonics(0, min(dataset.channels, 3))
+
+
+def three_only(settings: Mapping[str, Any]) -> Any:
+    """A weight per colour of RGB."""
+    weights = torch.tensor([0.2, 0.7, 0.1])
+    return lambda rendered, truth: (((rendered - truth).abs() * weights).mean(), {})
+
+
 class Uphill(SphericalHarmonics):
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         rgb = super().lower(params, geometry, camera, conditions).rgb
@@ -304,44 +321,51 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("parameter_specs", "'b2': activation", using(specs(activation="log"))),
     ("parameter_specs", "'b2': shape", using(specs(shape=(-1,)))),
     ("parameter_specs", "'b 2'", using(specs(name="b 2"))),
-    ("initialisers", "'W1': two draws with one seed", using(Lazy)),
-    ("initialisers", "'b2': start value: found shape (12,); expected (12, 1)", using(WrongStart)),
-    ("initialisers", "changed in place", using(Meddler)),
+    ("initialisers", "density.parameters: 'W1': init: two draws with one seed", using(Lazy)),
+    ("initialisers", "density.parameters: 'b2': init: start value: found shape (12,); expected (12, 1)", using(WrongStart)),
+    ("initialisers", "density.parameters: 'b2': init: found the context's means, scales or colors changed in place", using(Meddler)),
     ("dataset", "view train0: condition 'time'", timed(example=WithoutTime)),
     ("dataset", "view train0: pixels: found (4, 4, 3)", using(example=Misfit)),
     (
-        "channels",
+        "display",
         "conformance example: 3 channels; expected 2, which task 'static' names: a, b",
         using(channels=("a", "b"), example=ThreeChannels),
     ),
-    ("channels", "display gave torch.float32 of shape (9, 10, 2)", using(display=lambda image: image[..., :2])),
-    ("channels", "found its argument changed in place", using(display=lambda image: image.mul_(0.5))),
-    ("channels", "off its rows one by one", using(display=lambda image: image / image.max())),
+    ("display", "display gave torch.float32 of shape (9, 10, 2)", using(display=lambda image: image[..., :2])),
+    ("display", "found its argument changed in place", using(display=lambda image: image.mul_(0.5))),
+    ("display", "off its rows one by one", using(display=lambda image: image / image.max())),
     ("loss", "loss of the truth itself", using(loss=negative)),
     ("loss", "shape (9, 10, 3)", using(loss=per_pixel)),
     ("loss", "no gradient", using(loss=detached)),
     ("loss", "loss part 'l1'", using(loss=wordy)),
-    ("lowered_forms", "lowered b2: found shape (1, 12)", using(Transposed)),
-    ("lowered_forms", "expected torch.float64", using(lowers(lambda f, g: replace(f, W1=f.W1.float())))),
-    ("lowered_forms", "channels: found 1", using(colour=Grey)),
-    ("alive", "density of a primitive that is not alive", using(LeavesOut)),
-    ("alive", "ascending", using(Unsorted)),
-    ("line_integral", "line integral of a chord, primitive", using(Doubled)),
-    ("opaque_twin", "alpha of view train0", using(Doubled)),
-    ("gradients", "gradient of w2: found none", using(lowers(lambda f, g: replace(f, w2=f.w2.detach())))),
-    ("gradients", "gradient of b1: found zero", using(lowers(lambda f, g: replace(f, b1=f.b1 * 0)))),
-    ("finite_differences", "gradient of W1, primitive", using(lowers(lambda f, g: replace(f, W1=2 * f.W1 - f.W1.detach())))),
-    ("finite_differences", "gradient of sh_dc, primitive", using(colour=Uphill)),
-    ("scale_density", "density after scale_density", using(Squares)),
-    ("scale_density", "w2: found changed in place", using(InPlace)),
-    ("clone", "a change of", using(Squares)),
-    ("split", "density of a child inside it", using(Copies)),
-    ("split", "mass of both children", using(Spills)),
+    ("lowered_forms", "density field Transposed lowered to Cosine: b2 has shape (1, 12); expected (12, 1) or (12,)", using(Transposed)),
+    (
+        "lowered_forms",
+        "density.lower: W1: found torch.float32; expected torch.float64",
+        using(lowers(lambda f, g: replace(f, W1=f.W1.float()))),
+    ),
+    ("lowered_forms", "colour.lower: channels: found 1; expected 3", using(colour=Grey)),
+    ("channels", "colour.lower with data of 5 channels: channels: found 3; expected 5", using(colour=FirstThree)),
+    ("channels", "colour.channels with data of 5 channels: found 3; expected 5", replace(using(), build=at_most_three)),
+    ("channels", "stopped by RuntimeError", replace(using(), loss=three_only)),
+    ("alive", "density.alive: density of a primitive that it leaves out", using(LeavesOut)),
+    ("alive", "density.alive: found torch.int64 [11, 10", using(Unsorted)),
+    ("line_integral", "density.lower: line integral of a chord, primitive", using(Doubled)),
+    ("opaque_twin", "density.lower: alpha of view train0", using(Doubled)),
+    ("gradients", "density.lower: gradient of w2: found none", using(lowers(lambda f, g: replace(f, w2=f.w2.detach())))),
+    ("gradients", "density.lower: gradient of b1: found zero", using(lowers(lambda f, g: replace(f, b1=f.b1 * 0)))),
+    ("finite_differences", "density.lower: gradient of W1, primitive", using(lowers(lambda f, g: replace(f, W1=2 * f.W1 - f.W1.detach())))),
+    ("finite_differences", "colour.lower: gradient of sh_dc, primitive", using(colour=Uphill)),
+    ("scale_density", "density.scale_density: density after it, primitive", using(Squares)),
+    ("scale_density", "density.scale_density: w2: found changed in place", using(InPlace)),
+    ("clone", "density.scale_density by a half, twice over: view train0: found a change of", using(Squares)),
+    ("on_split", "density.on_split: density of a child inside it, primitive", using(Copies)),
+    ("on_split", "density.on_split: mass of both children of primitive", using(Spills)),
     ("divide", "density.divide: geometry: found 12 rows; expected 24", using(HalfDivides)),
     ("determinism", "two runs of one seed: ", using(Noisy)),
     ("learning", "mean loss over the training views", using(loss=uphill)),
     ("save_load", "after loading: found a change", using(colour=Progresses)),
-    ("save_load", "unknown density setting", using(SwallowsSettings)),
+    ("save_load", "SwallowsSettings(no_such_setting=1), as a model file has it", using(SwallowsSettings)),
     ("resume", "8 steps against 4 + resume + 4", using(Remembers)),
     ("conditions", "parse('no such value'): found it was taken", timed(parse=lenient)),
     ("conditions", "parse('0.25'): found shape (1,)", timed(parse=lambda text: [number(text)[0].reshape(1)])),
@@ -379,3 +403,32 @@ def test_the_unbroken_ones_pass(name: str) -> None:
 def test_infinite_rates_are_noticed() -> None:
     with pytest.raises(ConformanceError, match="lr: found inf"):
         named_checks(using(specs(lr=math.inf)), model=MODEL)["parameter_specs"]()
+
+
+def test_a_fixed_number_of_channels_and_a_refusal_pass() -> None:
+    """The renderer refuses the background of other data; and a task may say itself that it takes RGB only."""
+
+    def build(model: Mapping[str, Any], dataset: Any) -> Any:
+        if dataset.channels != 3:
+            raise ConfigError("RGB only")
+        return CosineDensity(2), SphericalHarmonics(0, 3)
+
+    for task in (replace(using(), build=build), replace(using(), build=lambda m, d: (CosineDensity(2), SphericalHarmonics(0)))):
+        named_checks(task, model=MODEL)["channels"]()
+
+
+def test_an_error_in_a_method_names_it_and_its_line() -> None:
+    class Explodes(CosineDensity):
+        def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
+            return {**params, "b1": params["b1"] + torch.ones(5)}
+
+    with pytest.raises(ConformanceError) as caught:
+        named_checks(using(Explodes), model=MODEL)["on_split"]()
+    message = str(caught.value)
+    assert message.startswith("task 'static': on_split: stopped by RuntimeError: The size of tensor")
+    assert "Explodes.on_split (test_conformance_mutants.py, line " in message and "\n" not in message
+
+
+def test_a_form_that_does_not_fit_names_its_field() -> None:
+    with pytest.raises(ConformanceError, match=r"gradients: density field Changed lowered to Cosine: w2 has shape \(3, 2\)"):
+        named_checks(using(lowers(lambda f, g: replace(f, w2=f.w2[:3]))), model=MODEL)["gradients"]()

@@ -14,11 +14,15 @@ synthetic data set with the conditions it declares. The docstring of a check say
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
+from neuprim.core.errors import FormError
 from neuprim.core.task import TaskSpec
+from neuprim.plugins.conformance.channels import check_channels
 from neuprim.plugins.conformance.edges import check_clear_errors, check_conditions, check_extremes, check_missing_conditions
 from neuprim.plugins.conformance.forms import (
     check_alive,
@@ -35,12 +39,12 @@ from neuprim.plugins.conformance.parameters import (
     check_members,
     check_parameter_specs,
 )
-from neuprim.plugins.conformance.population import check_clone, check_divide, check_scale_density, check_split
+from neuprim.plugins.conformance.population import check_clone, check_divide, check_on_split, check_scale_density
 from neuprim.plugins.conformance.subject import ConformanceError, Subject
 from neuprim.plugins.conformance.training import (
-    check_channels,
     check_dataset,
     check_determinism,
+    check_display,
     check_learning,
     check_loss,
     check_resume,
@@ -58,9 +62,10 @@ CHECKS: dict[str, Callable[[Subject], None]] = {
         check_parameter_specs,
         check_initialisers,
         check_dataset,
-        check_channels,
+        check_display,
         check_loss,
         check_lowered_forms,
+        check_channels,
         check_alive,
         check_line_integral,
         check_opaque_twin,
@@ -68,7 +73,7 @@ CHECKS: dict[str, Callable[[Subject], None]] = {
         check_finite_differences,
         check_scale_density,
         check_clone,
-        check_split,
+        check_on_split,
         check_divide,
         check_determinism,
         check_learning,
@@ -81,6 +86,19 @@ CHECKS: dict[str, Callable[[Subject], None]] = {
     )
 }
 """Every check by name, in the order in which they are best read."""
+
+
+_FRAMEWORK = ("neuprim.core", "neuprim.config", "neuprim.plugins")
+_LIBRARIES = ("torch", "numpy", "scipy", "numba", "importlib", "omegaconf", "hydra", "yaml")
+
+
+def _origin(error: BaseException) -> str:
+    """``" in Waves.on_split (fields.py, line 12)"``: the innermost line of the task's own code; nothing where none was running."""
+    for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
+        module = str(frame.f_globals.get("__name__", ""))
+        if not module.startswith(_FRAMEWORK) and module.split(".")[0] not in _LIBRARIES:
+            return f" in {frame.f_code.co_qualname} ({Path(frame.f_code.co_filename).name}, line {line})"
+    return ""
 
 
 def named_checks(task: TaskSpec, preset: str | None = None, model: Mapping[str, Any] | None = None) -> dict[str, Callable[[], None]]:
@@ -107,9 +125,11 @@ def named_checks(task: TaskSpec, preset: str | None = None, model: Mapping[str, 
                 check(subject_of(name))
             except ConformanceError:
                 raise
+            except FormError as error:  # it names field, method and tensor
+                raise ConformanceError(f"task {task.name!r}: {name}: {error}") from error
             except (Exception, SystemExit) as error:  # whatever a task's code does, the message must say whose it is
                 text = " ".join(str(error).split())
-                raise ConformanceError(f"task {task.name!r}: {name}: stopped by {type(error).__name__}: {text}") from error
+                raise ConformanceError(f"task {task.name!r}: {name}: stopped by {type(error).__name__}: {text}{_origin(error)}") from error
 
         run.__doc__ = check.__doc__
         return run

@@ -92,7 +92,7 @@ def check_extremes(t: Subject) -> None:
             rgb.sum().backward()
         for parameter, value in params.items():
             bad = value.grad is not None and not bool(torch.isfinite(value.grad).all())
-            t.require(not bad, f"gradient of {parameter}, {name}", "NaN or infinity", "finite numbers")
+            t.require(not bad, f"{t.lowering(parameter)}gradient of {parameter}, {name}", "NaN or infinity", "finite numbers")
 
 
 def _scaled(by: tuple[float, float, float]) -> Callable[[Primitives], None]:

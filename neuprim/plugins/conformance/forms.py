@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.data import View
-from neuprim.core.fields import Constant, Cosine, LoweredColour, LoweredDensity, Opaque, OpaqueColour, RayNet
+from neuprim.core.fields import Constant, LoweredColour, LoweredDensity, Opaque
 from neuprim.core.primitives import Lowered, Primitives
 from neuprim.core.render import render, render_lowered
 from neuprim.plugins.conformance.integrals import Alive, by_quadrature, chords, inside, line_integral, opaque_colour
@@ -42,35 +42,21 @@ def check_lowered_forms(t: Subject) -> None:
     for dtype in (torch.float32, torch.float64):
         model = t.model(dtype)
         for view in t.views()[:3]:
-            lowered = model.lower(view.camera, view.conditions)
-            n = lowered.geometry.count
-            t.require(isinstance(lowered.density, Cosine | Opaque), "density.lower", type(lowered.density).__name__, "Cosine or Opaque")
-            _shapes(t, lowered.density, lowered.colour, n, dtype)
+            lowered = model.lower(view.camera, view.conditions)  # which refuses what does not fit, by name
+            _numbers(t, "density.lower", lowered.density, dtype)
+            _numbers(t, "colour.lower", lowered.colour, dtype)
             channels = lowered.colour.rgb.shape[1] if isinstance(lowered.colour, Constant) else lowered.colour.channels
             t.require(channels == t.dataset.channels, "colour.lower: channels", channels, str(t.dataset.channels))
             declared = model.colour.channels
             t.require(declared == t.dataset.channels, "colour.channels", declared, str(t.dataset.channels))
 
 
-def _shapes(t: Subject, density: LoweredDensity, colour: LoweredColour, n: int, dtype: torch.dtype) -> None:
-    expected: dict[str, tuple[Tensor, tuple[tuple[int, ...], ...]]] = {}
-    if isinstance(density, Cosine):
-        k = density.W1.shape[1]
-        expected |= {"W1": (density.W1, ((n, k, 3),)), "b1": (density.b1, ((n, k),)), "w2": (density.w2, ((n, k),))}
-        expected |= {"b2": (density.b2, ((n,), (n, 1)))}
-    if isinstance(colour, Constant):
-        expected |= {"rgb": (colour.rgb, ((n, colour.rgb.shape[-1]),))}
-    elif isinstance(colour, RayNet):
-        h, c = colour.hidden, colour.channels
-        expected |= {"Wx": (colour.Wx, ((n, h, 3),)), "bias": (colour.bias, ((n, h),))}
-        expected |= {"Wout": (colour.Wout, ((n, c, h),)), "base": (colour.base, ((n, c),))}
-    else:
-        t.require(isinstance(colour, OpaqueColour), "colour.lower", type(colour).__name__, "Constant, RayNet or OpaqueColour")
-    for name, (value, shapes) in expected.items():
-        where = f"lowered {name}"
-        t.require(tuple(value.shape) in shapes, where, f"shape {tuple(value.shape)}", " or ".join(map(str, shapes)))
-        t.require(value.dtype == dtype, where, value.dtype, f"{dtype}, as the parameters")
-        t.require(bool(torch.isfinite(value).all()), where, "NaN or infinity", "finite numbers")
+def _numbers(t: Subject, where: str, form: LoweredDensity | LoweredColour, dtype: torch.dtype) -> None:
+    """Dtype and values of a form's tensors; their shapes were checked as they were lowered."""
+    for name, value in vars(form).items():
+        if isinstance(value, Tensor):
+            t.require(value.dtype == dtype, f"{where}: {name}", value.dtype, f"{dtype}, as the parameters")
+            t.require(bool(torch.isfinite(value).all()), f"{where}: {name}", "NaN or infinity", "finite numbers")
 
 
 def check_alive(t: Subject) -> None:
@@ -88,7 +74,7 @@ def check_alive(t: Subject) -> None:
         moved = model.density.move(params, model.geometry, view.conditions)
         sigma = model.density.density(params, model.geometry, left, inside(moved, left, generator), view.conditions)
         worst = float(sigma.abs().max()) if len(left) else 0.0
-        t.require(worst == 0.0, "density of a primitive that is not alive", f"{worst:g}", "0")
+        t.require(worst == 0.0, "density.alive: density of a primitive that it leaves out", f"{worst:g}", "0")
 
 
 def check_line_integral(t: Subject) -> None:
@@ -104,15 +90,20 @@ def check_line_integral(t: Subject) -> None:
             o, d, t0, t1 = chords(alive.moved, prim, generator)
             middle = t0 + 0.4 * (t1 - t0)
             whole = line_integral(alive.form, alive.moved, prim, o, d, t0, t1)
-            t.require(tuple(whole.shape) == tuple(prim.shape), "line integral", f"shape {tuple(whole.shape)}", str(tuple(prim.shape)))
+            t.require(
+                tuple(whole.shape) == tuple(prim.shape),
+                "density.lower: line integral",
+                f"shape {tuple(whole.shape)}",
+                str(tuple(prim.shape)),
+            )
             parts = [line_integral(alive.form, alive.moved, prim, o, d, a, b) for a, b in ((t0, middle), (middle, t1))]
             expected, peak = by_quadrature(model, alive, view.conditions, prim, o, d, t0, t1)
             piece, _ = by_quadrature(model, alive, view.conditions, prim, o, d, middle, t1)
             size = (t1 - t0) * peak + 1e-30
             for where, a, b in (
-                ("line integral of a chord", whole, expected),
-                ("line integral of a piece", parts[1], piece),
-                ("sum over two pieces of a chord", parts[0] + parts[1], whole),
+                ("density.lower: line integral of a chord", whole, expected),
+                ("density.lower: line integral of a piece", parts[1], piece),
+                ("density.lower: sum over two pieces of a chord", parts[0] + parts[1], whole),
             ):
                 error = (a - b).abs() / size
                 worst = int(error.argmax()) if len(error) else 0
@@ -138,7 +129,7 @@ def check_opaque_twin(t: Subject) -> None:
             plain = Lowered(lowered.geometry, Opaque(twin), opaque_colour(lowered.colour, lowered.geometry), lowered.rows)
             a, b = (render_lowered(x, view.camera, EXACT) for x in (lowered, plain))
             seen = max(seen, float(a.alpha.max()))
-            for what, x, y in (("alpha", a.alpha, b.alpha), ("colour", a.rgb, b.rgb)):
+            for what, x, y in (("density.lower: alpha", a.alpha, b.alpha), ("colour.lower: colour", a.rgb, b.rgb)):
                 error = float((x - y).abs().max())
                 t.require(error <= 1e-5, f"{what} of view {view.name}", f"a difference of {error:.3g}", "at most 1e-5")
     t.require(seen > 0.01, "frames of a fresh model", f"opacity of at most {seen:.2g}", "something to see")
@@ -165,10 +156,11 @@ def check_gradients(t: Subject) -> None:
     for name, value in params.items():
         if not value.numel():
             continue
-        t.require(value.grad is not None, f"gradient of {name}", "none: the image does not depend on it", "one")
+        where = f"{t.lowering(name)}gradient of {name}"
+        t.require(value.grad is not None, where, "none: the image does not depend on it", "one")
         assert value.grad is not None
-        t.require(bool(torch.isfinite(value.grad).all()), f"gradient of {name}", "NaN or infinity", "finite numbers")
-        t.require(float(value.grad.abs().max()) > 0, f"gradient of {name}", "zero in all views", "other than zero")
+        t.require(bool(torch.isfinite(value.grad).all()), where, "NaN or infinity", "finite numbers")
+        t.require(float(value.grad.abs().max()) > 0, where, "zero in all views", "other than zero")
 
 
 def check_finite_differences(t: Subject) -> None:
@@ -208,7 +200,8 @@ def _compare(t: Subject, model: Primitives, view: View, name: str, grad: Tensor)
             if ok:
                 break
         row = entry // max(len(grad) // model.count, 1)
-        t.require(ok, f"gradient of {name}, primitive {row}, view {view.name}", f"{found:.6g}", f"{expected:.6g} by finite differences")
+        place = f"{t.lowering(name)}gradient of {name}, primitive {row}, view {view.name}"
+        t.require(ok, place, f"{found:.6g}", f"{expected:.6g} by finite differences")
 
 
 def camera_at(camera: Camera, position: Tensor, focal: float = 1.0) -> Camera:

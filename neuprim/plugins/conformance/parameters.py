@@ -78,7 +78,7 @@ def check_parameter_specs(t: Subject) -> None:
     """Names are unique, shapes and rates possible, groups the field's own: optimiser, checkpoint and export all live off this list."""
     taken = {s.name for s in GEOMETRY_SPECS}
     for kind, spec in t.specs():
-        where = f"{kind} parameter {spec.name!r}"
+        where = f"{kind}.parameters: {spec.name!r}"
         t.require(isinstance(spec, ParameterSpec), where, type(spec).__name__, "ParameterSpec")
         t.require(str(spec.name).isidentifier(), where, repr(spec.name), "a name of letters, digits and _ (it becomes a key)")
         t.require(spec.name not in taken, where, "a name used twice", "a unique one")
@@ -102,7 +102,7 @@ def check_initialisers(t: Subject) -> None:
         return InitContext(cloud.means.float(), scales, cloud.colors.float(), generator, t.settings.model.init, cloud.conditions)
 
     for kind, spec in t.specs():
-        where = f"{kind} parameter {spec.name!r}"
+        where = f"{kind}.parameters: {spec.name!r}: init"
         context = drawn(5)
         kept = [x.clone() for x in (context.means, context.scales, context.colors)]
         with torch.random.fork_rng(devices=[]):
@@ -117,7 +117,7 @@ def check_initialisers(t: Subject) -> None:
             torch.equal(value, again), f"{where}: two draws with one seed", "different values", "equal ones (use only context.generator)"
         )
         same = all(torch.equal(a, b) for a, b in zip(kept, (context.means, context.scales, context.colors), strict=True))
-        t.require(same, f"{where}: initialiser", "the context's means, scales or colors changed in place", "a context left alone")
+        t.require(same, where, "the context's means, scales or colors changed in place", "a context left alone")
     first, other = t.fresh(), t.fresh()
     equal = all(torch.equal(first.params[n], other.params[n]) for n in first.params)
     t.require(equal, "two models of one seed", "different start values", "equal ones")

@@ -13,7 +13,7 @@ from neuprim.plugins.conformance.forms import double
 from neuprim.plugins.conformance.integrals import Alive, inside
 from neuprim.plugins.conformance.subject import EXACT, Subject
 
-__all__ = ["check_clone", "check_divide", "check_scale_density", "check_split"]
+__all__ = ["check_clone", "check_divide", "check_on_split", "check_scale_density"]
 
 
 def check_scale_density(t: Subject) -> None:
@@ -29,7 +29,7 @@ def check_scale_density(t: Subject) -> None:
     for view in map(double, t.views()):
         prim, x = _points(model, view.conditions, 5)
         before, after = (model.density.density(p, model.geometry, prim, x, view.conditions) for p in (own, scaled))
-        _close(t, "density after scale_density", after, before * factor[prim], prim)
+        _close(t, "density.scale_density: density after it", after, before * factor[prim], prim)
 
 
 def check_clone(t: Subject) -> None:
@@ -43,10 +43,15 @@ def check_clone(t: Subject) -> None:
             a, b = (render(m, view.camera, view.conditions, EXACT) for m in (model, twice))
             error = float((a.rgb - b.rgb).abs().max())
             # Two clamps at 0.9999 let less through than one.
-            t.require(error <= 2e-4 * max(1.0, float(a.rgb.abs().max())), f"view {view.name}", f"a change of {error:.3g}", "none")
+            t.require(
+                error <= 2e-4 * max(1.0, float(a.rgb.abs().max())),
+                f"density.scale_density by a half, twice over: view {view.name}",
+                f"a change of {error:.3g}",
+                "none",
+            )
 
 
-def check_split(t: Subject) -> None:
+def check_on_split(t: Subject) -> None:
     """Children continue their parent's sigma inside themselves, or where ``exact_split`` is False hold its mass: splits must not flicker."""
     model = t.model()
     old = model.geometry
@@ -76,7 +81,7 @@ def check_split(t: Subject) -> None:
             x = inside(now, prim, generator)
             found = model.density.density(child, new, prim, x, view.conditions)
             expected = model.density.density(parents, old, prim, x, view.conditions)
-            _close(t, "density of a child inside it", found, expected, prim)
+            _close(t, "density.on_split: density of a child inside it", found, expected, prim)
 
 
 def _mass(t: Subject, model: Primitives, children: list[tuple[dict[str, Tensor], Geometry]]) -> None:
@@ -100,7 +105,7 @@ def _mass(t: Subject, model: Primitives, children: list[tuple[dict[str, Tensor],
     worst = int(error.argmax())
     t.require(
         float(error.max()) <= 0.01,
-        f"mass of both children of primitive {worst}",
+        f"density.on_split: mass of both children of primitive {worst}",
         f"{float(both[worst]):.4g}",
         f"{float(parents[worst]):.4g}",
     )

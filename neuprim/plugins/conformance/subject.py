@@ -55,6 +55,12 @@ class Subject:
         other.check = check
         return other
 
+    def with_channels(self, channels: int) -> Subject:
+        """The same on a synthetic data set of so many colour channels."""
+        other = copy(self)
+        other.dataset = Example(self.task.conditions, channels)
+        return other
+
     # ------------------------------------------------------------ verdicts
 
     def require(self, ok: bool, where: str, found: object, expected: str) -> None:
@@ -100,6 +106,11 @@ class Subject:
         """("density" or "colour", spec) of every parameter beside the geometry's."""
         density, colour = self.fields()
         return [*(("density", s) for s in density.parameters()), *(("colour", s) for s in colour.parameters())]
+
+    def lowering(self, name: str) -> str:
+        """``"density.lower: "`` for a parameter of the density, and so on: the method that the image depends on it through."""
+        kind = next((kind for kind, spec in self.specs() if spec.name == name), None)
+        return "" if kind is None else f"{kind}.lower: "
 
     def fresh(self, seed: int = 0) -> Primitives:
         """A model as a run starts with."""

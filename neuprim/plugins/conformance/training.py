@@ -19,7 +19,7 @@ from neuprim.core.train.trainer import Trainer
 from neuprim.core.uses import loss_settings
 from neuprim.plugins.conformance.subject import Subject
 
-__all__ = ["check_channels", "check_dataset", "check_determinism", "check_learning", "check_loss", "check_resume", "check_save_load"]
+__all__ = ["check_dataset", "check_determinism", "check_display", "check_learning", "check_loss", "check_resume", "check_save_load"]
 
 _STEPS = 4  # before the kill, and again after it; the population changes twice in each half
 
@@ -48,7 +48,7 @@ def check_dataset(t: Subject) -> None:
     t.require(torch.equal(a.means, b.means), "example: initial_points", "other points for the same seed", "the same")
 
 
-def check_channels(t: Subject) -> None:
+def check_display(t: Subject) -> None:
     """The names of the channels fit the data, and the display makes sRGB of each pixel by itself: of primitives, parts and whole images."""
     channels = channels_of(t.task, t.dataset)
     image = t.dataset.test.pixels(0).over(t.dataset.background)
@@ -174,4 +174,5 @@ def _refuses_foreign(t: Subject, path: Path) -> None:
             checkpoint.load_model(other, t.task)
         except CheckpointError:
             continue
-        t.require(False, f"a model file with an unknown {kind} setting", "it was loaded", "CheckpointError")
+        where = f"{header[kind]['class']}(no_such_setting=1), as a model file has it"
+        t.require(False, where, "it was loaded", "CheckpointError, because the class refuses settings that it does not have")

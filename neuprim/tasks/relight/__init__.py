@@ -46,6 +46,8 @@ def _check(model: Mapping[str, Any]) -> None:
 
 
 def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
+    if dataset.channels != 3:
+        raise ConfigError(f"{dataset.name}: {dataset.channels} colour channels; task relight expects 3, as light_intensity has")
     falloff = getattr(dataset, "falloff", "none") == "inverse_square"
     return CosineDensity(model["neurons"]), _colour(model, dataset.channels, falloff, typical_light(dataset, falloff))
 

@@ -91,6 +91,7 @@ def _composed(
         load_loss(settings.train.loss)
         loss = Maker.of(LOSSES.find(settings.train.loss))
     scene = _scene(full["scene"], base["scene"], declared_paths)
+    added = None if found.added_by is None else Maker.of(found.added_by, scene_name)
     directory = output_directory(settings.output_dir, f"{_in_path(task_word)}-{_in_path(scene_word)}", settings.resume, check_output)
     full["scene"] = scene
     changed = {"preset": (own.preset, preset)} if preset != own.preset else {}
@@ -108,7 +109,7 @@ def _composed(
         options=full["task"]["options"],
         overrides=list(overrides),
         non_default={**changed, **_differences(_typed(plain), _typed(full, settings))},
-        made_by=MadeBy(__version__, Maker.of(task_info), found.added_by and Maker.of(found.added_by, scene_name), loss),
+        made_by=MadeBy(__version__, Maker.of(task_info), added, loss),
     )
 
 

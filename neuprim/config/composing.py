@@ -22,7 +22,7 @@ from neuprim.config.schema import REQUIRED, build, defaults, is_free, like, sett
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.plugins.names import split
 from neuprim.plugins.provenance import MadeBy, Maker
-from neuprim.plugins.registry import LOSSES, TASKS, UnknownPlugin, find_scene, load_loss, load_task
+from neuprim.plugins.registry import LOSSES, TASKS, UnknownPlugin, find_scene
 
 if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
@@ -69,7 +69,7 @@ def _composed(
 ) -> RunConfig:
     values = [a for a in assignments if a.key not in CHOICES]
     task_word = chosen["task"] or DEFAULT_TASK
-    task_info, spec = TASKS.find(task_word), load_task(task_word)
+    task_info, spec = TASKS.loaded(task_word)
     check_groups(spec)
     own = task_choices(spec)
     preset = chosen["preset"] or own.preset
@@ -86,10 +86,7 @@ def _composed(
     plain, full = _merge(base, values)
     settings = _settings(full)
     spec.check(vars(settings.model))
-    loss = None
-    if settings.train.loss is not None:
-        load_loss(settings.train.loss)
-        loss = Maker.of(LOSSES.find(settings.train.loss))
+    loss = None if settings.train.loss is None else Maker.of(LOSSES.loaded(settings.train.loss)[0])
     scene = _scene(full["scene"], base["scene"], declared_paths)
     added = None if found.added_by is None else Maker.of(found.added_by, scene_name)
     directory = output_directory(settings.output_dir, f"{_in_path(task_word)}-{_in_path(scene_word)}", settings.resume, check_output)

@@ -25,7 +25,7 @@ from neuprim.core.uses import build_settings
 from neuprim.plugins.blame import blamed
 from neuprim.plugins.names import split
 from neuprim.plugins.provenance import MadeBy, Maker
-from neuprim.plugins.registry import LOSSES, TASKS, UnknownPlugin, find_scene, load_loss, load_task
+from neuprim.plugins.registry import LOSSES, TASKS, UnknownPlugin, find_scene
 
 if TYPE_CHECKING:
     from neuprim.core.extensions import LossExtension
@@ -73,7 +73,7 @@ def _composed(
 ) -> RunConfig:
     values = [a for a in assignments if a.key not in CHOICES]
     task_word = chosen["task"] or DEFAULT_TASK
-    task_info, spec = TASKS.find(task_word), load_task(task_word)
+    task_info, spec = TASKS.loaded(task_word)
     check_groups(spec)
     own = task_choices(spec)
     preset = chosen["preset"] or own.preset
@@ -89,14 +89,15 @@ def _composed(
         _check_key(assignment, base, scene_name)
     plain, full = _merge(base, values)
     settings = _settings(full)
-    loss = None if settings.train.loss is None else load_loss(settings.train.loss)
-    loss_maker = None if settings.train.loss is None else Maker.of(LOSSES.find(settings.train.loss))
-    check_typed(spec, loss, values)
-    options = _options(spec, loss, own.options, plain, full)
+    loss = None if settings.train.loss is None else LOSSES.loaded(settings.train.loss)
+    declared = None if loss is None else loss[1]
+    check_typed(spec, declared, values)
+    options = _options(spec, declared, own.options, plain, full)
     check_names(spec, settings)
     with blamed(task_info, f"check of task {spec.name!r}"):
         spec.check(build_settings(spec, settings.model, options))
     scene = _scene(full["scene"], base["scene"], declared_paths)
+    added = None if found.added_by is None else Maker.of(found.added_by, scene_name)
     directory = output_directory(settings.output_dir, f"{_in_path(task_word)}-{_in_path(scene_word)}", settings.resume, check_output)
     full["scene"] = scene
     changed = {"preset": (own.preset, preset)} if preset != own.preset else {}
@@ -112,12 +113,10 @@ def _composed(
         seed=settings.seed,
         resume=settings.resume,
         options=options,
-        unused=unused(spec, loss),
+        unused=unused(spec, declared),
         overrides=list(overrides),
         non_default={**changed, **_differences(_typed(plain), _typed(full, settings))},
-        made_by=MadeBy(
-            __version__, Maker.of(task_info), None if found.added_by is None else Maker.of(found.added_by, scene_name), loss_maker
-        ),
+        made_by=MadeBy(__version__, Maker.of(task_info), added, None if loss is None else Maker.of(loss[0])),
     )
 
 

@@ -114,7 +114,12 @@ class Group(Generic[T]):
             UnknownPlugin: there is none.
             PluginError: the bare name is claimed by several packages, or the plugin is broken or was written for another version.
         """
-        return self._load(*self._find(word))
+        return self.loaded(word)[1]
+
+    def loaded(self, word: str) -> tuple[PluginInfo, T]:
+        """Who registers it, and the plugin, as :meth:`load`."""
+        info, entry = self._find(word)
+        return info, self._load(info, entry)
 
     def survey(self) -> list[PluginReport[T]]:
         """Every registered plugin, loaded one by one; the broken ones come with their error."""

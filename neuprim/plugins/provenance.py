@@ -104,10 +104,9 @@ def load_recorded(group: Group[T], maker: Maker, file: Path | None = None, entry
     """
     word = qualified(maker.package, entry or maker.name)
     try:
-        info = group.find(word)
+        info, spec = group.loaded(word)
     except UnknownPlugin as error:
         raise ConfigError(_told(file, missing(group, maker, entry))) from error
-    spec = group.load(word)
     if not info.built_in and info.version != maker.version:
         warn_once(_told(file, f"this run was made by {maker.origin} ({group.kind} {maker.name}); installed is {info.origin}"))
     return info, spec

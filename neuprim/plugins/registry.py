@@ -127,11 +127,11 @@ def find_scene(task: TaskSpec, word: str) -> FoundScene:
         for info in list_scenes(task.name):
             if info.name == f"{task.name}.{name}":
                 warn_once(SCENES.hidden(info, f"one of task {task.name!r} itself"))
-    if own and package in (None, _package_of(task)):
+    if own and (package is None or package == _package_of(task)):
         return FoundScene(own[0], task.config_package)
     added = f"{task.name}.{name}" if package is None else f"{package}:{task.name}.{name}"
     try:
-        info = SCENES.find(added)
+        info, extension = SCENES.loaded(added)
     except UnknownPlugin:
         offered = scene_names(task)
         if package is not None:
@@ -140,7 +140,6 @@ def find_scene(task: TaskSpec, word: str) -> FoundScene:
         whose = f"task {task.name!r} has no such scene" + (f" of {package}" if package else "")
         late = not_installed_yet(SCENES.entry_points, f"{task.name}.{name}", package)
         raise UnknownPlugin(f"scene={word}: {whose}{nearest(name, offered)}{late}") from None
-    extension = SCENES.load(f"{normalised(info.distribution)}:{info.name}")
     return FoundScene(extension.scene, extension.config_package, info)
 
 

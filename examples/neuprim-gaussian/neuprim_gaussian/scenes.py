@@ -15,7 +15,7 @@ def _like_static(name: str, summary: str) -> SceneSpec:
     def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         from neuprim.plugins.registry import find_scene, load_task  # imported when used: listing tasks stays quick
 
-        return find_scene(load_task("static"), name).spec.load(settings, context)
+        return find_scene(load_task("neuprim:static"), name).spec.load(settings, context)
 
     return SceneSpec(name, summary, load)
 

@@ -6,7 +6,7 @@ each split, before a run starts.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, get_args
 
 import torch
@@ -176,7 +176,7 @@ def _finite(value: Tensor, where: str) -> None:
         raise DatasetFault(f"{where}: found {int(bad.sum())} values that are NaN or infinite{first}; expected finite numbers")
 
 
-def _one_of(where: str, value: object, choices: Iterable[str]) -> None:
+def _one_of(where: str, value: object, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise DatasetFault(f"{where} is {value!r}; expected {' or '.join(choices)}")
 

@@ -62,7 +62,7 @@ class blamed:
         if not _a_crash(error) or self.origin.built_in:
             return
         called = _frames(trace)[1:]  # the first one is the caller's
-        theirs = [frame for frame in called if _top(frame[0]) == _top(self.origin.target)]
+        theirs = [frame for frame in called if _top(frame[0]) in Party(self.what, self.origin).modules]
         if called and _top(called[0][0]) == _OURS and not theirs:
             return
         raise PluginError(_line(self.what, self.origin, error, theirs, self.folder)) from error
@@ -77,7 +77,7 @@ class Party:
     modules: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
-        self.modules.add(_top(self.origin.target))
+        self.modules |= {_top(self.origin.target)} - {""}
 
 
 class Suspects:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import torch
 
@@ -148,7 +149,8 @@ def check_clear_errors(t: Subject) -> None:
     model = t.settings.model
     t.task.check(build_settings(t.task, model, t.options))
     for group in ("density", "colour"):
-        wrong = build_settings(t.task, replace(model, **{group: {**getattr(model, group), "no_such_setting": 1}}), t.options)
+        changed: dict[str, Any] = {group: {**getattr(model, group), "no_such_setting": 1}}
+        wrong = build_settings(t.task, replace(model, **changed), t.options)
         where = f"TaskSpec.check with model.{group}.no_such_setting=1"
         try:
             t.task.check(wrong)

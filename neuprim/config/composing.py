@@ -25,7 +25,7 @@ from neuprim.core.uses import build_settings
 from neuprim.plugins.blame import blamed
 from neuprim.plugins.names import split
 from neuprim.plugins.provenance import MadeBy, Maker
-from neuprim.plugins.registry import LOSSES, TASKS, UnknownPlugin, find_scene
+from neuprim.plugins.registry import LOSSES, TASKS, UnknownPlugin, find_scene, load_loss
 
 if TYPE_CHECKING:
     from neuprim.core.extensions import LossExtension

@@ -242,12 +242,11 @@ def _render(args: argparse.Namespace) -> int:
         if not Path(args.camera).is_file():
             raise ConfigError(f"--camera {args.camera}: no such file")
     environment = environment_of(args)
-    from rich.console import Console
-
+    from neuprim.console import plain_console
     from neuprim.evaluate import render_run
     from neuprim.progress import DrawProgress
 
-    with DrawProgress(Console(stderr=True)) as progress:
+    with DrawProgress(plain_console(stderr=True)) as progress:
         paths = render_run(
             *(run_dir, args.camera, args.size, args.format, args.out, args.frames, args.conditions, args.fps),
             environment=environment,
@@ -261,11 +260,10 @@ def _render(args: argparse.Namespace) -> int:
 
 def _export(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
-    from rich.console import Console
-
+    from neuprim.console import plain_console
     from neuprim.exporting import export_run, print_report
 
-    print_report(export_run(run_dir, args.format, args.out, args.options, args.force, Console(stderr=True)), args.json)
+    print_report(export_run(run_dir, args.format, args.out, args.options, args.force, plain_console(stderr=True)), args.json)
     return 0
 
 
@@ -329,7 +327,7 @@ def _conditions(run_dir: Path, words: list[str], command: str, known: argparse.A
     spec = load_task(RunConfig.from_yaml(_run_directory(run_dir)).task)
     parser = Parser(prog=f"neuprim {command}", add_help=False, allow_abbrev=False)
     for condition in spec.conditions:
-        parser.add_argument("--" + condition.name.replace("_", "-"), dest=condition.name)
+        parser.add_argument(condition.flag, dest=condition.name)
     args, rest = parser.parse_known_args(words)
     if rest:
         flags = [flag for flag in (*known._option_string_actions, *parser._option_string_actions) if flag.startswith("--")]

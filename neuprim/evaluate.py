@@ -204,7 +204,7 @@ def with_conditions(views: list[View], task: TaskSpec, texts: Mapping[str, str])
                 views = [replace(v, name=f"{v.name}_{i:03d}", conditions={**v.conditions, spec.name: x}) for i, (v, x) in enumerate(pick)]
         for v in views:
             if spec.name not in v.conditions:
-                raise ConfigError(f"view {v.name} has no {spec.name}, which task {task.name!r} needs; give --{spec.name}")
+                raise ConfigError(f"view {v.name} has no {spec.name}, which task {task.name!r} needs; give {spec.flag}")
     return views, animated
 
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from neuprim.core.datasets.common import PosedImages
 from neuprim.core.errors import CheckpointError, DataError, NonFiniteError
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.evaluate import evaluate_run, read_metrics, render_run
+from neuprim.measure import measure
 from tests.core import tiny
 
 STEPS = 240
@@ -129,6 +131,26 @@ def test_curve(whole: Path) -> None:
     assert any("moved" in line.get("change", "") for line in lines)
     assert lines[-1]["eval_psnr"] > lines[0]["psnr"] + 3
     assert lines[-1]["eval_psnr"] == pytest.approx(read_metrics(whole)["psnr"], abs=1e-3)
+
+
+def test_masked_pixels_do_not_count_on_the_curve() -> None:
+    dataset = tiny.TwoPrimitives()
+    mask = torch.zeros(tiny.SIZE, tiny.SIZE, dtype=torch.bool)
+    mask[8:14, 5:20] = True
+    dataset.test.images = [  # type: ignore[attr-defined]
+        replace(p, rgb=torch.where(mask[..., None], p.rgb, torch.tensor(7.0)), mask=mask)
+        for p in dataset.test.images  # type: ignore[attr-defined]
+    ]
+    trainer = tiny.trainer(dataset, 3)
+    views = measure(trainer.model, dataset, trainer.renderer)
+    assert running._curve_psnr(trainer) == pytest.approx(sum(v.psnr for v in views) / len(views), abs=1e-9)
+
+
+def test_a_perfect_view_leaves_the_curve_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = tiny.TwoPrimitives()
+    monkeypatch.setattr(running, "draw", lambda model, view, settings, background: dataset.test.pixels(0).over(background))
+    dataset.test.images = [dataset.test.images[0]] * 2  # type: ignore[attr-defined]
+    assert running._curve_psnr(tiny.trainer(dataset, 3)) == 200.0
 
 
 def test_a_data_set_may_judge_views_and_keep_films_beside_them(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -41,7 +41,10 @@ Conditions = Mapping[str, Tensor]
 class ConditionSpec:
     """A quantity a frame depends on besides its camera; command-line flags derive from these.
 
-    ``parse`` turns the text of ``--NAME TEXT`` into one tensor per frame of an animation.
+    Attributes:
+        name: of the flag, and the key in a frame's conditions.
+        parse: turns the text of ``--NAME TEXT`` into one tensor per frame of an animation.
+        sweep: a text of ``--NAME TEXT`` that animates the condition, for the commands a report offers; empty: none.
     """
 
     name: str
@@ -49,6 +52,12 @@ class ConditionSpec:
     unit: str
     range: tuple[float, float]
     parse: Callable[[str], list[Tensor]]
+    sweep: str = ""
+
+    @property
+    def flag(self) -> str:
+        """``--name``, as the command line spells it."""
+        return "--" + self.name.replace("_", "-")
 
 
 # ---------------------------------------------------------------- closed forms of density

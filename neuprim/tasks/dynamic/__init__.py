@@ -77,6 +77,6 @@ TASK = TaskSpec(
     build=_build,
     loss=photometric,
     check=_check,
-    conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_times),),
+    conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_times, sweep="0:1"),),
     fields={"TimeDensity": TimeDensity, "TimeHarmonics": TimeHarmonics},
 )

@@ -17,6 +17,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.images import write_exr
 from neuprim.evaluate import render_run
 from neuprim.run import run
+from tests.reports import offered
 
 SCENE = ["task=relight", "scene=lit_solids", "scene.size=32", "scene.train_views=24", "scene.test_views=6", "scene.supersampling=1"]
 SMALL = ["model.primitives=150", "model.neurons=2", "model.colour.hidden=3", "train.max_seconds=null"]
@@ -49,6 +50,24 @@ def test_the_light_goes_round(finished: Path, tmp_path: Path) -> None:
     assert main(words) == 0
     with Image.open(target) as film:
         assert getattr(film, "n_frames", 1) == 5
+
+
+def test_the_report_offers_commands_that_work(finished: Path, tmp_path: Path) -> None:
+    commands = offered(finished / "report.html")
+    assert ["render", str(finished), "--camera", "orbit", "--light", "orbit"] in commands
+    assert not any("--time" in words for words in commands), "a scene under lights has no time"
+    for i, words in enumerate(commands):
+        small = ["--size", "6x5", "--frames", "2", "--out", str(tmp_path / str(i))] if words[0] == "render" else []
+        assert main([*words, *small]) == 0, words
+
+
+def test_a_missing_condition_is_asked_for_by_its_flag(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    camera = {"w": 6, "h": 5, "camera_angle_x": 0.5, "frames": [{"name": "a", "transform_matrix": np.eye(4).tolist()}]}
+    (tmp_path / "cameras.json").write_text(json.dumps(camera))
+    words = ["render", str(finished), "--camera", str(tmp_path / "cameras.json"), "--light", "3,0,3"]
+    assert main(words) == 2
+    assert "has no light_intensity, which task 'relight' needs; give --light-intensity" in capsys.readouterr().err
+    assert main([*words, "--light-intensity", "9", "--out", str(tmp_path / "a.png")]) == 0
 
 
 def test_light_from_all_around(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

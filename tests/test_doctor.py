@@ -1,10 +1,14 @@
 import io
+from dataclasses import replace
 from importlib import metadata
+from typing import Any
 
 import pytest
 from rich.console import Console
 
+import neuprim.core.render as rendering
 from neuprim import doctor
+from neuprim.core.render import BACKENDS
 
 
 def report() -> tuple[int, str]:
@@ -70,3 +74,17 @@ def test_a_backend_that_raises_is_shown_not_fatal(monkeypatch: pytest.MonkeyPatc
 
 def test_the_oracle_works_here() -> None:
     assert doctor._probe("reference") is None
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_backend_that_is_a_thousandth_off_does_not_work(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert doctor._probe(backend) is None
+    genuine = rendering.render_lowered
+
+    def dimmer(*args: Any) -> Any:
+        output = genuine(*args)
+        return replace(output, rgb=0.999 * output.rgb)
+
+    monkeypatch.setattr(rendering, "render_lowered", dimmer)
+    reason = doctor._probe(backend)
+    assert reason is not None and reason.startswith("drew 0.86")

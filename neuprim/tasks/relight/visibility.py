@@ -24,9 +24,10 @@ __all__ = ["BIAS", "SIZE", "SOFTNESS", "light_visibility"]
 SIZE = 192
 """Pixels of the depth image, square."""
 
-BIAS, SOFTNESS = 0.2, 0.08
-"""In units of a quarter of the scene's diameter as the light sees it: how far behind the depth image a lit surface may lie, and over
-what distance light fades."""
+BIAS, SOFTNESS = 1 / 20, 1 / 50
+"""In scene diameters, as the light sees the scene: how far behind the depth image light has fallen to a half, and over what distance it
+fades. A compromise: surfaces made of ellipsoids are bumpy, and with a smaller bias the bumps shadow each other; with a larger one shadows
+begin further from what casts them. A point on the depth image itself keeps 1/(1 + exp(-BIAS/SOFTNESS)) = 92 % of its light."""
 
 _FAR = 1e3  # scene radii
 
@@ -34,7 +35,7 @@ _FAR = 1e3  # scene radii
 def light_visibility(geometry: Geometry, density: LoweredDensity, light: Tensor, bias: float = BIAS, softness: float = SOFTNESS) -> Shade:
     """The function (M, 3) scene points -> (M,) visibility 0..1, float32, of a point light (3,).
 
-    The light's camera looks at the middle of all centres and sees all of them; a light among them looks the way most of them lie,
+    ``bias`` and ``softness`` are in scene diameters, see :data:`BIAS`. The light's camera looks at the middle of all centres and sees all of them; a light among them looks the way most of them lie,
     and points behind it count as lit.
     """
     with torch.no_grad():
@@ -60,7 +61,7 @@ def light_visibility(geometry: Geometry, density: LoweredDensity, light: Tensor,
         output = render_lowered(flat, camera, RenderSettings(depth=True, near=near))
         assert output.depth is not None
         nearness = torch.where(output.alpha > 0.5, 1.0 / output.depth.double().clamp_min(near), 0.0)
-        unit = 0.5 * radius
+        diameter = 2.0 * radius
 
     def visibility(points: Tensor) -> Tensor:
         with torch.no_grad():
@@ -70,6 +71,6 @@ def light_visibility(geometry: Geometry, density: LoweredDensity, light: Tensor,
             where = torch.stack([x * spread, y * spread], -1).clamp(-2.0, 2.0)
             found = F.grid_sample(nearness[None, None], where[None, None], align_corners=False)[0, 0, 0]
             behind = z - 1.0 / found.clamp_min(1e-12)
-            return torch.where(front, torch.sigmoid((bias * unit - behind) / (softness * unit)), 1.0).float()
+            return torch.where(front, torch.sigmoid((bias * diameter - behind) / (softness * diameter)), 1.0).float()
 
     return visibility

@@ -160,6 +160,20 @@ def test_files_stay_small() -> None:
     assert long == []
 
 
+def test_tests_do_not_import_tests() -> None:
+    """What several of them need is in a module without ``test_`` in its name: else a change of one test is a change of others."""
+    folder = Path(__file__).parent
+    wrong = [
+        f"{f.relative_to(folder)}:{node.lineno}"
+        for f in sorted([*folder.rglob("*.py"), *(folder.parent / "examples").rglob("*.py"), *(folder.parent / "benchmarks").rglob("*.py")])
+        for node in ast.walk(ast.parse(f.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for name in [getattr(node, "module", None) or "", *(alias.name for alias in node.names)]
+        if any(part.startswith("test_") for part in name.split("."))
+    ]
+    assert wrong == []
+
+
 def test_what_says_that_it_returns_something_does() -> None:
     silent = []
     for f in FILES:

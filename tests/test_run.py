@@ -16,11 +16,10 @@ from typing import Any
 import pytest
 import torch
 from PIL import Image
-from rich.console import Console
 from torch import Tensor
 
 import neuprim.run as running
-from neuprim.config import RunConfig, compose
+from neuprim.config import RunConfig
 from neuprim.core import checkpoint
 from neuprim.core.data import Clip
 from neuprim.core.datasets.common import PosedImages
@@ -29,8 +28,7 @@ from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.evaluate import evaluate_run, read_metrics, render_run
 from neuprim.measure import measure
 from tests.core import tiny
-
-STEPS = 240
+from tests.short_runs import STEPS, fit, words
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -43,20 +41,6 @@ def short_orbits() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny.write_blender(tmp_path_factory.mktemp("data") / "two")
-
-
-def words(scene: Path, out: Path, iterations: int = STEPS, *more: str) -> list[str]:
-    """Overrides of a run that is over in a second or two and reproducible to the bit."""
-    return [
-        "task=static", "scene=blender", f"scene.path={scene}", "scene.background=random", f"output_dir={out}",
-        "model.primitives=40", "model.neurons=4", "model.sh_degree=3", "model.sh_every=0.5", "seed=3", f"train.iterations={iterations}",
-        "train.max_seconds=null", "train.log_every=10", "train.eval_every=0.25", "train.population.every=20", "train.population.start=0.05",
-        *more,
-    ]  # fmt: skip
-
-
-def fit(overrides: list[str]) -> Path:
-    return running.run(compose(overrides), Console(quiet=True))
 
 
 @pytest.fixture(scope="module")

@@ -41,6 +41,7 @@ def passed(output: str) -> int:
     return int(output.split(" passed")[0].split()[-1])
 
 
+@pytest.mark.timeout(900)
 def test_the_example_installs_trains_and_passes_its_own_tests(tmp_path: Path) -> None:
     copy, site = tmp_path / "example", tmp_path / "site"
     shutil.copytree(EXAMPLE, copy, ignore=shutil.ignore_patterns("build", "*.egg-info", "__pycache__"))
@@ -58,6 +59,7 @@ def test_the_example_installs_trains_and_passes_its_own_tests(tmp_path: Path) ->
     assert passed(shell([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"], copy, site)) > 50
 
 
+@pytest.mark.timeout(900)
 def test_a_new_task_installs_trains_and_passes_its_tests(tmp_path: Path) -> None:
     site, folder = tmp_path / "site", tmp_path / "mine"
     printed = neuprim_command(["new-task", "wave", "--out", str(folder)], tmp_path, site)

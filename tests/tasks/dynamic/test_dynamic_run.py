@@ -20,7 +20,7 @@ from neuprim.run import run
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.time import parse_times
 from tests.reports import offered
-from tests.tasks.dynamic.test_volume_scene import blob
+from tests.tasks.dynamic.sequences import blob
 
 SMALL = ["scene.size=24", "scene.cameras=6", "scene.samples=1", "model.primitives=60", "model.neurons=2", "train.max_seconds=null"]
 

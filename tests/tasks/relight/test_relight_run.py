@@ -15,8 +15,9 @@ from neuprim.cli import main
 from neuprim.config import compose
 from neuprim.core.errors import ConfigError
 from neuprim.core.images import write_exr
-from neuprim.evaluate import render_run
-from neuprim.run import run
+from neuprim.evaluate import load_dataset, load_run, render_run
+from neuprim.plugins.registry import load_task
+from neuprim.run import make_trainer, run
 from tests.reports import offered
 
 SCENE = ["task=relight", "scene=lit_solids", "scene.size=32", "scene.train_views=24", "scene.test_views=6", "scene.supersampling=1"]
@@ -84,18 +85,28 @@ def test_light_from_all_around(finished: Path, tmp_path: Path, capsys: pytest.Ca
 
 
 @pytest.mark.parametrize(
-    "words",
+    ("words", "colour"),
     [
-        ["model.colour.form=multiplicative"],
-        ["model.colour.form=harmonics", "model.colour.degree=3"],
-        ["model.colour.visibility=none", "task.options.loss=compressed"],
-        ["model.colour.hidden=0", "task.options.loss=relative"],
-        ["preset=paper", "train.population.every=5"],
+        (["model.colour.form=multiplicative"], {"form": "multiplicative", "hidden": 3, "visibility": "primitive"}),
+        (["model.colour.form=harmonics", "model.colour.degree=3"], {"degree": 3}),
+        (["model.colour.visibility=none", "task.options.loss=compressed"], {"form": "additive", "hidden": 3, "visibility": "none"}),
+        (["model.colour.hidden=0", "task.options.loss=relative"], {"form": "additive", "hidden": 0, "visibility": "primitive"}),
+        (["preset=paper", "train.population.every=5"], {"form": "additive", "hidden": 3, "visibility": "none"}),
     ],
 )
-def test_every_variant_runs(tmp_path: Path, words: list[str]) -> None:
+def test_every_variant_runs(tmp_path: Path, words: list[str], colour: dict[str, object]) -> None:
+    """To the end: the model on disk is what was asked for, has moved from where it started, and was measured."""
     small = [w for w in SMALL if not (w.startswith("model.colour") and "harmonics" in str(words))]
-    assert run(compose([*SCENE, *small, *words, "train.iterations=8", f"output_dir='{tmp_path / 'run'}'"]), Console(quiet=True))
+    config = compose([*SCENE, *small, *words, "train.iterations=8", f"output_dir='{tmp_path / 'run'}'"])
+    task = load_task("relight")
+    start = make_trainer(config, task, load_dataset(config, task)).model
+    m = json.loads((run(config, Console(quiet=True)) / "metrics.json").read_text())
+    assert m["iterations"] == 8 and len(m["per_view"]) == 6 and m["psnr_linear_clamped"] > 5
+    end = load_run(tmp_path / "run")[2]
+    assert colour.items() <= end.colour.settings().items()
+    for name in end.params:
+        changed = not torch.equal(start.params[name], end.params[name])
+        assert changed == (end.params[name].numel() > 0), name
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def test_bad_names_write_nothing(name: str, tmp_path: Path, monkeypatch: pytest.
 def test_a_taken_name_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["new-task", "static"]) == 2
-    assert "new-task static: neuprim 0.1.0 already has a task of this name" in capsys.readouterr().err
+    assert f"new-task static: neuprim {neuprim.__version__} already has a task of this name" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neuprim.core.cosine import CosineDensity
-from neuprim.core.density_grid import density_at, density_grid, lattice
-from neuprim.core.primitives import Primitives
-from neuprim.core.render.cpu.threads import core_count
-from neuprim.core.schema import InitContext
+from neuprim.core.compute.threads import core_count
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import InitContext
+from neuprim.core.volumes.grid import density_at, density_grid, lattice
 from neuprim.tasks.static.fields import SphericalHarmonics
 
 
@@ -48,7 +48,7 @@ def main() -> None:
     args = parser.parse_args()
     conditions = {"time": torch.tensor(args.time)}
     if args.run_dir:
-        from neuprim.evaluate import load_run
+        from neuprim.runs.draw import load_run
 
         model = load_run(args.run_dir)[2]
     else:

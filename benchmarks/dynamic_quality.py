@@ -32,12 +32,12 @@ from static_quality import cpu_name, spread
 from tables import ROOT, between_markers
 
 from neuprim.config import compose
-from neuprim.core.render.cpu.threads import core_count
+from neuprim.core.compute.threads import core_count
 from neuprim.core.train.trainer import Trainer
-from neuprim.evaluate import load_dataset
-from neuprim.measure import draw
 from neuprim.plugins.registry import load_task
-from neuprim.run import make_trainer, warm_up
+from neuprim.runs.draw import load_dataset
+from neuprim.runs.fit import make_trainer, warm_up
+from neuprim.runs.measure import draw
 
 RESULTS = Path(__file__).parent / "results" / "dynamic_quality.json"
 COLOUR = ("model.colour.powers=4", "model.colour.waves=4")

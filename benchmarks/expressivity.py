@@ -33,10 +33,10 @@ from tables import between_markers
 from neuprim.config import compose
 from neuprim.core.channels import channels_of
 from neuprim.core.checkpoint import save_model
-from neuprim.evaluate import load_dataset
-from neuprim.measure import measure, summary
 from neuprim.plugins.registry import load_task
-from neuprim.run import make_trainer
+from neuprim.runs.draw import load_dataset
+from neuprim.runs.fit import make_trainer
+from neuprim.runs.measure import measure, summary
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "expressivity.json"

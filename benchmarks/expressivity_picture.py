@@ -20,15 +20,15 @@ from torch import Tensor
 
 from neuprim.core.channels import Channels
 from neuprim.core.data import Dataset, View
-from neuprim.core.fields import Constant
-from neuprim.core.gaussian import GaussianDensity
-from neuprim.core.geometry import Geometry
-from neuprim.core.primitives import Lowered, Primitives
+from neuprim.core.model.densities.gaussian import GaussianDensity
+from neuprim.core.model.fields import Constant
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render import render_lowered
-from neuprim.core.render.reference import pixel_directions
-from neuprim.evaluate import load_dataset, load_run
-from neuprim.measure import draw
+from neuprim.core.render.reference.backend import pixel_directions
 from neuprim.report.pictures import ERROR_SCALE
+from neuprim.runs.draw import load_dataset, load_run
+from neuprim.runs.measure import draw
 
 SIZE = 200
 """Pixels on a side of every panel; chair_200's own size, and what solids is ray-cast at for the truth."""

@@ -7,8 +7,8 @@ from typing import Any
 from neuprim.config import RunConfig
 from neuprim.core.channels import channels_of
 from neuprim.core.train.trainer import Trainer
-from neuprim.measure import measure, summary
 from neuprim.plugins.registry import load_task
+from neuprim.runs.measure import measure, summary
 
 __all__ = ["finish"]
 

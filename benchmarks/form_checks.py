@@ -2,7 +2,7 @@
 
     python benchmarks/form_checks.py [--primitives 5000] [--size 200] [--steps 60]
 
-Every function of neuprim.core.forms that a step calls is timed in the steps themselves, so both times come from one process and one
+Every function of neuprim.core.model.checks that a step calls is timed in the steps themselves, so both times come from one process and one
 mood of the machine; the clock's own cost counts as the checks'. Exits with an error where the share reaches --most (1 %).
 """
 
@@ -18,15 +18,18 @@ from typing import Any
 
 import torch
 
-from neuprim.core import forms, primitives, render, sh
-from neuprim.core.cosine import CosineDensity
+from neuprim.conformance.example import Example
+from neuprim.core import render
 from neuprim.core.data import Pixels
-from neuprim.core.fields import ColourField, DensityField
+from neuprim.core.model import checks as forms
+from neuprim.core.model import primitives
+from neuprim.core.model.colours import sh
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.train import population
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer, initial_model
-from neuprim.plugins.conformance.example import Example
 from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity

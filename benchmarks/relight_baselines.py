@@ -12,7 +12,7 @@ import time
 
 from tables import ROOT, Table, between_markers
 
-from neuprim.core.files import cache_directory
+from neuprim.core.io.files import cache_directory
 from neuprim.core.task import SceneContext
 from neuprim.tasks.relight.data import bright
 from neuprim.tasks.relight.lit import load

@@ -27,11 +27,11 @@ from neuprim.core.cameras import Camera
 from neuprim.core.channels import Channels
 from neuprim.core.data import View
 from neuprim.core.environment import Environment
-from neuprim.core.images import write_exr, write_png
+from neuprim.core.io.images import write_exr, write_png
 from neuprim.core.metrics import psnr
-from neuprim.core.solids.raycast import Scene
-from neuprim.evaluate import load_dataset, load_run
-from neuprim.measure import draw_sum
+from neuprim.runs.draw import load_dataset, load_run
+from neuprim.runs.measure import draw_sum
+from neuprim.scenes.raycast import Scene
 from neuprim.tasks.relight.environment import illuminate
 from neuprim.tasks.relight.lit.generate import INTENSITY, picture
 from neuprim.tasks.relight.lit.scene import solids

@@ -28,13 +28,13 @@ from static_quality import cpu_name
 from tables import PERFORMANCE, Table, between_markers
 
 from neuprim.core.cameras import Camera
-from neuprim.core.fields import Constant, Cosine
-from neuprim.core.geometry import Geometry
-from neuprim.core.primitives import Lowered
+from neuprim.core.model.fields import Constant, Cosine
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.schema import ParameterSpec
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.cpu import layout
 from neuprim.core.render.cpu.layout import SPAN_WIDTH, gradient_width, row_width
-from neuprim.core.schema import ParameterSpec
 from neuprim.core.train.optimizer import RowAdam
 
 RESULTS = Path(__file__).parent / "results" / "render.json"

@@ -24,9 +24,9 @@ from render import lower, random_scene, view
 from static_quality import cpu_name
 from tables import PERFORMANCE, Table, between_markers
 
-from neuprim.core.primitives import Lowered
+from neuprim.core.compute.threads import core_count
+from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.cpu.threads import core_count
 
 HERE = Path(__file__).parent
 RESULTS, PICTURE = HERE / "results" / "scaling.json", HERE.parent / "docs" / "pictures" / "scaling.png"

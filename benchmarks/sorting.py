@@ -25,7 +25,7 @@ from tables import PERFORMANCE, Table, between_markers
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.primitives import Lowered
+from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.joint import sorting_errors
 
@@ -40,7 +40,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 def from_run(folder: Path, index: int) -> tuple[str, tuple[Lowered, Camera, Tensor]]:
     """The model of a finished run, as leaves that take gradients, one of its test cameras, and its background; named."""
-    from neuprim.evaluate import load_dataset, load_run
+    from neuprim.runs.draw import load_dataset, load_run
 
     config, task, model, _ = load_run(folder)
     dataset = load_dataset(config, task)

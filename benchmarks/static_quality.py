@@ -76,7 +76,7 @@ def main() -> None:
     parser.add_argument("--readme", action="store_true", help="write the recorded table into README.md")
     args = parser.parse_args()
     if args.scene:
-        from neuprim.core.render.cpu.threads import core_count
+        from neuprim.core.compute.threads import core_count
 
         results: dict[str, Any] = {"cpu": cpu_name(), "cores": core_count(), "seeds": args.seeds, "rows": []}
         if args.keep:

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from neuprim.core.vdb import read_grids, read_header
+from neuprim.core.io.vdb import read_grids, read_header
 
 
 def leaves(path: Path, names: list[str]) -> int:

@@ -20,9 +20,9 @@ import torch
 
 import neuprim
 from neuprim.core.cameras import look_at
-from neuprim.core.cosine import OMEGA0, cosine_density
-from neuprim.core.fields import Cosine
-from neuprim.core.geometry import Geometry
+from neuprim.core.model.densities.cosine import OMEGA0, cosine_density
+from neuprim.core.model.fields import Cosine
+from neuprim.core.model.geometry import Geometry
 
 
 def primitive() -> tuple[Geometry, Cosine]:

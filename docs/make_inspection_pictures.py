@@ -12,7 +12,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from neuprim.inspecting import Request, inspect_run
+from neuprim.runs.inspect import Request, inspect_run
 
 FOLDER = Path(__file__).parent / "pictures"
 PICTURES = {

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, check_viewmat
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, NonFiniteError, nearest
-from neuprim.core.fields import Constant, Cosine
-from neuprim.core.forms import Sizes, misfit, tensor_fault
-from neuprim.core.geometry import Geometry
-from neuprim.core.primitives import Lowered
+from neuprim.core.model.checks import Sizes, misfit, tensor_fault
+from neuprim.core.model.fields import Constant, Cosine
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, RenderStats, render_lowered
 
 __all__ = ["Rasterized", "rasterize"]

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.fields import Constant, Cosine, LoweredColour, RayNet
-from neuprim.core.geometry import Geometry
-from neuprim.core.primitives import Lowered
+from neuprim.core.model.fields import Constant, Cosine, LoweredColour, RayNet
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Lowered
 
 
 def camera(width: int = 64, height: int = 48, distance: float = 3.0, fov: float = 40.0, shift: tuple[float, float] = (0.0, 0.0)) -> Camera:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-import neuprim.run as running
+import neuprim.runs.fit as running
 from neuprim.config import compose
 
 STEPS = 240

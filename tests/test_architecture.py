@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import neuprim
-from neuprim.core.schema import ParameterSpec
+from neuprim.core.model.schema import ParameterSpec
 
 ROOT = Path(neuprim.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
@@ -60,13 +60,13 @@ def test_core_knows_no_task_plugin_or_command() -> None:
 def test_tasks_know_no_command_plugin_or_other_task() -> None:
     above = (
         "neuprim.cli",
-        "neuprim.run",
-        "neuprim.evaluate",
+        "neuprim.runs.fit",
+        "neuprim.runs.draw",
         "neuprim.report",
         "neuprim.config",
         "neuprim.plugins",
-        "neuprim.doctor",
-        "neuprim.progress",
+        "neuprim.cli.doctor",
+        "neuprim.cli.progress",
     )
     for task in sorted(p.name for p in (ROOT / "tasks").iterdir() if (p / "__init__.py").exists()):
         others = tuple(f"neuprim.tasks.{p.name}" for p in (ROOT / "tasks").iterdir() if p.is_dir() and p.name != task)
@@ -76,12 +76,12 @@ def test_tasks_know_no_command_plugin_or_other_task() -> None:
 def test_formats_and_inspectors_know_no_command() -> None:
     above = (
         "neuprim.cli",
-        "neuprim.run",
-        "neuprim.evaluate",
+        "neuprim.runs.fit",
+        "neuprim.runs.draw",
         "neuprim.report",
-        "neuprim.exporting",
-        "neuprim.inspecting",
-        "neuprim.trained",
+        "neuprim.runs.export",
+        "neuprim.runs.inspect",
+        "neuprim.runs.open",
     )
     for folder in ("plugins/export", "plugins/inspect"):
         assert offences(folder, above) == []

@@ -92,7 +92,7 @@ def test_a_failing_combination_does_not_lose_the_others(
             raise NonFiniteError("w2 of primitive 3")
         return config.output_dir
 
-    monkeypatch.setattr(sys.modules["neuprim.run"], "run", run)
+    monkeypatch.setattr(sys.modules["neuprim.runs.fit"], "run", run)
     assert main(["run", "task=toy", "-m", "seed=1,2"]) == 2
     assert ran == [1, 2]
     assert capsys.readouterr().err == "neuprim: error: outputs/toy-ball-sweep/seed-1: w2 of primitive 3\n"
@@ -137,7 +137,7 @@ def test_errors_of_many_lines_become_one(calls: list[Any], capsys: pytest.Captur
     def run(config: RunConfig) -> Path:
         raise DataError("missing images:\n  a.png\n  b.png")
 
-    monkeypatch.setattr(sys.modules["neuprim.run"], "run", run)
+    monkeypatch.setattr(sys.modules["neuprim.runs.fit"], "run", run)
     assert main(["run", "task=toy"]) == 2
     assert error_line(capsys) == "neuprim: error: missing images: a.png b.png\n"
 
@@ -149,9 +149,9 @@ def test_interrupt_is_130_and_a_bug_keeps_its_traceback(calls: list[Any], monkey
     def bug(config: RunConfig) -> Path:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(sys.modules["neuprim.run"], "run", stop)
+    monkeypatch.setattr(sys.modules["neuprim.runs.fit"], "run", stop)
     assert main(["run", "task=toy"]) == 130
-    monkeypatch.setattr(sys.modules["neuprim.run"], "run", bug)
+    monkeypatch.setattr(sys.modules["neuprim.runs.fit"], "run", bug)
     with pytest.raises(ZeroDivisionError):
         main(["run", "task=toy"])
 
@@ -169,7 +169,7 @@ def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
         started.append(config)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(sys.modules["neuprim.run"], "run", stop)
+    monkeypatch.setattr(sys.modules["neuprim.runs.fit"], "run", stop)
     nasty = "it's a=b, $c"
     quoted = "output_dir='it\\'s a=b, $c'"
     for words, where, there in (
@@ -201,7 +201,7 @@ def test_a_disk_that_refuses_is_no_bug(calls: list[Any], capsys: pytest.CaptureF
     def full(config: RunConfig) -> Path:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(sys.modules["neuprim.run"], "run", full)
+    monkeypatch.setattr(sys.modules["neuprim.runs.fit"], "run", full)
     assert main(["run", "task=toy"]) == 2
     assert error_line(capsys) == "neuprim: error: writing: No space left on device\n"
 

@@ -11,9 +11,9 @@ import pytest
 from rich.console import Console
 
 import neuprim
-from neuprim.console import plain_console
+from neuprim.cli.console import plain_console
+from neuprim.cli.progress import DrawProgress, RunProgress
 from neuprim.core.train.trainer import StepReport
-from neuprim.progress import DrawProgress, RunProgress
 
 ODD = "pip install 'neuprim[video]' [bold]loud[/bold] [/] :smile: C:dir:x"
 """Markup that would vanish, a closing tag that would raise, an emoji's name."""

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 import neuprim.core.render as rendering
-from neuprim import doctor
+from neuprim.cli import doctor
 from neuprim.core.render import BACKENDS
 
 

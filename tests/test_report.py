@@ -17,8 +17,8 @@ import torch
 from PIL import Image
 
 from neuprim.core.errors import DataError
-from neuprim.core.fields import ConditionSpec
 from neuprim.core.metrics import psnr, ssim, to_json
+from neuprim.core.model.fields import ConditionSpec
 from neuprim.report import error_map, write_report
 from neuprim.report.record import read_run
 from tests.reports import offered

@@ -18,15 +18,15 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-import neuprim.run as running
+import neuprim.runs.fit as running
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint
 from neuprim.core.data import Clip
-from neuprim.core.datasets.common import PosedImages
+from neuprim.core.data.common import PosedImages
 from neuprim.core.errors import CheckpointError, DataError, NonFiniteError
 from neuprim.core.train.trainer import StepReport, Trainer
-from neuprim.evaluate import evaluate_run, read_metrics, render_run
-from neuprim.measure import measure
+from neuprim.runs.draw import evaluate_run, read_metrics, render_run
+from neuprim.runs.measure import measure
 from tests.core import tiny
 from tests.short_runs import STEPS, fit, words
 

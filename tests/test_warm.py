@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from neuprim import warm
 from neuprim.core.train import optimizer
+from neuprim.runs import warm
 from tests import kernels
 
 

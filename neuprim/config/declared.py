@@ -9,7 +9,7 @@ from neuprim.config.overrides import Assignment
 from neuprim.config.record import RunSettings
 from neuprim.config.schema import like, setting_names
 from neuprim.core.errors import ConfigError, nearest
-from neuprim.core.geometry import GEOMETRY_SPECS
+from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.uses import OPTIONAL
 
 if TYPE_CHECKING:

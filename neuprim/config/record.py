@@ -12,7 +12,7 @@ import yaml
 
 from neuprim.config.schema import build
 from neuprim.core.errors import CheckpointError, ConfigError, nearest
-from neuprim.core.render.settings import RenderSettings
+from neuprim.core.settings import RenderSettings
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.uses import OPTIONAL
 from neuprim.plugins.names import split

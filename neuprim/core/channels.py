@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from neuprim.core.channel_names import default_names, names_fault
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
-from neuprim.core.images import linear_to_srgb
+from neuprim.core.io.channel_names import default_names, names_fault
+from neuprim.core.io.images import linear_to_srgb
 
 if TYPE_CHECKING:
     from neuprim.core.data import Dataset

@@ -16,9 +16,9 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from neuprim.core.errors import CheckpointError, nearest
-from neuprim.core.fields import ColourField, DensityField
-from neuprim.core.files import atomic_path
-from neuprim.core.primitives import Primitives
+from neuprim.core.io.files import atomic_path
+from neuprim.core.model.fields import ColourField, DensityField
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 
 __all__ = ["FORMAT", "load_model", "read", "read_header", "save_model", "write"]

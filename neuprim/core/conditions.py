@@ -2,7 +2,7 @@
 
 A condition is given as ``--NAME TEXT``, ``--NAME=TEXT`` or ``NAME=TEXT``, with ``-`` or ``_`` inside its name. For a condition that is
 one number the text may be a number, a list ``A,B,C`` of them, ``FIRST:LAST`` or ``FIRST:LAST:COUNT``, one frame each; what one number
-is, the task's own :attr:`ConditionSpec.parse <neuprim.core.fields.ConditionSpec>` says. The text of any other condition is the task's
+is, the task's own :attr:`ConditionSpec.parse <neuprim.core.model.fields.ConditionSpec>` says. The text of any other condition is the task's
 altogether, as ``x,y,z`` or ``orbit`` for a light.
 
 Values are held against the condition's range here, so that no command and no exporter can forget to.
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError, NeuprimError
-from neuprim.core.fields import ConditionSpec
+from neuprim.core.model.fields import ConditionSpec
 
 __all__ = ["FRAMES", "Warn", "export_frames", "flag", "named", "read_conditions", "split_words"]
 

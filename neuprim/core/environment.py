@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.images import image_info, read_image, srgb_to_linear
+from neuprim.core.io.images import image_info, read_image, srgb_to_linear
 
 __all__ = ["MAX_LIGHTS", "Beams", "Environment", "EnvironmentFile", "Illumination", "read_environment"]
 
@@ -157,7 +157,7 @@ def read_environment(path: Path, up: Tensor | None = None, rotation: float = 0.0
         scale: multiplies the radiance.
 
     Raises:
-        DataError: as :func:`neuprim.core.images.read_image`, and for another shape than 2:1 or negative values.
+        DataError: as :func:`neuprim.core.io.images.read_image`, and for another shape than 2:1 or negative values.
     """
     info = image_info(path)
     if info.width != 2 * info.height:

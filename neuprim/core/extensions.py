@@ -19,10 +19,10 @@ from neuprim.core.channels import Channels, stored_channels
 from neuprim.core.conditions import export_frames
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
-from neuprim.core.primitives import Primitives
-from neuprim.core.render.settings import RenderSettings
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.settings import RenderSettings
 from neuprim.core.task import Loss, SceneSpec, TaskSpec
-from neuprim.core.volume_source import VolumeSource
+from neuprim.core.volumes.source import VolumeSource
 
 __all__ = ["Exporter", "ExportJob", "ExportReport", "Inspector", "LossExtension", "SceneExtension", "StoredModel", "TrainedModel"]
 

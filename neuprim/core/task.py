@@ -12,8 +12,8 @@ from torch import Tensor
 from neuprim.core.channels import Display
 from neuprim.core.data import Dataset, View
 from neuprim.core.environment import Environment, Illumination
-from neuprim.core.fields import ColourField, ConditionSpec, DensityField, Field
-from neuprim.core.volume_source import VolumeSource
+from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField, Field
+from neuprim.core.volumes.source import VolumeSource
 
 __all__ = ["API_VERSION", "Illuminate", "Loss", "SceneContext", "SceneSpec", "Supervision", "TaskSpec"]
 
@@ -111,7 +111,7 @@ class TaskSpec:
     fields: Mapping[str, type[Field]] | None = None
     """Class name -> field class, so that a saved model can be rebuilt from its header."""
     example: Callable[[], Dataset] | None = None
-    """A tiny data set, made in memory, that the checks of :mod:`neuprim.plugins.conformance` use in place of their own: for tasks
+    """A tiny data set, made in memory, that the checks of :mod:`neuprim.conformance` use in place of their own: for tasks
     whose fields ask for something beside posed images and conditions within their ranges. Images of about 10 x 10 pixels will do."""
     environment: Illuminate | None = None
     channels: tuple[str, ...] = ()

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from neuprim.core.data_check import DatasetFault
+from neuprim.core.data.check import DatasetFault
 from neuprim.core.errors import DataError, NeuprimError
 from neuprim.plugins.mechanism import Group, PluginError, PluginInfo
 from neuprim.plugins.names import normalised, split
@@ -104,7 +104,7 @@ class Suspects:
     def watch(self, folder: Path | None = None) -> _Watch:
         """Around neuprim's own code that calls plugins here and there: whose code a crash is in is read off the traceback.
 
-        A :class:`~neuprim.core.data_check.DatasetFault` becomes a DataError that names the scene's package.
+        A :class:`~neuprim.core.data.check.DatasetFault` becomes a DataError that names the scene's package.
         """
         return _Watch(self, folder)
 

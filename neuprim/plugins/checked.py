@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from neuprim.core.data import Dataset
-from neuprim.core.fields import ColourField, DensityField
+from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.task import Loss, Supervision
 from neuprim.plugins.blame import blamed
 from neuprim.plugins.mechanism import PluginError
@@ -23,7 +23,7 @@ def check_fields(density: object, colour: object, dataset: Dataset, where: str) 
     """
     for name, made, kind in (("density", density, DensityField), ("colour", colour, ColourField)):
         if not isinstance(made, kind):
-            raise PluginError(f"{where}: the {name} is of type {type(made).__name__}; expected a neuprim.core.fields.{kind.__name__}")
+            raise PluginError(f"{where}: the {name} is of type {type(made).__name__}; expected a neuprim.core.model.fields.{kind.__name__}")
     channels = getattr(colour, "channels", None)
     if channels != dataset.channels:
         raise PluginError(f"{where}: the colour has channels={channels}; expected {dataset.channels}, as data set {dataset.name!r} has")

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Any
 
-from neuprim.core.channel_names import names_fault
 from neuprim.core.extensions import Exporter, Inspector, LossExtension, SceneExtension
-from neuprim.core.fields import ConditionSpec, Field
+from neuprim.core.io.channel_names import names_fault
+from neuprim.core.model.fields import ConditionSpec, Field
 from neuprim.core.task import SceneSpec, TaskSpec
 from neuprim.core.uses import OPTIONAL
 
@@ -97,7 +97,7 @@ def _task(spec: TaskSpec) -> str | None:
         return f"fields is of type {type(spec.fields).__name__}; expected a mapping of class names to classes"
     for name, field in (spec.fields or {}).items():
         if not isinstance(field, type) or not issubclass(field, Field):
-            return f"fields[{name!r}] is {field!r}; expected a subclass of neuprim.core.fields.Field"
+            return f"fields[{name!r}] is {field!r}; expected a subclass of neuprim.core.model.fields.Field"
         if inspect.isabstract(field):
             lacking = ", ".join(sorted(field.__abstractmethods__))
             return f"fields[{name!r}] lacks the methods {lacking}"

@@ -7,8 +7,8 @@ from importlib.resources import files
 from pathlib import Path
 from string import Template
 
-from neuprim.core.fields import ConditionSpec
-from neuprim.core.files import write_text
+from neuprim.core.io.files import write_text
+from neuprim.core.model.fields import ConditionSpec
 from neuprim.report import sections
 from neuprim.report.record import RunRecord, read_run
 from neuprim.report.text import escape

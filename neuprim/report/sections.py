@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from neuprim.core.conditions import flag
-from neuprim.core.fields import ConditionSpec
 from neuprim.core.metrics import from_json
+from neuprim.core.model.fields import ConditionSpec
 from neuprim.report.curves import curve, dots, series
 from neuprim.report.pictures import ERROR_SCALE, Inlined, color_bar, inline
 from neuprim.report.record import RunRecord, ViewFiles, number, per_view

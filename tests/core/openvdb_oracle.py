@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from neuprim.core.vdb import Grid, read_grids, read_header
+from neuprim.core.io.vdb import Grid, read_grids, read_header
 
 SCRIPT = Path(__file__).with_name("openvdb_side.py")
 VARIABLE = "NEUPRIM_OPENVDB_PYTHON"

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
-import neuprim.run as running
+import neuprim.runs.fit as running
 from neuprim.core import checkpoint
 from neuprim.core.cameras import Camera
-from neuprim.core.cosine import CosineDensity
 from neuprim.core.data import Pixels, PointCloud
 from neuprim.core.errors import NonFiniteError
+from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.render import RenderSettings
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from neuprim.core.camera_file import read_cameras
+from neuprim.core.cameras.file import read_cameras
 from neuprim.core.errors import DataError
 
 POSE = [[1.0, 0.0, 0.0, 0.5], [0.0, 0.0, -1.0, -4.0], [0.0, 1.0, 0.0, 0.25], [0.0, 0.0, 0.0, 1.0]]  # at (0.5, -4, 0.25), looking along +y

@@ -12,10 +12,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core import images
-from neuprim.core.channel_names import default_names, names_fault
 from neuprim.core.channels import Channels, channels_of, stored_channels
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
+from neuprim.core.io import images
+from neuprim.core.io.channel_names import default_names, names_fault
 from neuprim.tasks.static import TASK
 from tests.core import tiny
 

@@ -18,9 +18,9 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from neuprim.core import checkpoint
-from neuprim.core.cosine import CosineDensity
 from neuprim.core.errors import CheckpointError
-from neuprim.core.primitives import Primitives
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.tasks.static import TASK
 from neuprim.tasks.static.fields import SphericalHarmonics

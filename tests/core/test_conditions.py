@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neuprim.core.conditions import FRAMES, export_frames, flag, named, read_conditions, split_words
 from neuprim.core.errors import ConfigError
-from neuprim.core.fields import ConditionSpec
+from neuprim.core.model.fields import ConditionSpec
 
 
 def number(text: str) -> list[Tensor]:

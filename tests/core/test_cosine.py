@@ -11,13 +11,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.cosine import CosineDensity
-from neuprim.core.fields import Cosine
-from neuprim.core.geometry import Geometry, quaternion_to_matrix
-from neuprim.core.primitives import Primitives
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.fields import Cosine
+from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.reference import pixel_directions
-from neuprim.core.schema import InitContext
+from neuprim.core.render.reference.backend import pixel_directions
 from neuprim.core.train.population import split
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes

@@ -10,13 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.cosine import cosine_density
+from neuprim.conformance.integrals import chords, inside, line_integral
 from neuprim.core.errors import FormError
-from neuprim.core.fields import MOST_UNITS, Cosine, Opaque
-from neuprim.core.geometry import Geometry
-from neuprim.core.primitives import Lowered
+from neuprim.core.model.densities.cosine import cosine_density
+from neuprim.core.model.fields import MOST_UNITS, Cosine, Opaque
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.plugins.conformance.integrals import chords, inside, line_integral
 from tests import scenes
 
 COUNT = 12

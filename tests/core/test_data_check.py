@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cosine import CosineDensity
+from neuprim.core.cameras.rays import RayCamera
 from neuprim.core.data import PointCloud
-from neuprim.core.data_check import DatasetFault, check_dataset, check_mask, check_pixels, check_points
+from neuprim.core.data.check import DatasetFault, check_dataset, check_mask, check_pixels, check_points
 from neuprim.core.errors import ConfigError
-from neuprim.core.fields import ConditionSpec
-from neuprim.core.ray_cameras import RayCamera
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.train.settings import ModelSettings
 from neuprim.core.train.trainer import initial_model
 from neuprim.tasks.static.fields import SphericalHarmonics

@@ -7,13 +7,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.cosine import CosineDensity
-from neuprim.core.density_grid import agreement, density_at, density_grid
 from neuprim.core.errors import ConfigError
-from neuprim.core.gaussian import GaussianDensity
-from neuprim.core.geometry import Geometry
-from neuprim.core.primitives import Primitives
-from neuprim.core.schema import InitContext
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.densities.gaussian import GaussianDensity
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import InitContext
+from neuprim.core.volumes.grid import agreement, density_at, density_grid
 from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
@@ -89,7 +89,7 @@ def test_a_density_in_torch_code_is_asked_point_by_point(monkeypatch: pytest.Mon
     assert float(expected.max()) > 0.1
     whole = density_grid(m, {}, matrix, SHAPE)
     assert torch.allclose(whole.double(), expected, rtol=1e-5, atol=1e-6)
-    monkeypatch.setattr("neuprim.core.density_grid._PAIRS", 20)  # blocks of single planes
+    monkeypatch.setattr("neuprim.core.volumes.grid._PAIRS", 20)  # blocks of single planes
     assert torch.equal(density_grid(m, {}, matrix, SHAPE, threads=2), whole)
 
 

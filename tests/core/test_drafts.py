@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from neuprim.core.drafts import drafted, refuse_taken
 from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.io.drafts import drafted, refuse_taken
 
 
 def tree(folder: Path) -> dict[str, str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from neuprim.core.files import publish_folder
+from neuprim.core.io.files import publish_folder
 
 
 def write(folder: Path) -> None:

@@ -12,16 +12,16 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-import neuprim.run as running
+import neuprim.runs.fit as running
 from neuprim.config import compose
 from neuprim.core import checkpoint
 from neuprim.core.errors import BackendUnavailable, CheckpointError, ConfigError
-from neuprim.core.fields import Opaque
-from neuprim.core.gaussian import GaussianDensity, bell_integral
-from neuprim.core.geometry import Geometry
-from neuprim.core.primitives import Primitives
+from neuprim.core.model.densities.gaussian import GaussianDensity, bell_integral
+from neuprim.core.model.fields import Opaque
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.schema import InitContext
 from neuprim.core.train.population import Gradient, Relocate, split
 from neuprim.core.train.settings import PopulationSettings
 from neuprim.tasks.static import TASK

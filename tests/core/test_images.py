@@ -13,8 +13,8 @@ import pytest
 import torch
 from PIL import Image
 
-from neuprim.core import images
 from neuprim.core.errors import DataError
+from neuprim.core.io import images
 
 
 def noise(*shape: int) -> np.ndarray:

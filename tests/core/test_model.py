@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 import torch
 
-from neuprim.core.cosine import CosineDensity
 from neuprim.core.errors import FormError, NonFiniteError
-from neuprim.core.geometry import GEOMETRY_SPECS, Geometry, quaternion_to_matrix
-from neuprim.core.primitives import Primitives
-from neuprim.core.schema import InitContext, ParameterSpec
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry, quaternion_to_matrix
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import InitContext, ParameterSpec
 from neuprim.tasks.static.fields import SphericalHarmonics
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.schema import ParameterSpec
+from neuprim.core.model.schema import ParameterSpec
 from neuprim.core.train.optimizer import RowAdam, adam_step_reference
 
 SPECS = tuple(

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from neuprim.core.errors import DataError
-from neuprim.core.ply import read_ply, write_ply
+from neuprim.core.io.ply import read_ply, write_ply
 
 ROWS = np.array([(1.5, -2, 250, 1e-300), (np.float32(0.1), 7, 3, 2.5)], [("x", "<f4"), ("count", "<i2"), ("red", "|u1"), ("mass", "<f8")])
 

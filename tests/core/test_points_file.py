@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from neuprim.core import sh
-from neuprim.core.cosine import CosineDensity
-from neuprim.core.datasets.points_file import read_points
+from neuprim.core.data.points_file import read_points
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.geometry import Geometry
-from neuprim.core.ply import write_ply
-from neuprim.core.primitives import Primitives
+from neuprim.core.io.ply import write_ply
+from neuprim.core.model.colours import sh
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.settings import ModelSettings
 from neuprim.core.train.trainer import initial_model
 from neuprim.tasks.static.fields import SphericalHarmonics

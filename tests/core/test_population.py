@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.cosine import CosineDensity
 from neuprim.core.errors import FormError
-from neuprim.core.geometry import Geometry
-from neuprim.core.primitives import Primitives
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import RenderStats
 from neuprim.core.train.population import (
     SPLIT_GAUSSIAN,

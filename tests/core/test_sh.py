@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from neuprim.core import sh
-from neuprim.core.cosine import CosineDensity
-from neuprim.core.fields import Constant
-from neuprim.core.primitives import Primitives
-from neuprim.core.schema import InitContext
+from neuprim.core.model.colours import sh
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.fields import Constant
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import InitContext
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
 

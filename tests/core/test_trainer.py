@@ -18,7 +18,7 @@ from neuprim.core.metrics import psnr
 from neuprim.core.task import Supervision
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer, initial_model
-from neuprim.measure import draw
+from neuprim.runs.measure import draw
 from tests.core import tiny
 
 

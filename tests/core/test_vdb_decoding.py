@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from neuprim.core.vdb import read_grid, read_grids, read_header
+from neuprim.core.io.vdb import read_grid, read_grids, read_header
 from tests.core.vdb_bytes import LEAF_CORNER, bits, file_head, grid_bytes, one_grid, one_leaf, refused, text
 
 RNG = np.random.default_rng(11)

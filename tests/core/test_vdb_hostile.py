@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neuprim.core.vdb import read_grid, read_header
+from neuprim.core.io.vdb import read_grid, read_header
 from tests.core.vdb_bytes import (
     bits,
     file_head,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neuprim.core.vdb import Grid, Tiles, read_grids, scale_transform, write_vdb
+from neuprim.core.io.vdb import Grid, Tiles, read_grids, scale_transform, write_vdb
 from tests.core.openvdb_oracle import VARIABLE, ask, chosen, compare, other_python, reason
 from tests.core.vdb_bytes import random_grid
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neuprim.core.vdb import Grid, read_grid, read_header, sequence, write_vdb
+from neuprim.core.io.vdb import Grid, read_grid, read_header, sequence, write_vdb
 from tests.core.vdb_bytes import real_folder, refused, same
 
 FOLDERS = {"embergen_fire_a": 2, "mantaflow_smoke": 21, "vdb_samples": 1}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from neuprim.core.errors import DataError
-from neuprim.core.vdb import Grid, Tiles, read_grid, read_header, scale_transform, write_vdb
+from neuprim.core.io.vdb import Grid, Tiles, read_grid, read_header, scale_transform, write_vdb
 from tests.core.vdb_bytes import random_grid, refused, same
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from neuprim.cli import main
-from neuprim.core.vdb import Grid, scale_transform, sequence, write_vdb
+from neuprim.core.io.vdb import Grid, scale_transform, sequence, write_vdb
 from tests.core.vdb_bytes import one_grid, one_leaf, refused
 
 

@@ -13,11 +13,11 @@ from PIL import Image
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.cosine import CosineDensity
 from neuprim.core.data import Dataset, Pixels, PointCloud, View, ViewSet, camera_extent
-from neuprim.core.fields import Constant, Cosine
-from neuprim.core.geometry import Geometry
-from neuprim.core.primitives import Lowered
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.fields import Constant, Cosine
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings

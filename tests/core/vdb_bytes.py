@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from neuprim.core.errors import NeuprimError
-from neuprim.core.vdb import Grid, Tiles, read_grid, read_header, scale_transform, write_vdb
+from neuprim.core.io.vdb import Grid, Tiles, read_grid, read_header, scale_transform, write_vdb
 
 LEAF_CORNER = (8, 0, 16)
 

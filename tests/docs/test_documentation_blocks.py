@@ -16,13 +16,13 @@ from rich.console import Console
 
 from neuprim.cli import _parsers
 from neuprim.config import compose, compose_all
-from neuprim.core.camera_file import read_cameras
+from neuprim.core.cameras.file import read_cameras
 from neuprim.core.conditions import read_conditions, split_words
 from neuprim.core.errors import NeuprimError
-from neuprim.core.fields import ConditionSpec
-from neuprim.core.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.model.fields import ConditionSpec
 from neuprim.plugins.registry import load_exporter, survey
-from neuprim.run import run
+from neuprim.runs.fit import run
 from tests.docs.pages import PAGES, ROOT, Block, blocks, commands, name_of
 
 NOT_RUN: dict[str, int] = {}

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.fields import OpaqueColour
+from neuprim.core.model.fields import OpaqueColour
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
-from neuprim.core.render.reference import pixel_directions
+from neuprim.core.render.reference.backend import pixel_directions
 from tests import scenes
 
 

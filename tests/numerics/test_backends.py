@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import BackendUnavailable, NonFiniteError
-from neuprim.core.fields import Constant, Opaque, OpaqueColour
+from neuprim.core.model.fields import Constant, Opaque, OpaqueColour
 from neuprim.core.render import RenderSettings, choose_backend, render_lowered
 from tests import scenes
 from tests.numerics.cases import CASES, DEFAULT, case

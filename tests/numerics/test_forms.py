@@ -13,14 +13,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core import sh
-from neuprim.core.cosine import CosineDensity
-from neuprim.core.density_grid import density_at, density_grid
 from neuprim.core.errors import FormError
-from neuprim.core.fields import MOST_UNITS, Constant, Cosine, Opaque, OpaqueColour, Shading
-from neuprim.core.primitives import Lowered, Primitives
+from neuprim.core.model.colours import sh
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.fields import MOST_UNITS, Constant, Cosine, Opaque, OpaqueColour, Shading
+from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render import RenderSettings, render, render_lowered
 from neuprim.core.render.joint import joint_volume
+from neuprim.core.volumes.grid import density_at, density_grid
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
 

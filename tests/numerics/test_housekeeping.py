@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 
 import neuprim
+from neuprim.core.compute.kernels import cache_directory, sources_hash
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.cpu import backend
 from neuprim.core.render.cpu.backward import backward_tiles
-from neuprim.core.render.cpu.compile import cache_directory, sources_hash
 from neuprim.core.render.cpu.forward import composite_tiles
 from tests import scenes
 from tests.kernels import PACKAGE, frozen_into_kernels

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.cosine import cosine_density
 from neuprim.core.errors import ConfigError
-from neuprim.core.fields import Constant, Cosine, Opaque, OpaqueColour
+from neuprim.core.model.densities.cosine import cosine_density
+from neuprim.core.model.fields import Constant, Cosine, Opaque, OpaqueColour
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.joint import joint_volume, sorting_errors
 from tests import scenes

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.geometry import Geometry, quaternion_to_matrix
+from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.projection import screen_boxes
-from neuprim.core.render.reference import pixel_directions
+from neuprim.core.render.reference.backend import pixel_directions
+from neuprim.core.render.reference.projection import screen_boxes
 from tests import scenes
 
 NEAR = 0.01

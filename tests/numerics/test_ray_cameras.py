@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
+from neuprim.core.cameras.rays import RayCamera
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
-from neuprim.core.ray_cameras import RayCamera
 from neuprim.core.render import RenderSettings, choose_backend, render, render_lowered
-from neuprim.core.render.rays import pixel_directions, view_of
-from neuprim.core.render.reference import _Frame
+from neuprim.core.render.reference.backend import _Frame
+from neuprim.core.render.reference.rays import pixel_directions, view_of
 from tests import scenes
 
 EYE = torch.eye(4, dtype=torch.float64)
@@ -172,8 +172,8 @@ def test_only_the_reference_draws_them() -> None:
 
 def test_a_task_s_model_through_a_fisheye() -> None:
     """``render`` lowers view-dependent colours for such a camera as for any other."""
-    from neuprim.core.cosine import CosineDensity
-    from neuprim.core.primitives import Primitives
+    from neuprim.core.model.densities.cosine import CosineDensity
+    from neuprim.core.model.primitives import Primitives
     from neuprim.tasks.static.fields import SphericalHarmonics
 
     t = ball((0.0, 0.0, -2.0), 0.5, 3.0)

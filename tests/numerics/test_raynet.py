@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.cameras.rays import RayCamera
 from neuprim.core.errors import BackendUnavailable, NonFiniteError
-from neuprim.core.fields import Constant, Opaque, OpaqueColour, RayNet
-from neuprim.core.ray_cameras import RayCamera
+from neuprim.core.model.fields import Constant, Opaque, OpaqueColour, RayNet
 from neuprim.core.render import RenderSettings, choose_backend, render_lowered
 from neuprim.core.render.joint import joint_volume
-from neuprim.core.render.rays import pixel_directions
+from neuprim.core.render.reference.rays import pixel_directions
 from tests import scenes
 from tests.numerics.compare import assert_same_frame, draw
 

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 import torch
 
-from neuprim.core import sh
-from neuprim.core.cosine import CosineDensity
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.primitives import Primitives
+from neuprim.core.model.colours import sh
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render, render_lowered
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes

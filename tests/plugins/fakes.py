@@ -14,7 +14,7 @@ from neuprim.core import notices
 from neuprim.plugins import registry
 
 TOY = """
-from neuprim.core.fields import ConditionSpec
+from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.task import SceneSpec, TaskSpec
 
 TASK = TaskSpec(

@@ -10,10 +10,11 @@ import numpy as np
 import torch
 
 from neuprim.config import compose
-from neuprim.core import checkpoint, sh
-from neuprim.core.cosine import CosineDensity
-from neuprim.core.primitives import Primitives
-from neuprim.core.vdb import Grid, write_vdb
+from neuprim.core import checkpoint
+from neuprim.core.io.vdb import Grid, write_vdb
+from neuprim.core.model.colours import sh
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.primitives import Primitives
 from neuprim.plugins.registry import load_task
 
 PLACES = torch.tensor([[0.0, 0.0, 0.0], [0.8, 0.0, 0.0], [0.0, 0.6, 0.0], [0.0, 0.0, 0.5], [0.5, 0.7, 0.9]])

@@ -9,9 +9,9 @@ import torch
 
 from neuprim.config import compose
 from neuprim.core.checkpoint import save_model
-from neuprim.core.primitives import Primitives
-from neuprim.core.schema import InitContext
-from neuprim.core.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import InitContext
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
 

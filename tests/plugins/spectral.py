@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.console import Console
 
 from neuprim.config import compose
-from neuprim.run import run
+from neuprim.runs.fit import run
 from tests.plugins.fakes import install
 
 NAMES = ("450nm", "550 nm", "650nm", "NIR", "SWIR.1")
@@ -16,7 +16,7 @@ TASK = """
 import torch
 
 from neuprim.core.choices import choose
-from neuprim.core.cosine import CosineDensity
+from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.task import SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim.tasks.static.fields import SphericalHarmonics

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuprim.core.primitives import Primitives
-from neuprim.core.schema import InitContext
-from neuprim.new_task import new_task
+from neuprim.cli.new_task import new_task
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import InitContext
 from neuprim.plugins.registry import EXPORTERS, INSPECTORS, TASKS, Group
 from tests.plugins import marked
 from tests.plugins.fakes import install, site
@@ -24,8 +24,8 @@ from dataclasses import replace
 import torch
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.fields import ColourField, ConditionSpec, Constant
-from neuprim.core.schema import ParameterSpec
+from neuprim.core.model.fields import ColourField, ConditionSpec, Constant
+from neuprim.core.model.schema import ParameterSpec
 from neuprim_spectral import TASK as PLAIN
 from neuprim_spectral.fields import WaveDensity
 

@@ -84,9 +84,9 @@ PLUGIN = LossExtension(api=1, name="mine", summary="L1", make=make)
 """
 
 TASK = """
-from neuprim.core.fields import ColourField, ConditionSpec, Constant
-from neuprim.core.schema import ParameterSpec
-from neuprim.core.cosine import CosineDensity
+from neuprim.core.model.fields import ColourField, ConditionSpec, Constant
+from neuprim.core.model.schema import ParameterSpec
+from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.task import SceneSpec, TaskSpec
 from neuprim.core.train.losses import l1
 from tests.core.tiny import TwoPrimitives
@@ -144,7 +144,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "tmp").mkdir()
     monkeypatch.chdir(work)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
-    monkeypatch.setattr("neuprim.run._ORBIT_FRAMES", 2)
+    monkeypatch.setattr("neuprim.runs.fit._ORBIT_FRAMES", 2)
     return work
 
 
@@ -267,7 +267,7 @@ def test_losses_that_return_something_else(code: dict[str, str], text: str, site
         ("return None", "build of task 'mine' of fake-task 2.0: TypeError: cannot unpack"),
         (
             "return 3, Plain()",
-            "build of task 'mine' of fake-task 2.0: the density is of type int; expected a neuprim.core.fields.DensityField",
+            "build of task 'mine' of fake-task 2.0: the density is of type int; expected a neuprim.core.model.fields.DensityField",
         ),
         ("return CosineDensity(2), Plain(1)", "2.0: the colour has channels=1; expected 3, as data set 'two' has"),
         ("model['options']['width']", "task 'mine' reads task.options.width, which its 'options' does not declare"),
@@ -360,7 +360,7 @@ def test_suspects() -> None:
     assert {p.origin.distribution for p in (suspects.task, suspects.scene, suspects.loss)} == {"neuprim"}
     assert origin_of(TASKS, "nobody", "some.module").origin == "some"
     with pytest.raises(DataError, match=r"^scene 'solids' of neuprim \S+: view x: wrong$"), suspects.watch():
-        from neuprim.core.data_check import DatasetFault
+        from neuprim.core.data.check import DatasetFault
 
         raise DatasetFault("view x: wrong")
     with pytest.raises(ValueError, match=r"^ours$"), suspects.watch():

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import pytest
 
+from neuprim.conformance import CHECKS, ConformanceError, check_task, checks, named_checks
+from neuprim.conformance.subject import Subject
 from neuprim.core.errors import ConfigError
-from neuprim.plugins.conformance import CHECKS, ConformanceError, check_task, checks, named_checks
-from neuprim.plugins.conformance.subject import Subject
 from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.relight import TASK as RELIGHT
 from neuprim.tasks.static import TASK as STATIC
@@ -90,5 +90,5 @@ def test_an_unforeseen_error_names_task_and_check() -> None:
 
 
 def test_pytest_is_imported_only_where_it_is_used() -> None:
-    code = "import sys, neuprim.plugins.conformance as c; c.named_checks; sys.exit('pytest' in sys.modules)"
+    code = "import sys, neuprim.conformance as c; c.named_checks; sys.exit('pytest' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

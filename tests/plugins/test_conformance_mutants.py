@@ -11,18 +11,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.cosine import CosineDensity
+from neuprim.conformance import CHECKS, ConformanceError, named_checks
+from neuprim.conformance.example import Example
+from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.data import Pixels
 from neuprim.core.errors import ConfigError
-from neuprim.core.fields import Conditions, ConditionSpec, Constant, Cosine, Field
-from neuprim.core.gaussian import GaussianDensity
-from neuprim.core.geometry import Geometry
-from neuprim.core.ray_cameras import AnyCamera
-from neuprim.core.schema import InitContext, ParameterSpec, Params
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.densities.gaussian import GaussianDensity
+from neuprim.core.model.fields import Conditions, ConditionSpec, Constant, Cosine, Field
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.task import SceneSpec, Supervision, TaskSpec
 from neuprim.core.train.losses import photometric
-from neuprim.plugins.conformance import CHECKS, ConformanceError, named_checks
-from neuprim.plugins.conformance.example import Example
 from neuprim.tasks.static import TASK
 from neuprim.tasks.static.fields import SphericalHarmonics
 

@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 import torch
 
-from neuprim.core import sh
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.cosine import CosineDensity
 from neuprim.core.errors import ConfigError
-from neuprim.core.geometry import quaternion_to_matrix
-from neuprim.core.ply import read_ply
-from neuprim.core.primitives import Primitives
+from neuprim.core.io.ply import read_ply
+from neuprim.core.model.colours import sh
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.geometry import quaternion_to_matrix
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.settings import ModelSettings
 from neuprim.core.train.trainer import initial_model
-from neuprim.exporting import export_run
 from neuprim.plugins.export import appearance
 from neuprim.plugins.export.appearance import Harmonics, harmonics_of
 from neuprim.plugins.export.gaussian_ply import LAYOUT
 from neuprim.plugins.export.gaussians import Gaussians, draw_gaussians, fit_gaussians
 from neuprim.plugins.registry import load_task
-from neuprim.trained import trained_model
+from neuprim.runs.export import export_run
+from neuprim.runs.open import trained_model
 from tests.core import tiny
 from tests.plugins import marked
 
@@ -165,7 +165,7 @@ def test_a_dynamic_model_needs_a_time_and_colours_follow_it(tmp_path: Path) -> N
 def test_a_relit_model_takes_a_light_and_fits_its_colours(tmp_path: Path) -> None:
     task = load_task("relight")
     assert task.fields is not None
-    from neuprim.core.schema import InitContext
+    from neuprim.core.model.schema import InitContext
 
     colour = task.fields["LightNetwork"](hidden=4, visibility="none")
     context = InitContext(marked.PLACES, marked.RADII, marked.COLOURS, torch.Generator().manual_seed(1))

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.exporting import export_run
 from neuprim.plugins.export import appearance
 from neuprim.plugins.export.mesh import best_level
+from neuprim.runs.export import export_run
 from tests.plugins import marked
 
 

@@ -12,9 +12,9 @@ import pytest
 import neuprim
 from neuprim.cli import main
 from neuprim.core.errors import ConfigError
-from neuprim.export_record import FILE
-from neuprim.exporting import export_run, import_run
 from neuprim.plugins.registry import EXPORTERS
+from neuprim.runs.export import export_run, import_run
+from neuprim.runs.export_record import FILE
 from tests.plugins.fakes import install, site
 from tests.plugins.marked import static_run
 

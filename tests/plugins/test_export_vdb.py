@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from neuprim.core.density_grid import density_grid
 from neuprim.core.errors import ConfigError
-from neuprim.core.vdb import Grid, read_grid
-from neuprim.exporting import export_run
+from neuprim.core.io.vdb import Grid, read_grid
+from neuprim.core.volumes.grid import density_grid
 from neuprim.plugins.export import vdb as exporter
-from neuprim.trained import trained_model
+from neuprim.runs.export import export_run
+from neuprim.runs.open import trained_model
 from tests.core.openvdb_oracle import compare, environment, other_python
 from tests.plugins import marked
 

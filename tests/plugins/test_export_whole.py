@@ -13,10 +13,10 @@ import torch
 
 from neuprim.cli import main
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NeuprimError
-from neuprim.core.ply import read_ply, write_ply
-from neuprim.evaluate import load_run, render_run
-from neuprim.exporting import export_run, import_run
+from neuprim.core.io.ply import read_ply, write_ply
 from neuprim.plugins.registry import list_exporters
+from neuprim.runs.draw import load_run, render_run
+from neuprim.runs.export import export_run, import_run
 from tests.plugins import marked
 
 LOSSLESS = ("ply", "npz")

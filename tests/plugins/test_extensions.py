@@ -13,10 +13,10 @@ from neuprim.cli import main
 from neuprim.config import RunConfig, compose
 from neuprim.core.errors import ConfigError
 from neuprim.core.notices import NeuprimWarning
-from neuprim.evaluate import evaluate_run, load_dataset
 from neuprim.plugins import registry
 from neuprim.plugins.registry import ALL, EXPORTERS, INSPECTORS, LOSSES, SCENES, TASKS, Group, PluginError, find_scene, load_task
-from neuprim.run import run
+from neuprim.runs.draw import evaluate_run, load_dataset
+from neuprim.runs.fit import run
 from tests.plugins.fakes import TOY, install, site, toy
 
 __all__ = ["site", "toy"]
@@ -223,7 +223,7 @@ MEMBERS = [
 def test_missing_and_wrong_members(kind: str, old: str, new: str, text: str, site: Path) -> None:
     group, entry, source, _ = KINDS[kind]
     assert old in source
-    add(site, kind, "from neuprim.core.fields import DensityField\n" + source.replace(old, new, 1))
+    add(site, kind, "from neuprim.core.model.fields import DensityField\n" + source.replace(old, new, 1))
     with pytest.raises(PluginError) as caught:
         group.load(entry)
     assert text in str(caught.value)

@@ -14,20 +14,20 @@ import numpy as np
 import pytest
 import torch
 
-from neuprim import inspecting
 from neuprim.cli import main
-from neuprim.core.density_grid import density_at, density_grid, lattice
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
 from neuprim.core.extensions import Inspector
-from neuprim.core.vdb import read_grid
-from neuprim.evaluate import load_dataset, load_run
-from neuprim.inspecting import Request, inspect_run
+from neuprim.core.io.vdb import read_grid
+from neuprim.core.volumes.grid import density_at, density_grid, lattice
 from neuprim.plugins.inspect import ViewOptions, headless, views
 from neuprim.plugins.inspect.field import FieldFrame
 from neuprim.plugins.inspect.frames import box_of, condition_frames, corners, in_words, round_up
 from neuprim.plugins.inspect.page import encoded
 from neuprim.plugins.inspect.shapes import ellipsoids
 from neuprim.plugins.registry import load_task
+from neuprim.runs import inspect as inspecting
+from neuprim.runs.draw import load_dataset, load_run
+from neuprim.runs.inspect import Request, inspect_run
 from tests.plugins import runs
 
 BUILT_IN = {i.name: i for i in (views.VOLUME, views.ISOSURFACE, views.SLICES, views.PRIMITIVES, views.PRIMITIVE, views.DIFFERENCE)}

@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from neuprim.core.errors import BackendUnavailable
-from neuprim.inspecting import Request, inspect_run
 from neuprim.plugins.inspect import window
 from neuprim.plugins.inspect.headless import prepare_headless
+from neuprim.runs.inspect import Request, inspect_run
 from tests.plugins import runs
 
 pytest.importorskip("pyvista", exc_type=ImportError)
@@ -86,7 +86,7 @@ def test_the_slider_draws_the_frame_it_comes_to(run_dir: Path, tmp_path: Path, m
             assert len(self.plotter.scalar_bars) == 1
 
     monkeypatch.setattr(window.Window, "interact", interact)
-    monkeypatch.setattr("neuprim.inspecting.has_display", lambda: True)
+    monkeypatch.setattr("neuprim.runs.inspect.has_display", lambda: True)
     plain = window.Window.__init__
     monkeypatch.setattr(window.Window, "__init__", lambda self, panels, up, off, size=None: plain(self, panels, up, True, (240, 200)))
     assert look(run_dir, conditions={"time": "0,1"}) == []

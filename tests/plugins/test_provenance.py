@@ -14,15 +14,15 @@ from rich.console import Console
 
 import neuprim
 from neuprim.cli import main
+from neuprim.cli.new_task import new_task
 from neuprim.config import RunConfig, compose
 from neuprim.core import checkpoint, notices
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.notices import NeuprimWarning
-from neuprim.evaluate import evaluate_run, load_run
-from neuprim.new_task import new_task
 from neuprim.plugins import provenance
 from neuprim.plugins.provenance import MadeBy, Maker
-from neuprim.run import run
+from neuprim.runs.draw import evaluate_run, load_run
+from neuprim.runs.fit import run
 from tests.plugins.fakes import install, install_groups, site, uninstall
 from tests.plugins.marked import static_run
 from tests.plugins.test_extensions import LOSS, add

@@ -15,16 +15,16 @@ from torch import Tensor
 
 from neuprim.cli import main
 from neuprim.config import RunConfig, compose
+from neuprim.conformance import ConformanceError, named_checks
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.task import Supervision
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.uses import OPTIONAL, build_settings, loss_settings
-from neuprim.plugins.conformance import ConformanceError, named_checks
 from neuprim.plugins.members import fault
 from neuprim.plugins.registry import list_losses, load_loss, load_task
-from neuprim.run import make_loss, run
+from neuprim.runs.fit import make_loss, run
 from neuprim.tasks.static import TASK
 from tests.plugins.fakes import install, site, toy
 from tests.plugins.test_extensions import LOSS, add

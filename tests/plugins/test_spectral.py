@@ -19,18 +19,20 @@ from PIL import Image
 from rich.console import Console
 from torch import Tensor
 
-import neuprim.run as running
+import neuprim.runs.fit as running
 from neuprim.cli import main
-from neuprim.core import checkpoint, images, sh
+from neuprim.conformance import check_task
+from neuprim.core import checkpoint
 from neuprim.core.channels import stored_channels
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NeuprimError
+from neuprim.core.io import images
+from neuprim.core.model.colours import sh
 from neuprim.core.render import render
-from neuprim.evaluate import FORMATS, evaluate_run, load_dataset, load_run, read_metrics, render_run
-from neuprim.exporting import export_run, import_run
-from neuprim.inspecting import Request, inspect_run
-from neuprim.plugins.conformance import check_task
 from neuprim.plugins.export import appearance, mesh
 from neuprim.plugins.registry import load_task
+from neuprim.runs.draw import FORMATS, evaluate_run, load_dataset, load_run, read_metrics, render_run
+from neuprim.runs.export import export_run, import_run
+from neuprim.runs.inspect import Request, inspect_run
 from tests.plugins.fakes import site
 from tests.plugins.spectral import NAMES, fit, install_spectral
 
@@ -137,8 +139,8 @@ def test_rendering_needs_no_data_for_the_names(trained: Path, tmp_path: Path, mo
     def gone(*_: object) -> None:
         raise DataError("the data are gone")
 
-    monkeypatch.setattr("neuprim.evaluate.load_dataset", gone)
-    monkeypatch.setattr("neuprim.evaluate.find_scene", gone)
+    monkeypatch.setattr("neuprim.runs.draw.load_dataset", gone)
+    monkeypatch.setattr("neuprim.runs.draw.find_scene", gone)
     pose = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0.5], [0, 0, 0, 1]]
     (tmp_path / "cameras.json").write_text(json.dumps({"w": 20, "h": 16, "camera_angle_x": 0.7, "frames": [{"transform_matrix": pose}]}))
     (exr,) = render_run(trained, str(tmp_path / "cameras.json"), None, "exr", tmp_path / "exr", 1, {})

@@ -11,13 +11,13 @@ from PIL import Image
 
 from neuprim.cli import main
 from neuprim.core.errors import ConfigError
-from neuprim.core.vdb import read_grid
-from neuprim.exporting import export_run, import_run
-from neuprim.inspecting import Request, inspect_run
+from neuprim.core.io.vdb import read_grid
 from neuprim.plugins import crashes
 from neuprim.plugins.blame import origin_of
 from neuprim.plugins.export import npz
 from neuprim.plugins.registry import EXPORTERS, PluginError
+from neuprim.runs.export import export_run, import_run
+from neuprim.runs.inspect import Request, inspect_run
 from tests.plugins import marked
 from tests.plugins.strangers import EXPORTER, INSPECTOR, add, run_dir, site, spectral
 
@@ -346,9 +346,9 @@ def test_a_crash_of_an_inspector(
         def close(self) -> None:
             pass
 
-    monkeypatch.setattr("neuprim.inspecting.Window", Shown)
-    monkeypatch.setattr("neuprim.inspecting.require_pyvista", lambda: None)
-    monkeypatch.setattr("neuprim.inspecting.prepare_headless", lambda: None)
+    monkeypatch.setattr("neuprim.runs.inspect.Window", Shown)
+    monkeypatch.setattr("neuprim.runs.inspect.require_pyvista", lambda: None)
+    monkeypatch.setattr("neuprim.runs.inspect.prepare_headless", lambda: None)
     add(site, "inspector", INSPECTOR)  # its plotter is None here
     assert call("inspect", run_dir, "--show", "crumbs", "--grid", "8", "--out", tmp_path / "a.png") == 2
     error = one_line(capsys)

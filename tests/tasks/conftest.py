@@ -17,8 +17,8 @@ from neuprim.config import compose
 from neuprim.core.data import ViewSet
 from neuprim.core.errors import NeuprimError
 from neuprim.core.task import SceneContext
-from neuprim.evaluate import read_metrics
-from neuprim.run import run
+from neuprim.runs.draw import read_metrics
+from neuprim.runs.fit import run
 
 
 class Scenes:

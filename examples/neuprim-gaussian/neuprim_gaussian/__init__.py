@@ -8,7 +8,7 @@ from typing import Any
 from neuprim.core.choices import choose
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
-from neuprim.core.fields import ColourField, DensityField
+from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim_gaussian.colour import ViewDependentColour

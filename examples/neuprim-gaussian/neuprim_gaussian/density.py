@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.fields import Conditions, DensityField, Opaque
-from neuprim.core.geometry import Geometry
-from neuprim.core.schema import InitContext, ParameterSpec, Params
+from neuprim.core.model.fields import Conditions, DensityField, Opaque
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 
 __all__ = ["BellDensity", "bell"]
 

@@ -12,10 +12,10 @@ from neuprim_gaussian import TASK
 from neuprim_gaussian.density import bell
 
 from neuprim.config import compose
+from neuprim.conformance import checks
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.evaluate import read_metrics
-from neuprim.plugins.conformance import checks
-from neuprim.run import run
+from neuprim.runs.draw import read_metrics
+from neuprim.runs.fit import run
 
 SMALL = "scene.size=16 scene.train_views=4 scene.test_views=1 scene.supersampling=1 model.primitives=40 model.sh_degree=0"
 

@@ -9,16 +9,16 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.cameras.rays import AnyCamera, RayCamera
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.core.fields import Constant, Cosine, RayNet
-from neuprim.core.forms import check_lowered
-from neuprim.core.primitives import Lowered, Primitives
-from neuprim.core.ray_cameras import AnyCamera, RayCamera
+from neuprim.core.model.checks import check_lowered
+from neuprim.core.model.fields import Constant, Cosine, RayNet
+from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render.output import RenderOutput, RenderStats
 from neuprim.core.render.refusals import refuse_non_finite
 from neuprim.core.render.samples import render_samples
-from neuprim.core.render.settings import RenderSettings
 from neuprim.core.render.shading import Draw, with_shade
+from neuprim.core.settings import RenderSettings
 
 __all__ = ["BACKENDS", "RenderOutput", "RenderSettings", "RenderStats", "choose_backend", "probe", "render", "render_lowered"]
 
@@ -81,7 +81,7 @@ def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings
     if choose_backend(lowered, settings, camera) == "cpu":  # which checks while it prepares
         from neuprim.core.render.cpu.backend import render as draw
     else:
-        from neuprim.core.render.reference import render as draw
+        from neuprim.core.render.reference.backend import render as draw
 
         refuse_non_finite(lowered)
     paint: Draw = draw if lowered.shade is None else with_shade(draw)
@@ -97,7 +97,7 @@ def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings
 
 def probe(name: str) -> str | None:
     """None if backend ``name`` works here, else why not: draws one small sphere and looks at the middle pixel."""
-    from neuprim.core.geometry import Geometry
+    from neuprim.core.model.geometry import Geometry
 
     try:
         view = torch.eye(4, dtype=torch.float64)

@@ -23,17 +23,17 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import ConfigError
-from neuprim.core.fields import Constant, Cosine, RayNet
-from neuprim.core.forms import check_lowered, check_result
-from neuprim.core.geometry import quaternion_to_matrix
 from neuprim.core.metrics import psnr
-from neuprim.core.primitives import Lowered
+from neuprim.core.model.checks import check_lowered, check_result
+from neuprim.core.model.fields import Constant, Cosine, RayNet
+from neuprim.core.model.geometry import quaternion_to_matrix
+from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import render_lowered
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
-from neuprim.core.render.projection import screen_boxes
-from neuprim.core.render.reference import pixel_directions
+from neuprim.core.render.reference.backend import pixel_directions
+from neuprim.core.render.reference.projection import screen_boxes
 from neuprim.core.render.samples import render_samples
-from neuprim.core.render.settings import RenderSettings, SortOrder
+from neuprim.core.settings import RenderSettings, SortOrder
 
 __all__ = ["Keep", "SortingError", "joint_volume", "sorting_errors"]
 

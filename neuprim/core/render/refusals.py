@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.fields import Constant, Cosine, RayNet
-from neuprim.core.primitives import Lowered
+from neuprim.core.model.fields import Constant, Cosine, RayNet
+from neuprim.core.model.primitives import Lowered
 
 __all__ = ["refuse_non_finite"]
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.primitives import Lowered
+from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
-from neuprim.core.render.settings import RenderSettings
 from neuprim.core.render.shading import Draw
+from neuprim.core.settings import RenderSettings
 
 __all__ = ["SampledStats", "render_samples"]
 

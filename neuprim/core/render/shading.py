@@ -8,11 +8,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from neuprim.core.forms import check_result
-from neuprim.core.primitives import Lowered
-from neuprim.core.ray_cameras import AnyCamera, RayCamera
+from neuprim.core.cameras.rays import AnyCamera, RayCamera
+from neuprim.core.model.checks import check_result
+from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.output import RenderOutput
-from neuprim.core.render.settings import RenderSettings
+from neuprim.core.settings import RenderSettings
 
 __all__ = ["Draw", "points_seen", "with_shade"]
 

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.render.cpu.compile import exact_kernel
-from neuprim.core.render.cpu.threads import parallel_for
-from neuprim.core.schema import ParameterSpec
+from neuprim.core.model.schema import ParameterSpec
 
 __all__ = ["RowAdam", "adam_step_reference"]
 

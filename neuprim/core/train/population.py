@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neuprim.core.forms import check_halves, check_tensors, method
-from neuprim.core.geometry import Geometry, quaternion_to_matrix
-from neuprim.core.primitives import Primitives
+from neuprim.core.model.checks import check_halves, check_tensors, method
+from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import RenderStats
 from neuprim.core.train.settings import PopulationSettings
 

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.core.render.cpu.compile import inline, kernel
-from neuprim.core.render.cpu.threads import parallel_for
+from neuprim.core.compute.kernels import inline, kernel
+from neuprim.core.compute.threads import parallel_for
 
 __all__ = ["photometric_fused"]
 

@@ -19,14 +19,14 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from neuprim.core.data import Dataset
-from neuprim.core.data_check import check_pixels, check_points
-from neuprim.core.datasets.initial import subset
-from neuprim.core.datasets.points_file import read_points
+from neuprim.core.data.check import check_pixels, check_points
+from neuprim.core.data.initial import subset
+from neuprim.core.data.points_file import read_points
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NonFiniteError, nearest
-from neuprim.core.fields import ColourField, DensityField
-from neuprim.core.primitives import Primitives
+from neuprim.core.model.fields import ColourField, DensityField
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.schema import InitContext
 from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.losses import scale_anisotropy
 from neuprim.core.train.optimizer import RowAdam

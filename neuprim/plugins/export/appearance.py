@@ -8,12 +8,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from neuprim.core import sh
 from neuprim.core.cameras import Camera, look_at, orbit
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import ExportJob, TrainedModel
-from neuprim.core.fields import Conditions, OpaqueColour
+from neuprim.core.model.colours import sh
+from neuprim.core.model.fields import Conditions, OpaqueColour
 
 __all__ = ["Harmonics", "comparison_views", "harmonics_of", "rgb_of", "sphere"]
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.extensions import ExportJob
-from neuprim.core.fields import Conditions
+from neuprim.core.model.fields import Conditions
 
 __all__ = ["model_box", "pack_header", "unpack_header"]
 

@@ -21,9 +21,9 @@ from torch import Tensor
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
-from neuprim.core.fields import Conditions
+from neuprim.core.io.ply import write_ply
 from neuprim.core.metrics import psnr
-from neuprim.core.ply import write_ply
+from neuprim.core.model.fields import Conditions
 from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
 from neuprim.plugins.export.appearance import Harmonics, comparison_views, harmonics_of, rgb_of

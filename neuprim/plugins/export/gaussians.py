@@ -11,8 +11,8 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.extensions import TrainedModel
-from neuprim.core.fields import Conditions
-from neuprim.core.geometry import Geometry
+from neuprim.core.model.fields import Conditions
+from neuprim.core.model.geometry import Geometry
 from neuprim.plugins.export.appearance import Harmonics
 
 __all__ = ["Gaussians", "draw_gaussians", "fit_gaussians"]

@@ -26,14 +26,14 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from neuprim.core import images
-from neuprim.core.density_grid import density_grid
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
-from neuprim.core.fields import Conditions
-from neuprim.core.files import atomic_path
+from neuprim.core.io import images
+from neuprim.core.io.files import atomic_path
+from neuprim.core.model.fields import Conditions
 from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
+from neuprim.core.volumes.grid import density_grid
 from neuprim.plugins.export.appearance import Harmonics, comparison_views, harmonics_of, rgb_of
 from neuprim.plugins.export.common import model_box
 

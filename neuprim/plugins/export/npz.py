@@ -15,7 +15,7 @@ import numpy as np
 
 from neuprim.core.errors import DataError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
-from neuprim.core.files import atomic_path
+from neuprim.core.io.files import atomic_path
 from neuprim.core.task import API_VERSION
 from neuprim.plugins.export.common import pack_header, unpack_header
 

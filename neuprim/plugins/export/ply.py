@@ -17,7 +17,7 @@ import numpy as np
 
 from neuprim.core.errors import DataError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
-from neuprim.core.ply import read_ply, write_ply
+from neuprim.core.io.ply import read_ply, write_ply
 from neuprim.core.task import API_VERSION
 from neuprim.plugins.export.common import pack_header, unpack_header
 

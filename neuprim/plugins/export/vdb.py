@@ -20,13 +20,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neuprim.core.density_grid import agreement, density_grid, lattice
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
-from neuprim.core.fields import Conditions
+from neuprim.core.io.vdb import Grid, Tiles, read_grid, scale_transform, write_vdb
+from neuprim.core.model.fields import Conditions
 from neuprim.core.task import API_VERSION
-from neuprim.core.vdb import Grid, Tiles, read_grid, scale_transform, write_vdb
-from neuprim.core.volume_source import Placement, VolumeSource
+from neuprim.core.volumes.grid import agreement, density_grid, lattice
+from neuprim.core.volumes.source import Placement, VolumeSource
 from neuprim.plugins.export.common import model_box
 
 __all__ = ["EXPORTER", "sampled_grid"]

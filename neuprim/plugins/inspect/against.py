@@ -11,11 +11,11 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from neuprim.core.density_truth import DensityTruth, TruthFrame
 from neuprim.core.errors import DataError
-from neuprim.core.fields import Conditions
-from neuprim.core.vdb import Frame, Grid, read_grid, read_header, sequence, write_vdb
-from neuprim.core.volume_source import VolumeSource
+from neuprim.core.io.vdb import Frame, Grid, read_grid, read_header, sequence, write_vdb
+from neuprim.core.model.fields import Conditions
+from neuprim.core.volumes.source import VolumeSource
+from neuprim.core.volumes.truth import DensityTruth, TruthFrame
 from neuprim.plugins.inspect.field import FieldFrame
 
 __all__ = ["SceneUnits", "open_truth", "pair", "write_volume"]

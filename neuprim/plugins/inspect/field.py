@@ -13,11 +13,11 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.channels import Channels
 from neuprim.core.conditions import flag
-from neuprim.core.density_grid import density_grid
 from neuprim.core.errors import ConfigError
-from neuprim.core.fields import Conditions
-from neuprim.core.geometry import Geometry
-from neuprim.core.primitives import Living, Primitives
+from neuprim.core.model.fields import Conditions
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Living, Primitives
+from neuprim.core.volumes.grid import density_grid
 
 __all__ = ["UNIT", "FieldFrame", "ViewOptions"]
 

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from neuprim.core.conditions import Warn, flag, read_conditions
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.fields import Conditions, ConditionSpec
-from neuprim.core.primitives import Primitives
+from neuprim.core.model.fields import Conditions, ConditionSpec
+from neuprim.core.model.primitives import Primitives
 from neuprim.plugins.inspect.field import FieldFrame
 
 __all__ = ["Given", "box_of", "condition_frames", "corners", "in_words", "round_up"]

@@ -17,7 +17,7 @@ import torch
 
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import Inspector
-from neuprim.core.files import write_text
+from neuprim.core.io.files import write_text
 from neuprim.plugins.inspect.field import UNIT, FieldFrame
 from neuprim.plugins.inspect.shapes import unit_sphere
 from neuprim.plugins.inspect.views import COLOURS, DIFFERENCE, ISOSURFACE, PRIMITIVES, SLICES, VOLUME, strongest

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from neuprim.core.geometry import Geometry
+from neuprim.core.model.geometry import Geometry
 from neuprim.plugins.inspect.field import FieldFrame
 
 __all__ = ["ellipsoids", "image", "padded", "unit_sphere"]

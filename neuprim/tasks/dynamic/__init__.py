@@ -8,10 +8,10 @@ from typing import Any
 from neuprim.core.choices import choose
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
-from neuprim.core.fields import ColourField, ConditionSpec, DensityField
+from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
-from neuprim.core.volume_source import VolumeSource
+from neuprim.core.volumes.source import VolumeSource
 from neuprim.tasks.dynamic.colour import FREQUENCIES, TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.dynamic.time import parse_times

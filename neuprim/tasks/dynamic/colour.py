@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core import sh
-from neuprim.core.fields import ColourField, Conditions, Constant
-from neuprim.core.geometry import Geometry
-from neuprim.core.ray_cameras import AnyCamera
-from neuprim.core.schema import ParameterSpec, Params
+from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.model.colours import sh
+from neuprim.core.model.fields import ColourField, Conditions, Constant
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.tasks.dynamic.density import time_of
 
 __all__ = ["TimeHarmonics"]

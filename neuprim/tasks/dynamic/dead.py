@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from neuprim.core.fields import Cosine
-from neuprim.core.geometry import Geometry
-from neuprim.core.primitives import Primitives
+from neuprim.core.model.fields import Cosine
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Primitives
 
 __all__ = ["dead_fraction"]
 

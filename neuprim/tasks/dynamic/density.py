@@ -18,10 +18,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.cosine import OMEGA0, CosineDensity, cosine_density, split_cosine
-from neuprim.core.fields import Conditions, Cosine, DensityField
-from neuprim.core.geometry import Geometry
-from neuprim.core.schema import InitContext, ParameterSpec, Params
+from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity, cosine_density, split_cosine
+from neuprim.core.model.fields import Conditions, Cosine, DensityField
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.train.population import SPLIT_LONG, SPLIT_SHIFT
 
 __all__ = ["PARTS", "TimeDensity", "time_of"]
@@ -47,7 +47,7 @@ def time_of(conditions: Conditions) -> Tensor:
 class TimeDensity(DensityField):
     """f(x~, xi) of K cosine neurons whose ``time`` parts vary, see the module; 5K + 1 parameters and those of the parts.
 
-    ``init`` of the model settings: as :class:`~neuprim.core.cosine.CosineDensity`, and ``window``, the half width tau of a fresh
+    ``init`` of the model settings: as :class:`~neuprim.core.model.densities.cosine.CosineDensity`, and ``window``, the half width tau of a fresh
     window in units of the sequence, and ``rate``, the bound of U(-rate, rate) that W_t starts from.
     """
 

@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import PointCloud, ViewSet
-from neuprim.core.datasets.hull import EmptyHull, hull_surface
-from neuprim.core.datasets.initial import box_points, check_count, distinct, farthest_points, has_silhouettes, median_colors
-from neuprim.core.datasets.views import SomeViews
+from neuprim.core.data.hull import EmptyHull, hull_surface
+from neuprim.core.data.initial import box_points, check_count, distinct, farthest_points, has_silhouettes, median_colors
+from neuprim.core.data.views import SomeViews
 
 __all__ = ["moving_points"]
 

@@ -2,7 +2,7 @@
 
 Either ``transforms_SPLIT.json`` per split, whose scenes have z upwards, or one ``transforms.json``, of which every n-th frame by
 name is a test view unless it lists ``train_filenames`` or ``test_filenames``; where both are there the splits count. Cameras,
-lenses and masks are those of :mod:`neuprim.core.datasets.transforms`; images are PNG, JPEG or OpenEXR.
+lenses and masks are those of :mod:`neuprim.core.data.transforms`; images are PNG, JPEG or OpenEXR.
 
 Each view has the condition "time", a float32 tensor without dimensions, 0..1.
 
@@ -23,11 +23,11 @@ from typing import Any
 import torch
 
 from neuprim.core.data import Dataset
-from neuprim.core.datasets.common import posed_images
-from neuprim.core.datasets.records import Record, read_json
-from neuprim.core.datasets.settings import Setting, count, data_folder, read_settings, text
-from neuprim.core.datasets.transforms import read_frames, split_frames
-from neuprim.core.datasets.views import Frame
+from neuprim.core.data.common import posed_images
+from neuprim.core.data.records import Record, read_json
+from neuprim.core.data.settings import Setting, count, data_folder, read_settings, text
+from neuprim.core.data.transforms import read_frames, split_frames
+from neuprim.core.data.views import Frame
 from neuprim.core.errors import DataError
 from neuprim.core.task import SceneContext
 from neuprim.tasks.dynamic.moving import moving_points

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from neuprim.core.choices import choose
-from neuprim.core.cosine import CosineDensity
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
-from neuprim.core.fields import ColourField, ConditionSpec, DensityField
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import l1
 from neuprim.tasks.relight.colour import FORMS, VISIBILITY, LightNetwork

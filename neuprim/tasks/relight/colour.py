@@ -8,7 +8,7 @@
 E is the light's intensity, divided by the squared distance where the data set says so, over that of a typical training light, so that
 learning rates do not depend on the data's unit of light; V the visibility of the light from the
 primitive (:mod:`neuprim.tasks.relight.visibility`) or 1. Everything but W_x x~ is constant over a primitive, so it folds into the
-closed form :class:`~neuprim.core.fields.RayNet`, which the renderer evaluates per pixel.
+closed form :class:`~neuprim.core.model.fields.RayNet`, which the renderer evaluates per pixel.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from typing import Any
 
 from torch import Tensor
 
-from neuprim.core.fields import ColourField, Conditions, LoweredDensity, RayNet, Shading
-from neuprim.core.geometry import Geometry
-from neuprim.core.ray_cameras import AnyCamera
-from neuprim.core.schema import InitContext, ParameterSpec, Params
+from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.model.fields import ColourField, Conditions, LoweredDensity, RayNet, Shading
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.settings import RenderSettings
 from neuprim.tasks.relight.directions import unit
 from neuprim.tasks.relight.visibility import light_visibility

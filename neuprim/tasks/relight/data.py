@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import View
-from neuprim.core.datasets.common import PosedImages
-from neuprim.core.datasets.views import ImageViews
+from neuprim.core.data.common import PosedImages
+from neuprim.core.data.views import ImageViews
 from neuprim.core.errors import DataError
-from neuprim.core.flip import flip_available
 from neuprim.core.metrics import means
-from neuprim.core.primitives import Primitives
+from neuprim.core.metrics.flip import flip_available
+from neuprim.core.model.primitives import Primitives
 from neuprim.tasks.relight.environment import summary
 from neuprim.tasks.relight.measure import scores
 

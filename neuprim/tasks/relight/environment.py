@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.datasets.records import Record
+from neuprim.core.data.records import Record
 from neuprim.core.environment import Environment, Illumination
 
 __all__ = ["FAR", "illuminate", "summary"]

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.fields import ColourField, Conditions, Constant
-from neuprim.core.geometry import Geometry
-from neuprim.core.ray_cameras import AnyCamera
-from neuprim.core.schema import ParameterSpec, Params
+from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.model.fields import ColourField, Conditions, Constant
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.tasks.relight.directions import unit
 
 __all__ = ["LightHarmonics", "real_harmonics"]

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import DataError
-from neuprim.core.flip import flip, flip_available
-from neuprim.core.images import linear_to_srgb
+from neuprim.core.io.images import linear_to_srgb
 from neuprim.core.metrics import psnr, ssim
+from neuprim.core.metrics.flip import flip, flip_available
 
 __all__ = ["CLASSES", "class_errors", "class_shares", "scores"]
 

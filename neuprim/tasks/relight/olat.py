@@ -37,12 +37,12 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, opengl_to_viewmat
-from neuprim.core.datasets.common import IMAGE_SUFFIXES, every_nth, find_image, missing_files, posed_images, unique_names
-from neuprim.core.datasets.records import Record, read_json
-from neuprim.core.datasets.settings import BACKGROUNDS, Setting, data_folder, flag, read_settings, text
-from neuprim.core.datasets.views import Frame
+from neuprim.core.data.common import IMAGE_SUFFIXES, every_nth, find_image, missing_files, posed_images, unique_names
+from neuprim.core.data.records import Record, read_json
+from neuprim.core.data.settings import BACKGROUNDS, Setting, data_folder, flag, read_settings, text
+from neuprim.core.data.views import Frame
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.images import ImageInfo, image_info
+from neuprim.core.io.images import ImageInfo, image_info
 from neuprim.core.task import SceneContext
 from neuprim.tasks.relight.data import PointLit, bright
 

@@ -21,9 +21,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.fields import Constant, LoweredDensity, Shade
-from neuprim.core.geometry import Geometry
-from neuprim.core.primitives import Lowered
+from neuprim.core.model.fields import Constant, LoweredDensity, Shade
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
 
 __all__ = ["BIAS", "SIZE", "SOFTNESS", "light_visibility"]

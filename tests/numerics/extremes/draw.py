@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.geometry import quaternion_to_matrix
+from neuprim.core.model.geometry import quaternion_to_matrix
 from tests import scenes
 from tests.numerics.extremes.measure import OPEN, Case
 from tests.numerics.extremes.oracle import Integrals, long_integrals

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from neuprim.core.io.vdb import Grid, scale_transform
 from neuprim.core.task import SceneContext
-from neuprim.core.vdb import Grid, scale_transform
 from neuprim.tasks.dynamic.volume.dataset import VolumeDataset
 from neuprim.tasks.dynamic.volume.scene import load
 

@@ -14,9 +14,9 @@ from rich.console import Console
 from neuprim.cli import main
 from neuprim.config import compose
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
-from neuprim.core.vdb import write_vdb
-from neuprim.evaluate import evaluate_run, load_run, render_run
-from neuprim.run import run
+from neuprim.core.io.vdb import write_vdb
+from neuprim.runs.draw import evaluate_run, load_run, render_run
+from neuprim.runs.fit import run
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.time import parse_times
 from tests.reports import offered

@@ -14,10 +14,10 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from neuprim.core.datasets.hull import EmptyHull, hull_surface
-from neuprim.core.datasets.initial import box_points
+from neuprim.core.data.hull import EmptyHull, hull_surface
+from neuprim.core.data.initial import box_points
 from neuprim.core.errors import ConfigError
-from neuprim.core.images import write_exr
+from neuprim.core.io.images import write_exr
 from neuprim.tasks.dynamic.moving import moving_points
 from neuprim.tasks.dynamic.multiview import load
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.vdb import read_grids, read_header, sequence
+from neuprim.core.io.vdb import read_grids, read_header, sequence
 from neuprim.tasks.dynamic.simulation import SCENES, generate, simulate
 from neuprim.tasks.dynamic.simulation.generate import THRESHOLD, box_of, cache_key, grids_of
 from neuprim.tasks.dynamic.simulation.scenes import Scene, Stage

@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.cosine import OMEGA0, CosineDensity
-from neuprim.core.geometry import Geometry
-from neuprim.core.primitives import Primitives
+from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.output import RenderStats
-from neuprim.core.schema import InitContext
 from neuprim.core.train.population import Relocate, split
 from neuprim.core.train.settings import PopulationSettings
 from neuprim.tasks.dynamic import TASK

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.tasks.dynamic.volume.looks import changed, named_look
 from neuprim.tasks.dynamic.volume.normalise import Normalisation
 from neuprim.tasks.dynamic.volume.optics import medium_of

@@ -13,7 +13,7 @@ import torch
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.vdb import scale_transform, sequence, write_vdb
+from neuprim.core.io.vdb import scale_transform, sequence, write_vdb
 from neuprim.tasks.dynamic.volume import EMBERGEN_FIRE, LOOKS, Light, Look, Medium, Normalisation, integrate, medium_of, named_look, rig
 from neuprim.tasks.dynamic.volume.blackbody import black_body_rgb, black_body_xyz
 from neuprim.tasks.dynamic.volume.transmittance import transmittance

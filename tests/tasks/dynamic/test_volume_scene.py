@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from neuprim.core.density_grid import lattice
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.volumes.grid import lattice
 from neuprim.tasks.dynamic.volume import shoot as shooting
 from neuprim.tasks.dynamic.volume.compare import extinction_on
 from neuprim.tasks.dynamic.volume.dataset import FrameViews

@@ -9,7 +9,7 @@ import torch
 from scipy import ndimage
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.vdb import Grid
+from neuprim.core.io.vdb import Grid
 from neuprim.tasks.dynamic.volume import Medium
 
 

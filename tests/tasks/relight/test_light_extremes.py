@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.cosine import CosineDensity
 from neuprim.core.data import Pixels, View
-from neuprim.core.fields import RayNet
-from neuprim.core.primitives import Primitives
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.fields import RayNet
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.task import Supervision
 from neuprim.core.train.losses import compressed, l1, relative

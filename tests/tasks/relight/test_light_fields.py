@@ -8,15 +8,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core import sh
 from neuprim.core.cameras import Camera
-from neuprim.core.cosine import CosineDensity
 from neuprim.core.errors import ConfigError
-from neuprim.core.fields import Cosine, RayNet
-from neuprim.core.geometry import Geometry
-from neuprim.core.primitives import Lowered, Primitives
+from neuprim.core.model.colours import sh
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.fields import Cosine, RayNet
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Lowered, Primitives
+from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderOutput, RenderSettings, render, render_lowered
-from neuprim.core.schema import InitContext
 from neuprim.core.train.population import split
 from neuprim.tasks.relight import TASK
 from neuprim.tasks.relight.colour import FORMS, LightNetwork

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.images import read_image
-from neuprim.core.solids.raycast import Scene
+from neuprim.core.io.images import read_image
 from neuprim.core.task import SceneContext
+from neuprim.scenes.raycast import Scene
 from neuprim.tasks.relight import olat
 from neuprim.tasks.relight.data import bright
 from neuprim.tasks.relight.lit import LitSolids, load

@@ -11,10 +11,10 @@ import pytest
 import torch
 import yaml
 
-from neuprim.core.datasets.settings import read_settings
+from neuprim.core.data.settings import read_settings
 from neuprim.core.errors import BackendUnavailable, DataError
-from neuprim.core.flip import flip, flip_available
 from neuprim.core.metrics import means, psnr
+from neuprim.core.metrics.flip import flip, flip_available
 from neuprim.tasks.relight import measure, olat
 from neuprim.tasks.relight.lit import dataset as lit
 from neuprim.tasks.relight.lit.generate import LitSettings

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.images import linear_to_srgb, srgb_to_linear, write_exr, write_png
+from neuprim.core.io.images import linear_to_srgb, srgb_to_linear, write_exr, write_png
 from neuprim.core.task import SceneContext
 from neuprim.tasks.relight.data import PointLit
 from neuprim.tasks.relight.olat import load

@@ -16,16 +16,16 @@ from torch import Tensor
 from neuprim.cli import main
 from neuprim.config import compose
 from neuprim.core import checkpoint
-from neuprim.core.cosine import CosineDensity
 from neuprim.core.data import View
 from neuprim.core.environment import Environment
 from neuprim.core.errors import DataError
-from neuprim.core.images import read_image, write_exr
-from neuprim.core.primitives import Primitives
+from neuprim.core.io.images import read_image, write_exr
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.solids.raycast import Scene
 from neuprim.core.task import SceneContext
-from neuprim.measure import draw_sum
+from neuprim.runs.measure import draw_sum
+from neuprim.scenes.raycast import Scene
 from neuprim.tasks.relight import TASK
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.relight.environment import FAR, illuminate, summary

@@ -14,10 +14,10 @@ from rich.console import Console
 from neuprim.cli import main
 from neuprim.config import compose
 from neuprim.core.errors import ConfigError
-from neuprim.core.images import write_exr
-from neuprim.evaluate import load_dataset, load_run, render_run
+from neuprim.core.io.images import write_exr
 from neuprim.plugins.registry import load_task
-from neuprim.run import make_trainer, run
+from neuprim.runs.draw import load_dataset, load_run, render_run
+from neuprim.runs.fit import make_trainer, run
 from tests.reports import offered
 
 SCENE = ["task=relight", "scene=lit_solids", "scene.size=32", "scene.train_views=24", "scene.test_views=6", "scene.supersampling=1"]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from neuprim.core.solids.meshes import ball, chamfered_box
-from neuprim.core.solids.raycast import Scene
-from neuprim.core.solids.shapes import Solid, plain, srgb
+from neuprim.scenes.meshes import ball, chamfered_box
+from neuprim.scenes.raycast import Scene
+from neuprim.scenes.shapes import Solid, plain, srgb
 from neuprim.tasks.relight.lit import generate as generator
 from neuprim.tasks.relight.lit.generate import FIELD_OF_VIEW, camera_to_world, picture
 from neuprim.tasks.relight.lit.rig import CIRCLE_FRAMES, DISTANCE, NEAR_LIGHTS, PARTS, splits
@@ -103,7 +103,7 @@ def test_a_pixel_has_the_class_of_most_of_its_rays() -> None:
 def test_pictures_do_not_depend_on_how_rays_are_batched(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, pose, light = Scene([FLOOR, BLOCK]), camera_to_world(np.array([2.0, -3.0, 2.5])), np.array([1.0, 1.0, 4.0])
     whole = picture(scene, pose, light, 24, 2)
-    monkeypatch.setattr("neuprim.core.solids.rays.RAYS_AT_ONCE", 300)
+    monkeypatch.setattr("neuprim.scenes.rays.RAYS_AT_ONCE", 300)
     again = picture(scene, pose, light, 24, 2)
     for name in ("rgba", "unshadowed", "classes"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(again, name))

@@ -12,9 +12,9 @@ import pytest
 import torch
 from PIL import Image
 
-from neuprim.core.datasets.views import ImageViews
+from neuprim.core.data.views import ImageViews
 from neuprim.core.errors import DataError
-from neuprim.core.images import write_exr
+from neuprim.core.io.images import write_exr
 from neuprim.core.task import SceneContext
 from neuprim.tasks.static.datasets.blender import load
 

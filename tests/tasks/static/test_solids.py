@@ -14,11 +14,11 @@ from PIL import Image
 
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
-from neuprim.core.solids import rays
-from neuprim.core.solids.meshes import ball, chamfered_box, corner_normals, rod
-from neuprim.core.solids.raycast import Scene
-from neuprim.core.solids.shapes import Solid, build, plain, srgb
 from neuprim.core.task import SceneContext
+from neuprim.scenes import rays
+from neuprim.scenes.meshes import ball, chamfered_box, corner_normals, rod
+from neuprim.scenes.raycast import Scene
+from neuprim.scenes.shapes import Solid, build, plain, srgb
 from neuprim.tasks.static.solids import generate as generator
 from neuprim.tasks.static.solids.generate import SolidsSettings, camera_matrices, generate, load, picture
 from neuprim.tasks.static.solids.shading import DAYLIGHT, encode_srgb, radiance

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import FormError, NonFiniteError
-from neuprim.core.fields import Constant, Cosine, RayNet
-from neuprim.core.primitives import Lowered
+from neuprim.core.model.fields import Constant, Cosine, RayNet
+from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.cpu.backward import backward_tiles, sum_rows
 from neuprim.core.render.cpu.binning import TileLists, bin_primitives
 from neuprim.core.render.cpu.colour_net import Net, net_backward, net_rows
@@ -21,9 +22,8 @@ from neuprim.core.render.cpu.entry import backward_tiles_by_entry, composite_til
 from neuprim.core.render.cpu.forward import composite_tiles
 from neuprim.core.render.cpu.layout import G_ERROR, G_NEURONS, G_WEIGHT, PER_NEURON, SPAN_WIDTH, TILE, gradient_width, row_width
 from neuprim.core.render.cpu.prepare import NON_FINITE, VISIBLE, prepare, prepare_backward, prepare_wide
-from neuprim.core.render.cpu.threads import parallel_for
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
-from neuprim.core.render.settings import RenderSettings
+from neuprim.core.settings import RenderSettings
 
 __all__ = ["render"]
 

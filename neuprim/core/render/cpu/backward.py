@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neuprim.core.render.cpu.compile import exact_kernel, inline, kernel
+from neuprim.core.compute.kernels import exact_kernel, inline, kernel
 from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH
 from neuprim.core.render.cpu.gradients import chord_gradient, field_gradient, two_neurons
 from neuprim.core.render.cpu.layout import (

@@ -9,10 +9,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from neuprim.core.render.cpu.compile import exact_kernel
+from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.compute.threads import parallel_for
 from neuprim.core.render.cpu.layout import HX, HY, SKEW, TILE, UNBOUNDED, UX, UY, XC, YC
 from neuprim.core.render.cpu.prepare import VISIBLE
-from neuprim.core.render.cpu.threads import parallel_for
 
 __all__ = ["TileLists", "bin_primitives", "depth_order"]
 

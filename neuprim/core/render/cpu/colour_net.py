@@ -1,4 +1,4 @@
-"""The per-primitive stage of a :class:`~neuprim.core.fields.RayNet`, in float64, and its hand-written backward.
+"""The per-primitive stage of a :class:`~neuprim.core.model.fields.RayNet`, in float64, and its hand-written backward.
 
 The network sees the chord's middle, x~_m = local (axes q) with q the middle in whitened space, which the density's pixel stage leaves
 in the lanes anyway. So its first layer goes to whitened axes and turns once per primitive, exactly as the density's neurons do, and
@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuprim.core.render.cpu.compile import exact_kernel
+from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.compute.threads import parallel_for
 from neuprim.core.render.cpu.layout import NET_OUT, PHASE, WX, net_row_width
 from neuprim.core.render.cpu.prepare import DELICATE_TURNS, rotation, rotation_backward
-from neuprim.core.render.cpu.threads import parallel_for
 
 __all__ = ["Net", "net_backward", "net_rows", "prepare_net"]
 

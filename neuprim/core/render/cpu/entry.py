@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from neuprim.core.compute.kernels import inline, kernel
 from neuprim.core.render.cpu.backward import opacity
-from neuprim.core.render.cpu.compile import inline, kernel
 from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH
 from neuprim.core.render.cpu.gradients import chord_gradient, field_gradient, two_neurons
 from neuprim.core.render.cpu.layout import (

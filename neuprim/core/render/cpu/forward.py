@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neuprim.core.render.cpu.compile import inline, kernel
+from neuprim.core.compute.kernels import inline, kernel
 from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH
 from neuprim.core.render.cpu.layout import (
     ALPHA,

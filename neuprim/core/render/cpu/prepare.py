@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from neuprim.core.render.cpu.compile import exact_kernel
+from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.render.cpu.layout import (
     AMPLITUDE,
     ANCHOR_Z,

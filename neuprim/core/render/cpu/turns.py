@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neuprim.core.render.cpu.compile import inline
+from neuprim.core.compute.kernels import inline
 
 __all__ = [
     "TAU",

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from neuprim.core.errors import ConfigError, DataError, nearest
-from neuprim.core.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.tasks.dynamic.simulation.projection import Box
 from neuprim.tasks.dynamic.simulation.scenes import SCENES, Scene, Stage
 from neuprim.tasks.dynamic.simulation.solver import State, advance

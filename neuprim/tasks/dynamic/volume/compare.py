@@ -9,8 +9,8 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from neuprim.core.density_grid import agreement, density_grid, lattice
-from neuprim.core.primitives import Primitives
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.volumes.grid import agreement, density_grid, lattice
 from neuprim.tasks.dynamic.volume.medium import Medium
 
 if TYPE_CHECKING:

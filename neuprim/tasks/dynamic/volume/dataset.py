@@ -12,11 +12,11 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from neuprim.core import images
 from neuprim.core.data import Clip, Dataset, DataSource, Pixels, PointCloud, View, ViewSet, camera_extent
 from neuprim.core.errors import DataError
-from neuprim.core.primitives import Primitives
-from neuprim.core.volume_source import Placement
+from neuprim.core.io import images
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.volumes.source import Placement
 from neuprim.tasks.dynamic.dead import dead_fraction
 from neuprim.tasks.dynamic.volume.compare import compare_with_truth
 from neuprim.tasks.dynamic.volume.shoot import Shoot

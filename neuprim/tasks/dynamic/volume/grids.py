@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from neuprim.core.errors import DataError, nearest
-from neuprim.core.vdb import Frame, Grid, read_grids, read_header
+from neuprim.core.io.vdb import Frame, Grid, read_grids, read_header
 
 __all__ = ["GridReader", "find_grids"]
 

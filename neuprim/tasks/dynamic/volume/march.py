@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import ConfigError
-from neuprim.core.render.cpu.threads import parallel_for
 from neuprim.tasks.dynamic.volume.medium import Medium
 from neuprim.tasks.dynamic.volume.traverse import radiances
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from neuprim.core.errors import DataError
-from neuprim.core.vdb import Survey
+from neuprim.core.io.vdb import Survey
 
 __all__ = ["Normalisation"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from neuprim.core.errors import ConfigError, DataError, nearest
-from neuprim.core.vdb import DENSE_LIMIT, Bounds, Grid
+from neuprim.core.io.vdb import DENSE_LIMIT, Bounds, Grid
 from neuprim.tasks.dynamic.volume.blackbody import black_body_rgb
 from neuprim.tasks.dynamic.volume.medium import Medium
 from neuprim.tasks.dynamic.volume.normalise import Normalisation

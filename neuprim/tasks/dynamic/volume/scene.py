@@ -13,8 +13,8 @@ import torch
 
 from neuprim.core.data import Dataset, DataSource
 from neuprim.core.errors import DataError
+from neuprim.core.io.vdb import Frame, sequence
 from neuprim.core.task import SceneContext
-from neuprim.core.vdb import Frame, sequence
 from neuprim.tasks.dynamic.simulation import simulate
 from neuprim.tasks.dynamic.volume.dataset import VolumeDataset
 from neuprim.tasks.dynamic.volume.grids import GridReader, find_grids

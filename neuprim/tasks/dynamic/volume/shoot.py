@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from neuprim.core import images
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import DataError
-from neuprim.core.files import write_json
-from neuprim.core.vdb import Frame
+from neuprim.core.io import images
+from neuprim.core.io.files import write_json
+from neuprim.core.io.vdb import Frame
 from neuprim.tasks.dynamic.volume.grids import GridReader
 from neuprim.tasks.dynamic.volume.march import integrate
 from neuprim.tasks.dynamic.volume.medium import Medium

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neuprim.core.volume_source import Placement, VolumeSource
+from neuprim.core.volumes.source import Placement, VolumeSource
 from neuprim.tasks.dynamic.volume.shoot import Shoot
 from neuprim.tasks.dynamic.volume.truth import VolumeTruth
 

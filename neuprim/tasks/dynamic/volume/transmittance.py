@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import ConfigError
-from neuprim.core.render.cpu.threads import parallel_for
 from neuprim.tasks.dynamic.volume.medium import Medium
 from neuprim.tasks.dynamic.volume.traverse import depths
 

@@ -16,7 +16,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from neuprim.core.render.cpu.compile import inline, kernel
+from neuprim.core.compute.kernels import inline, kernel
 
 __all__ = ["depths", "radiances"]
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from neuprim.core.density_truth import DensityTruth, TruthFrame
 from neuprim.core.errors import DataError
-from neuprim.core.vdb import Frame, sequence
+from neuprim.core.io.vdb import Frame, sequence
+from neuprim.core.volumes.truth import DensityTruth, TruthFrame
 from neuprim.tasks.dynamic.volume.compare import RESOLUTION, extinction_on
 from neuprim.tasks.dynamic.volume.shoot import Shoot
 

@@ -12,10 +12,10 @@ from PIL import Image
 from torch import Tensor
 
 from neuprim.core.data import Clip
-from neuprim.core.datasets.views import ImageViews
+from neuprim.core.data.views import ImageViews
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.images import read_image
-from neuprim.core.primitives import Primitives
+from neuprim.core.io.images import read_image
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import SceneContext
 from neuprim.tasks.relight import olat
 from neuprim.tasks.relight.data import PointLit

@@ -29,11 +29,11 @@ from PIL import Image
 
 from neuprim.core.cameras import look_at
 from neuprim.core.errors import DataError
-from neuprim.core.files import publish_folder
-from neuprim.core.images import write_exr
-from neuprim.core.solids.raycast import Scene
-from neuprim.core.solids.rays import bands, pixel_means
-from neuprim.core.solids.settings import check_names, check_whole, settings_key
+from neuprim.core.io.files import publish_folder
+from neuprim.core.io.images import write_exr
+from neuprim.scenes.raycast import Scene
+from neuprim.scenes.rays import bands, pixel_means
+from neuprim.scenes.settings import check_names, check_whole, settings_key
 from neuprim.tasks.relight.lit.rig import DISTANCE, Shot, splits
 from neuprim.tasks.relight.lit.scene import RADIUS, solids
 from neuprim.tasks.relight.lit.shading import shade

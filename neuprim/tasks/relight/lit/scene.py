@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from neuprim.core.solids.meshes import lathe, ring
-from neuprim.core.solids.shapes import FLOOR, Solid, build, plain
+from neuprim.scenes.meshes import lathe, ring
+from neuprim.scenes.shapes import FLOOR, Solid, build, plain
 
 __all__ = ["RADIUS", "solids"]
 

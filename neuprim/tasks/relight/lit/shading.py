@@ -1,7 +1,7 @@
 """What rays see of solids under one point light: direct light and hard shadows, nothing else. Linear RGB throughout.
 
 Radiance = (albedo / pi + highlight) cosine intensity / distance^2 where nothing lies between, else 0; see
-:mod:`neuprim.core.solids.reflectance`. Every ray falls into one class:
+:mod:`neuprim.scenes.reflectance`. Every ray falls into one class:
 
 * attached shadow: the surface, or its shading normal, faces away from the light;
 * cast shadow: it faces the light, but something lies between;
@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neuprim.core.solids.raycast import Scene
-from neuprim.core.solids.reflectance import dot, lobes
+from neuprim.scenes.raycast import Scene
+from neuprim.scenes.reflectance import dot, lobes
 from neuprim.tasks.relight.lit.rig import DISTANCE
 from neuprim.tasks.relight.measure import CLASSES
 

@@ -15,12 +15,12 @@ import torch
 
 from neuprim.core.cameras import Camera, opengl_to_viewmat
 from neuprim.core.data import Dataset
-from neuprim.core.datasets.common import every_nth, find_image, missing_files, posed_images, unique_names
-from neuprim.core.datasets.records import read_json
-from neuprim.core.datasets.settings import Setting, data_folder, read_settings, text
-from neuprim.core.datasets.views import Frame
+from neuprim.core.data.common import every_nth, find_image, missing_files, posed_images, unique_names
+from neuprim.core.data.records import read_json
+from neuprim.core.data.settings import Setting, data_folder, read_settings, text
+from neuprim.core.data.views import Frame
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.images import image_info
+from neuprim.core.io.images import image_info
 from neuprim.core.task import SceneContext
 
 __all__ = ["load"]

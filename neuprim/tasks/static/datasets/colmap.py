@@ -19,12 +19,12 @@ import torch
 
 from neuprim.core.cameras import Camera
 from neuprim.core.data import Dataset, PointCloud
-from neuprim.core.datasets.common import every_nth, missing_files, posed_images, unique_names
-from neuprim.core.datasets.distortion import Distortion
-from neuprim.core.datasets.settings import count, data_folder, flag, read_settings, text
-from neuprim.core.datasets.views import Frame
+from neuprim.core.data.common import every_nth, missing_files, posed_images, unique_names
+from neuprim.core.data.distortion import Distortion
+from neuprim.core.data.settings import count, data_folder, flag, read_settings, text
+from neuprim.core.data.views import Frame
 from neuprim.core.errors import BackendUnavailable, DataError
-from neuprim.core.images import ImageInfo, image_info
+from neuprim.core.io.images import ImageInfo, image_info
 from neuprim.core.task import SceneContext
 from neuprim.tasks.static.datasets.colmap_files import check_binary_model
 

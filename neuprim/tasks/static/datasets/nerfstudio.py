@@ -1,6 +1,6 @@
 """nerfstudio and instant-ngp captures: one ``transforms.json`` with intrinsics, lens distortion, OpenGL poses and masks.
 
-Frames are read by :mod:`neuprim.core.datasets.transforms`. Images are undistorted; what a photograph does not show is masked
+Frames are read by :mod:`neuprim.core.data.transforms`. Images are undistorted; what a photograph does not show is masked
 out, as is what ``mask_path`` blackens.
 
 Settings beside the common ones: ``skip_missing`` (default false: absent images are an error that lists them) and
@@ -18,10 +18,10 @@ import torch
 import trimesh
 
 from neuprim.core.data import Dataset, PointCloud
-from neuprim.core.datasets.common import missing_files, posed_images
-from neuprim.core.datasets.records import Record, read_json
-from neuprim.core.datasets.settings import count, data_folder, flag, read_settings
-from neuprim.core.datasets.transforms import read_frames, split_frames
+from neuprim.core.data.common import missing_files, posed_images
+from neuprim.core.data.records import Record, read_json
+from neuprim.core.data.settings import count, data_folder, flag, read_settings
+from neuprim.core.data.transforms import read_frames, split_frames
 from neuprim.core.errors import DataError
 from neuprim.core.task import SceneContext
 

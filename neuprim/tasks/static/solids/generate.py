@@ -25,12 +25,12 @@ from PIL import Image
 from neuprim.core.cameras import look_at
 from neuprim.core.data import Dataset
 from neuprim.core.errors import DataError
-from neuprim.core.files import publish_folder
-from neuprim.core.solids.raycast import Scene
-from neuprim.core.solids.rays import bands, pixel_means
-from neuprim.core.solids.settings import check_names, check_whole, settings_key
-from neuprim.core.solids.shapes import build
+from neuprim.core.io.files import publish_folder
 from neuprim.core.task import SceneContext
+from neuprim.scenes.raycast import Scene
+from neuprim.scenes.rays import bands, pixel_means
+from neuprim.scenes.settings import check_names, check_whole, settings_key
+from neuprim.scenes.shapes import build
 from neuprim.tasks.static.solids.shading import encode_srgb, radiance
 
 __all__ = ["GENERATOR_VERSION", "SolidsSettings", "camera_matrices", "generate", "load", "picture"]

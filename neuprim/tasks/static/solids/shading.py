@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neuprim.core.solids.raycast import Scene
-from neuprim.core.solids.reflectance import dot, reflected
+from neuprim.scenes.raycast import Scene
+from neuprim.scenes.reflectance import dot, reflected
 
 __all__ = ["DAYLIGHT", "Daylight", "encode_srgb", "radiance"]
 

@@ -1,0 +1,401 @@
+"""The ``neuprim`` command: parse, call, print.
+
+Exit status: 0 done, 1 no backend works (``doctor``), 2 the input's fault (one line on standard error), 130 interrupted. A bug in
+neuprim keeps its traceback. Heavy modules are imported by the subcommands that need them, so that help stays fast.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from neuprim import __version__
+from neuprim.cli import arguments
+from neuprim.cli.environment_flags import add_environment_flags, environment_of
+from neuprim.cli.export_help import export_help
+from neuprim.core.errors import DISK, ConfigError, NeuprimError, nearest
+from neuprim.core.notices import warnings_as_lines
+
+if TYPE_CHECKING:
+    from neuprim.config import RunConfig
+    from neuprim.core.task import TaskSpec
+
+__all__ = ["main"]
+
+COMMON_KEYS = """\
+commonest keys:
+  task=NAME scene=NAME preset=NAME     what to fit, and how (`neuprim tasks` lists them)
+  scene.path=DIR                       data of a scene that reads files
+  output_dir=DIR resume=true           where to write; continue an interrupted run
+  train.iterations=N train.max_seconds=S
+  model.primitives=N model.neurons=K model.sh_degree=D
+  train.rates.NAME=R                   learning rate of one parameter
+  renderer.backend=auto|reference|cpu  renderer.threads=N
+  renderer.sort=center|entry           renderer.samples=N (rays per pixel side)
+  seed=N
+`neuprim run task=NAME scene=NAME --cfg` shows every key with its value. A value that contains , = or brackets is quoted
+twice, for the shell and for the grammar: "scene.path='a=b, c'"."""
+
+EXAMPLES = """\
+examples:
+  neuprim run task=dynamic scene=smoke_fire
+  neuprim run task=dynamic scene=vdb scene.vdb=DIR scene.frames=0:100:2
+  neuprim run task=static scene=solids
+  neuprim run task=static scene=blender scene.path=DIR preset=paper
+  neuprim run -m model.primitives=200,1000 train.max_seconds=60"""
+
+
+class Parser(argparse.ArgumentParser):
+    """Reports a wrong command line as one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message} (see {self.prog} --help)")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command and returns its exit status."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        with warnings_as_lines():
+            return _dispatch(words)
+    except NeuprimError as error:
+        print(f"neuprim: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt as stop:
+        print(f"neuprim: interrupted{stop}", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # `neuprim tasks | head`; the interpreter's own flush at exit must not fail either
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except OSError as error:
+        if error.errno not in DISK:
+            raise
+        print(f"neuprim: error: {error.filename or 'writing'}: {error.strerror}", file=sys.stderr)
+        return 2
+    except SystemExit as stop:  # argparse, after --help and --version
+        return stop.code if isinstance(stop.code, int) else 0
+
+
+def _dispatch(words: list[str]) -> int:
+    parser, commands = _parsers(with_tasks=words[:1] == ["run"], asked=words[1:] if words[:1] == ["export"] else ())
+    if not words:
+        parser.print_help()
+        return 0
+    if not words[0].startswith("-") and words[0] not in commands:
+        raise ConfigError(f"{words[0]}: no such command{nearest(words[0], commands)}")
+    args, rest = parser.parse_known_args(words)
+    if args.command == "run":
+        args.overrides += [word for word in rest if not word.startswith("-")]  # argparse gives up on words after a flag
+        rest = [word for word in rest if word.startswith("-")]
+    if args.command in ("render", "inspect"):
+        args.conditions, rest = _conditions(args.run_dir, rest, args.command, commands[args.command])
+    if args.command == "export":
+        args.options, rest = _export_words(args.run_dir, rest, commands[args.command]), []
+    if rest:
+        known = [flag for flag in commands[args.command]._option_string_actions if flag.startswith("--")]
+        raise ConfigError(f"{rest[0]}: no such argument of `neuprim {args.command}`{nearest(rest[0], known)}")
+    call: Callable[[argparse.Namespace], int] = args.call
+    return call(args)
+
+
+def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[str, argparse.ArgumentParser]]:
+    parser = Parser(prog="neuprim", description="Radiance fields made of splattable neural primitives.", allow_abbrev=False)
+    parser.add_argument("--version", action="version", version=f"neuprim {__version__}")
+    sub = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    def command(name: str, call: Callable[[argparse.Namespace], int], summary: str, epilog: str = "") -> argparse.ArgumentParser:
+        raw = argparse.RawDescriptionHelpFormatter
+        made = sub.add_parser(name, help=summary, description=summary, epilog=epilog, formatter_class=raw, allow_abbrev=False)
+        made.set_defaults(call=call)
+        return made
+
+    run = command("run", _run, "fit a scene", "\n\n".join([COMMON_KEYS, *([_task_names()] if with_tasks else []), EXAMPLES]))
+    run.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings, in Hydra's grammar")
+    run.add_argument("-m", "--multirun", action="store_true", help="run every combination of values separated by commas")
+    run.add_argument("--cfg", action="store_true", help="print the resolved configuration and stop")
+
+    evaluate = command("eval", _eval, "measure a run on its test views")
+    evaluate.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+
+    render = command(
+        "render",
+        _render,
+        "draw images of a run",
+        "Each condition of the run's task (time, light, ...) is a flag, given after RUN_DIR: --time 0.5; a number may also be a list or a "
+        "range, --time 0.2,0.8 or --time 0:1:20, one frame each.",
+    )
+    render.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    render.add_argument("--camera", required=True, metavar="orbit|test|FILE.json", help="which cameras")
+    render.add_argument("--size", type=arguments.size, metavar="WxH", help="pixels (default: the data set's)")
+    render.add_argument("--format", choices=("png", "exr", "npy", "webp", "gif", "mp4"), help="default: png, or webp for an animation")
+    render.add_argument(
+        "--fps", type=arguments.rate, metavar="F", help="frames per second of an animation (default: about four seconds in all)"
+    )
+    render.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
+    render.add_argument("--frames", type=arguments.count, default=60, metavar="N", help="frames of an orbit (default: 60)")
+    add_environment_flags(render)
+
+    export = command("export", _export, "write a run's model in another format", export_help(asked))
+    export.usage = "neuprim export RUN_DIR --format NAME [KEY=VALUE ...] [--CONDITION TEXT ...] [--out PATH] [--force] [--json]"
+    export.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    export.add_argument("--format", required=True, metavar="vdb|ply|gaussian-ply|mesh|npz", help="or a plugin's")
+    export.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR/export)")
+    export.add_argument("--force", action="store_true", help="replace files that exist")
+    export.add_argument("--json", action="store_true", help="print JSON")
+
+    back = command("import", _import, "make a run directory of an exported .ply or .npz")
+    back.add_argument("file", type=Path, metavar="FILE")
+    back.add_argument("--out", type=Path, required=True, metavar="RUN_DIR", help="new directory")
+
+    inspect = command(
+        "inspect",
+        _inspect,
+        "look inside a run's density",
+        "Each condition of the run's task is a flag, given after RUN_DIR: --time 0.5, or several frames: --time 0:1:20, --time 0.2,0.8.",
+    )
+    inspect.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    inspect.add_argument(
+        "--show", default="", metavar="NAME,...", help="volume, isosurface, slices, primitives, primitive, difference, ..."
+    )
+    inspect.add_argument("--primitives", action="store_true", help="the ellipsoids in their own colours; as --show primitives")
+    inspect.add_argument("--primitive", type=arguments.row, metavar="INDEX", help="look into this one; as --show primitive")
+    inspect.add_argument("--against", metavar="FILE.vdb|DIR|scene", help="ground truth to compare with")
+    inspect.add_argument(
+        "--grid", type=arguments.count, default=128, metavar="N", help="points along the box's longest side (default: 128)"
+    )
+    inspect.add_argument(
+        "--box",
+        type=arguments.numbers,
+        metavar="X,Y,Z,X,Y,Z",
+        help="two corners, scene units, as --box=-1,-1,-1,1,1,1 (default: around all matter)",
+    )
+    inspect.add_argument("--level", type=arguments.numbers, default=[], metavar="S,...", help="extinctions of isosurfaces, 1/scene unit")
+    inspect.add_argument("--up", choices=("x", "y", "z"), help="the upward axis (default: the scene's, or z)")
+    inspect.add_argument("--size", type=arguments.size, metavar="WxH", help="pixels of the picture or window")
+    inspect.add_argument("--out", type=Path, metavar="FILE", help=".png, .webp, .gif, .mp4, .html or .vdb (default: a window)")
+    inspect.add_argument("--force", action="store_true", help="replace files that exist")
+
+    vdb = command("vdb", _vdb, "look into OpenVDB files", "`info` lists grids: type, transform, bounds, active voxels, values, memory.")
+    vdb.add_argument("action", choices=("info",), metavar="info", help="what to do")
+    vdb.add_argument("path", type=Path, metavar="FILE|DIR", help="a .vdb file, or a folder of frames")
+    vdb.add_argument("--json", action="store_true", help="print JSON")
+
+    command("tasks", _tasks, "list tasks, scenes, presets and other plugins, and the packages they come from")
+
+    new = command("new-task", _new_task, "write a small working package with a task of your own: see docs/plugins.md")
+    new.add_argument("name", metavar="NAME", help="what users will type after task=: lower-case letters, digits and _")
+    new.add_argument("--out", type=Path, metavar="DIR", help="a folder that does not exist yet (default: neuprim-NAME)")
+
+    command("doctor", _doctor, "show versions, devices and which renderer backends work here")
+    return parser, dict(sub.choices)
+
+
+# ---------------------------------------------------------------- commands
+
+
+def _run(args: argparse.Namespace) -> int:
+    from neuprim.config import compose, compose_all
+
+    check = not args.cfg
+    configs = compose_all(args.overrides, check) if args.multirun else [compose(args.overrides, check)]
+    if args.cfg:
+        print("---\n".join(config.to_yaml() for config in configs), end="")
+        return 0
+    if len(configs) == 1:
+        print(_fit(configs[0], args.overrides))
+        return 0
+    failed = 0
+    for number, config in enumerate(configs, 1):
+        print(f"[{number}/{len(configs)}] {config.output_dir}", flush=True)
+        try:
+            print(_fit(config, args.overrides), flush=True)
+        except NeuprimError as error:  # the other combinations are still worth having
+            failed += 1
+            print(f"neuprim: error: {config.output_dir}: {' '.join(str(error).split())}", file=sys.stderr)
+    return 2 if failed else 0
+
+
+def _fit(config: RunConfig, words: list[str]) -> Path:
+    """The run's directory; an interruption says where it is and what goes on with it, or with the sweep that ``words`` began."""
+    from neuprim.runs.fit import run
+
+    try:
+        return run(config)
+    except KeyboardInterrupt:
+        from neuprim.config.overrides import resuming
+
+        there = "has the run up to here" if (config.output_dir / "checkpoint.safetensors").exists() else "has no checkpoint yet"
+        command = shlex.join(["neuprim", "run", *resuming(words, config.output_dir)])
+        raise KeyboardInterrupt(f"; {config.output_dir} {there}; to go on:\n  {command}") from None
+
+
+def _eval(args: argparse.Namespace) -> int:
+    run_dir = _run_directory(args.run_dir)
+    from neuprim.runs.draw import evaluate_run
+
+    _print_metrics(evaluate_run(run_dir))
+    return 0
+
+
+def _render(args: argparse.Namespace) -> int:
+    run_dir = _run_directory(args.run_dir)
+    if args.camera not in ("orbit", "test"):
+        if not args.camera.lower().endswith(".json"):
+            raise ConfigError(f"--camera {args.camera}: expected orbit, test or a .json file")
+        if not Path(args.camera).is_file():
+            raise ConfigError(f"--camera {args.camera}: no such file")
+    environment = environment_of(args)
+    from neuprim.cli.console import plain_console
+    from neuprim.cli.progress import DrawProgress
+    from neuprim.runs.draw import render_run
+
+    with DrawProgress(plain_console(stderr=True)) as progress:
+        paths = render_run(
+            *(run_dir, args.camera, args.size, args.format, args.out, args.frames, args.conditions, args.fps),
+            environment=environment,
+            tell=progress.note,
+            progress=progress.show,
+        )
+    for path in paths:
+        print(path)
+    return 0
+
+
+def _export(args: argparse.Namespace) -> int:
+    run_dir = _run_directory(args.run_dir)
+    from neuprim.cli.console import plain_console
+    from neuprim.runs.export import export_run, print_report
+
+    print_report(export_run(run_dir, args.format, args.out, args.options, args.force, plain_console(stderr=True)), args.json)
+    return 0
+
+
+def _import(args: argparse.Namespace) -> int:
+    from neuprim.runs.export import import_run
+
+    print(import_run(args.file, args.out))
+    return 0
+
+
+def _inspect(args: argparse.Namespace) -> int:
+    run_dir = _run_directory(args.run_dir)
+    from neuprim.plugins.inspect import ViewOptions, corners
+    from neuprim.runs.inspect import Request, inspect_run
+
+    names = [name.strip() for name in args.show.split(",") if name.strip()]
+    names += ["primitives"] * args.primitives + ["primitive"] * (args.primitive is not None)
+    options, box = ViewOptions(tuple(args.level), args.primitive), None if args.box is None else corners(args.box)
+    more = {"options": options, "against": args.against, "out": args.out, "size": args.size, "up": args.up, "overwrite": args.force}
+    for path in inspect_run(Request(run_dir, names or ["volume"], args.conditions, args.grid, box, **more)):
+        print(path)
+    return 0
+
+
+def _vdb(args: argparse.Namespace) -> int:
+    from neuprim.cli.vdb_info import vdb_info
+
+    return vdb_info(args.path, args.json)
+
+
+def _tasks(args: argparse.Namespace) -> int:
+    from neuprim.cli.listing import list_plugins
+
+    print(*list_plugins(), sep="\n")
+    return 0
+
+
+def _new_task(args: argparse.Namespace) -> int:
+    from neuprim.cli.new_task import new_task
+
+    print(*new_task(args.name, args.out), sep="\n")
+    return 0
+
+
+def _doctor(args: argparse.Namespace) -> int:
+    from neuprim.cli.doctor import doctor
+
+    return doctor()
+
+
+# ---------------------------------------------------------------- arguments
+
+
+def _conditions(run_dir: Path, words: list[str], command: str, known: argparse.ArgumentParser) -> tuple[dict[str, str], list[str]]:
+    """Condition name -> text, from the flags that the run's task defines, and the words that are none of them."""
+    if not words:
+        return {}, []
+    from neuprim.core.conditions import split_words
+
+    task = _task_of(run_dir)
+    found, rest = split_words(words, task.conditions)
+    if rest:
+        raise _no_such(rest[0], command, known, task)
+    return found, []
+
+
+def _export_words(run_dir: Path, words: list[str], known: argparse.ArgumentParser) -> list[str]:
+    """The options and conditions of ``neuprim export``; refuses flags that are neither its own nor conditions."""
+    if any(word.startswith("-") for word in words):
+        from neuprim.core.conditions import split_words
+
+        task = _task_of(run_dir)
+        _, rest = split_words(words, task.conditions, bare=False)
+        for word in rest:
+            if word.startswith("-"):
+                raise _no_such(word, "export", known, task)
+    return words
+
+
+def _task_of(run_dir: Path) -> TaskSpec:
+    from neuprim.config import RunConfig, task_of
+
+    file = _run_directory(run_dir) / "config.yaml"
+    return task_of(RunConfig.from_yaml(file), file)
+
+
+def _no_such(word: str, command: str, known: argparse.ArgumentParser, task: TaskSpec) -> ConfigError:
+    from neuprim.core.conditions import flag
+
+    flags = [f for f in (*known._option_string_actions, *(flag(spec.name) for spec in task.conditions)) if f.startswith("--")]
+    return ConfigError(f"{word}: no such argument of `neuprim {command}` for task {task.name!r}{nearest(word, flags)}")
+
+
+def _run_directory(path: Path) -> Path:
+    if not path.is_dir():
+        raise ConfigError(f"{path}: no such run directory")
+    return path
+
+
+def _task_names() -> str:
+    from neuprim.plugins.registry import TASKS, list_tasks
+
+    lines = [f"  {TASKS.word(info)}  ({info.origin})" for info in list_tasks()]
+    return "\n".join(["tasks:", *(lines or ["  none is installed"])])
+
+
+# ---------------------------------------------------------------- output
+
+
+def _print_metrics(metrics: Mapping[str, Any]) -> None:
+    rows = list(_rows(metrics))
+    width = max((len(name) for name, _ in rows), default=0)
+    for name, value in rows:
+        print(f"{name:{width}}  {value}")
+
+
+def _rows(metrics: Mapping[str, Any], where: str = "") -> list[tuple[str, str]]:
+    rows: list[tuple[str, str]] = []
+    for key, value in metrics.items():
+        name = f"{where}{key}"
+        if isinstance(value, Mapping):
+            rows += _rows(value, name + ".")
+        elif isinstance(value, list) and value and all(isinstance(entry, Mapping) for entry in value):
+            rows.append((name, f"{len(value)} entries, in the run's metrics.json"))
+        else:
+            rows.append((name, f"{value:.4f}" if isinstance(value, float) else str(value)))
+    return rows

@@ -1,0 +1,164 @@
+"""``neuprim vdb info``: what is in OpenVDB files, as tables or JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from neuprim.cli.console import plain_console
+from neuprim.core.errors import DataError
+from neuprim.core.io.vdb import Grid, GridHeader, read_grids, read_header, sequence
+
+__all__ = ["describe_file", "vdb_info"]
+
+COLUMNS = ("grid", "type", "compression", "voxel size", "bounds", "active", "range", "dense")
+
+
+def vdb_info(path: Path, as_json: bool = False, console: Console | None = None) -> int:
+    """Prints the report on a file, or on every file of a folder; returns 0.
+
+    Raises:
+        DataError: nothing there, or a damaged file.
+    """
+    files, notes = _files(path)
+    if as_json:
+        print(json.dumps({"files": [describe_file(file) for file in files], "notes": notes}, indent=1, allow_nan=False))
+        return 0
+    console = console or plain_console()
+    for file in files:
+        _print(console, describe_file(file))
+    for note in notes:
+        console.print(Text(note))
+    return 0
+
+
+def _files(path: Path) -> tuple[list[Path], list[str]]:
+    """The files to show, in the order of their frames where they are frames, and remarks on the whole."""
+    if not path.is_dir():
+        return [path], []
+    try:
+        frames = sequence(path)
+    except DataError as error:
+        files = sorted(p for p in path.iterdir() if p.suffix.lower() == ".vdb" and p.is_file())
+        if not files:
+            raise
+        return files, [f"not one sequence: {error}"]
+    missing = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in frames.gaps)
+    note = f"{len(frames)} frames, {frames.frames[0].number} to {frames.frames[-1].number}; missing: {missing or 'none'}"
+    return [frame.path for frame in frames.frames], [note]
+
+
+def describe_file(path: Path) -> dict[str, Any]:
+    """Everything the report shows, as JSON-ready values: lengths in world units, bounds in voxel indices (upper ones excluded)."""
+    header = read_header(path)
+    grids = read_grids(path, level_sets=True)  # in the same order, one in memory at a time
+    return {
+        "path": str(path),
+        "version": header.version,
+        "library": list(header.library),
+        "metadata": _plain(header.metadata),
+        "grids": [_describe(entry, None if entry.undecodable() else next(grids)) for entry in header.grids],
+    }
+
+
+def _describe(header: GridHeader, grid: Grid | None) -> dict[str, Any]:
+    """One grid; grids that cannot be decoded have a ``reason`` and no numbers from voxels."""
+    entry: dict[str, Any] = {
+        "name": header.name,
+        "class": header.kind,
+        "type": header.type,
+        "half": header.half,
+        "compression": header.compression,
+        "map": header.map,
+        "transform": None if header.transform is None else header.transform.tolist(),
+        "voxel_size": None if header.voxel_size is None else list(header.voxel_size),
+        "metadata": _plain(header.metadata),
+        "reason": header.refusal(),
+    }
+    if grid is None:
+        return entry
+    box = grid.world_bounds()
+    return entry | {
+        "background": [_number(v) for v in grid.background.ravel().tolist()],
+        "bounds": None if grid.bounds is None else [list(corner) for corner in grid.bounds],
+        "world_bounds": None if box is None else box.tolist(),
+        "leaves": len(grid.values),
+        "tiles": len(grid.tiles),
+        "active_voxels": grid.active_voxels,
+        "range": None if grid.range is None else list(grid.range),
+        "non_finite": grid.non_finite,
+        "sparse_bytes": grid.sparse_bytes,
+        "dense_bytes": grid.dense_bytes,
+    }
+
+
+def _plain(metadata: Any) -> dict[str, Any]:
+    return {name: _value(value) for name, value in metadata.items()}
+
+
+def _value(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
+    return [_number(v) for v in value] if isinstance(value, tuple) else _number(value)
+
+
+def _number(value: Any) -> Any:
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value  # JSON knows no NaN
+
+
+def _print(console: Console, file: dict[str, Any]) -> None:
+    count = len(file["grids"])
+    title = f"{file['path']}  (version {file['version']}, {count} {'grid' if count == 1 else 'grids'})"
+    table = Table(title=Text(_clean(title)), title_justify="left", box=SIMPLE_HEAD)
+    for name in COLUMNS:
+        table.add_column(name, overflow="fold", no_wrap=name in ("bounds", "active", "range", "dense"))
+    for grid in file["grids"]:
+        table.add_row(*(Text(_clean(cell)) for cell in _cells(grid)))
+    console.print(table)
+    for line in _remarks(file["grids"]):
+        console.print(Text(_clean(f"  {line}")))
+
+
+def _cells(grid: dict[str, Any]) -> Iterator[str]:
+    size = grid["voxel_size"]
+    kind = grid["type"].removeprefix("Tree_").removesuffix("_5_4_3") + " as half" * grid["half"]
+    yield from (grid["name"], f"{kind}\n{grid['class']}", grid["compression"].replace(" + ", "\n"))
+    yield grid["map"] if size is None else "\n".join(f"{v:.4g}" for v in (size[:1] if len(set(size)) == 1 else size))
+    if "bounds" not in grid:
+        yield from ("not read", "", "", "")
+        return
+    box, span = grid["bounds"], grid["range"]
+    yield "empty" if box is None else "\n".join(f"{a}:{b}" for a, b in zip(*box, strict=True))
+    yield f"{grid['active_voxels']:,}"
+    yield "–" if span is None else f"{span[0]:.4g}\n{span[1]:.4g}"
+    yield _bytes(grid["dense_bytes"])
+
+
+def _remarks(grids: list[dict[str, Any]]) -> Iterator[str]:
+    for grid in grids:
+        if grid["reason"]:
+            yield f"{grid['name']}: {grid['reason']}"
+        if grid.get("non_finite"):
+            yield f"{grid['name']}: {grid['non_finite']} active values are NaN or infinite"
+
+
+def _bytes(count: int) -> str:
+    size = float(count)
+    for unit in ("B", "KiB", "MiB", "GiB"):
+        if size < 1024:
+            return f"{size:.3g} {unit}" if unit != "B" else f"{count} B"
+        size /= 1024
+    return f"{size:,.3g} TiB"
+
+
+def _clean(text: str) -> str:
+    """Names in files may hold control characters; a terminal must not act on them."""
+    return "".join(c if c.isprintable() or c == "\n" else "�" for c in text)

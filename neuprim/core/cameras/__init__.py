@@ -1,0 +1,5 @@
+"""Cameras: pinholes, other central projections, and files of them."""
+
+from neuprim.core.cameras.pinhole import Camera, check_viewmat, look_at, opengl_to_viewmat, orbit
+
+__all__ = ["Camera", "check_viewmat", "look_at", "opengl_to_viewmat", "orbit"]

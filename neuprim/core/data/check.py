@@ -1,0 +1,195 @@
+"""What a data set promises (see :mod:`neuprim.core.data`), compared with what it holds: one line names view, member, found and expected.
+
+Shapes and dtypes are compared wherever pixels are drawn, which costs nothing; values are looked through once, for the first view of
+each split, before a run starts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, get_args
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.cameras.rays import AnyCamera, RayCamera
+from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, View, ViewSet
+from neuprim.core.errors import DataError
+from neuprim.core.model.fields import ConditionSpec
+
+__all__ = ["DatasetFault", "check_dataset", "check_mask", "check_pixels", "check_points"]
+
+
+class DatasetFault(DataError):
+    """A loader broke a promise of :class:`~neuprim.core.data.Dataset`; whoever knows the loader's package adds its name."""
+
+
+def check_dataset(dataset: Dataset, conditions: Sequence[ConditionSpec]) -> None:
+    """Refuse a data set that would fail in the middle of a run.
+
+    Looks at its members, every view without its pixels, and the pixels of the first view of both splits.
+
+    Raises:
+        DatasetFault: naming member or view, what was found and what was expected.
+    """
+    _members(dataset)
+    for split in ("train", "test"):
+        views: ViewSet = getattr(dataset, split)
+        if len(views) == 0:
+            raise DatasetFault(f"{dataset.name}: the {'training' if split == 'train' else split} split is empty")
+        for i in range(len(views)):
+            _view(views.view(i), f"{split} view {i}", conditions)
+        view, pixels = views.view(0), views.pixels(0)
+        check_pixels(split, view, pixels, dataset.channels)
+        for name in ("rgb", "alpha"):
+            value = getattr(pixels, name)
+            if value is not None:
+                _finite(value, f"{split} view {view.name}: {name}")
+
+
+def check_pixels(split: str, view: View, pixels: Pixels, channels: int) -> None:
+    """Shapes and dtypes of one view's pixels: those of its camera and of the data set's channels.
+
+    Args:
+        split: "train" or "test", for the message.
+
+    Raises:
+        DatasetFault: naming view, member, found and expected.
+    """
+    size = (view.camera.height, view.camera.width)
+    if not isinstance(pixels, Pixels):
+        raise DatasetFault(f"{split} view {view.name}: pixels are {_described(pixels)}; expected a neuprim.core.data.Pixels")
+    rgb, alpha, mask = pixels.rgb, pixels.alpha, pixels.mask
+    if not (_is(rgb, torch.float32) and rgb.shape == (*size, channels)):
+        _refuse(f"{split} view {view.name}: rgb", rgb, torch.float32, (*size, channels), ", rows x columns x channels")
+    if alpha is not None and not (_is(alpha, torch.float32) and alpha.shape == size):
+        _refuse(f"{split} view {view.name}: alpha", alpha, torch.float32, size, ", rows x columns, or None")
+    if mask is not None:
+        check_mask(split, view, mask)
+
+
+def check_mask(split: str, view: View, mask: Tensor) -> None:
+    """As :func:`check_pixels`, of a mask alone."""
+    size = (view.camera.height, view.camera.width)
+    if not (_is(mask, torch.bool) and mask.shape == size):
+        _refuse(f"{split} view {view.name}: mask", mask, torch.bool, size, ", rows x columns, or None")
+
+
+def check_points(cloud: PointCloud, count: int, dataset: Dataset) -> None:
+    """Starting points, of which ``count`` at most were asked for.
+
+    Raises:
+        DatasetFault: naming member, found and expected.
+    """
+    where = f"{dataset.name}: starting points"
+    if not isinstance(cloud, PointCloud):
+        raise DatasetFault(f"{where}: found {_described(cloud)}; expected a neuprim.core.data.PointCloud")
+    found = len(cloud.means) if isinstance(cloud.means, Tensor) and cloud.means.dim() else 0
+    if found > count:
+        raise DatasetFault(f"{where}: found {found} points; expected at most {count}")
+    _floats(f"{where}: means", cloud.means, (found, 3))
+    _floats(f"{where}: colors", cloud.colors, (found, dataset.channels))
+    for name, columns in (("axes", (3,)), ("quats", (4,)), ("alphas", ())):
+        if getattr(cloud, name) is not None:
+            _floats(f"{where}: {name}", getattr(cloud, name), (found, *columns))
+    for name, value in cloud.conditions.items():
+        _floats(f"{where}: condition {name!r}", value, (found,))
+
+
+# ---------------------------------------------------------------- members and views
+
+
+def _members(dataset: Dataset) -> None:
+    who = str(getattr(dataset, "name", type(dataset).__name__))
+    for name in ("name", "train", "test", "channels", "color_space", "data_source", "extent", "background", "up", "center"):
+        if not hasattr(dataset, name):
+            raise DatasetFault(f"{who}: {name} is missing; see neuprim.core.data.Dataset")
+    for split in ("train", "test"):
+        value = getattr(dataset, split)
+        if not isinstance(value, ViewSet):
+            raise DatasetFault(f"{who}: {split} is {_described(value)}; expected a neuprim.core.data.ViewSet")
+    channels, extent, bounds = dataset.channels, dataset.extent, dataset.bounds
+    if not isinstance(channels, int) or channels < 1:
+        raise DatasetFault(f"{who}: channels is {channels!r}; expected a whole number, 1 or more")
+    _one_of(f"{who}: color_space", dataset.color_space, ("srgb", "linear"))
+    _one_of(f"{who}: data_source", dataset.data_source, get_args(DataSource))
+    if not isinstance(extent, (int, float)) or not 0 < extent < float("inf"):
+        raise DatasetFault(f"{who}: extent is {extent!r}; expected a positive number of scene units")
+    _floats(f"{who}: background", dataset.background, (channels,), f", one number for each of the {channels} channels")
+    _floats(f"{who}: up", dataset.up, (3,))
+    _floats(f"{who}: center", dataset.center, (3,))
+    if bounds is not None:
+        _floats(f"{who}: bounds", bounds, (2, 3), ", lower and upper corner, or None")
+
+
+def _view(view: View, where: str, conditions: Sequence[ConditionSpec]) -> None:
+    if not isinstance(view, View):
+        raise DatasetFault(f"{where}: found {_described(view)}; expected a neuprim.core.data.View")
+    where = f"{where} ({view.name})" if view.name else where
+    if not isinstance(view.name, str) or not view.name:
+        raise DatasetFault(f"{where}: name is {view.name!r}; expected text")
+    _camera(view.camera, where)
+    for spec in conditions:
+        if spec.name not in view.conditions:
+            there = ", ".join(sorted(view.conditions)) or "none"
+            raise DatasetFault(f"{where}: condition {spec.name!r} is missing; found {there}, the task needs it")
+        value, shape = view.conditions[spec.name], tuple(spec.shape)
+        if not isinstance(value, Tensor) or tuple(value.shape) != shape:
+            _refuse(f"{where}: condition {spec.name!r}", value, torch.float32, shape)
+        _finite(value, f"{where}: condition {spec.name!r}")
+
+
+def _camera(camera: AnyCamera, where: str) -> None:
+    if isinstance(camera, Camera):
+        if not isinstance(camera.viewmat, Tensor):
+            raise DatasetFault(f"{where}: camera: viewmat is {_described(camera.viewmat)}; expected a tensor (4, 4)")
+        try:
+            camera.validate(f"{where}: camera")
+        except DataError as error:
+            raise DatasetFault(str(error)) from error
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise DatasetFault(f"{where}: camera is {camera!r}; expected numbers ({error})".replace("\n", " ")) from error
+    elif not isinstance(camera, RayCamera):
+        raise DatasetFault(f"{where}: camera is {_described(camera)}; expected a neuprim.core.cameras.Camera")
+
+
+# ---------------------------------------------------------------- comparing
+
+
+def _is(value: Any, dtype: torch.dtype) -> bool:
+    return isinstance(value, Tensor) and value.dtype == dtype
+
+
+def _floats(where: str, value: Any, shape: tuple[int, ...], more: str = "") -> None:
+    """Finite floating numbers of any precision."""
+    if not (isinstance(value, Tensor) and value.is_floating_point() and tuple(value.shape) == shape):
+        _refuse(where, value, torch.float32, shape, more)
+    _finite(value, where)
+
+
+def _finite(value: Tensor, where: str) -> None:
+    bad = ~torch.isfinite(value)
+    if bool(bad.any()):
+        place = bad.nonzero()[0].tolist()
+        first = f", the first at {place}" if place else ""
+        raise DatasetFault(f"{where}: found {int(bad.sum())} values that are NaN or infinite{first}; expected finite numbers")
+
+
+def _one_of(where: str, value: object, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise DatasetFault(f"{where} is {value!r}; expected {' or '.join(choices)}")
+
+
+def _refuse(where: str, value: Any, dtype: torch.dtype, shape: tuple[int, ...], more: str = "") -> None:
+    raise DatasetFault(f"{where} is {_described(value)}; expected {_name(dtype)} {shape}{more}")
+
+
+def _described(value: Any) -> str:
+    if isinstance(value, Tensor):
+        return f"{_name(value.dtype)} {tuple(value.shape)}"
+    return "None" if value is None else f"a {type(value).__module__}.{type(value).__qualname__}".replace("a builtins.", "a ")
+
+
+def _name(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")

@@ -1,0 +1,195 @@
+"""What the loaders share: file checks, and the Dataset made of posed image files."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.data import Dataset, PointCloud, ViewSet, camera_extent
+from neuprim.core.data.focus import focus_point
+from neuprim.core.data.initial import initial_points
+from neuprim.core.data.views import Frame, ImageViews
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.task import SceneContext
+
+__all__ = ["IMAGE_SUFFIXES", "PosedImages", "StartingPoints", "every_nth", "find_image", "missing_files", "posed_images", "unique_names"]
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG", ".EXR")
+_LISTED = 10
+
+Made = TypeVar("Made", bound="PosedImages")
+
+StartingPoints = Callable[[ViewSet, int, torch.Generator], PointCloud]
+"""(training views, count, generator) -> at most ``count`` distinct starting points."""
+
+
+def find_image(folder: Path, text: str) -> Path | None:
+    """The image that ``text`` names below ``folder``: as written, else with the usual suffixes added; None if there is none."""
+    text = str(folder / text.replace("\\", "/"))
+    try:
+        return next((Path(text + s) for s in ("", *IMAGE_SUFFIXES) if Path(text + s).is_file()), None)
+    except OSError:  # a name longer than the file system can hold
+        return None
+
+
+def missing_files(where: str, names: Sequence[str], hint: str = "") -> DataError:
+    """One error for all absent files, the first ten by name."""
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return DataError(f"{where}: {len(names)} files not found: {', '.join(names[:_LISTED])}{more}{hint}")
+
+
+def unique_names(paths: Iterable[str], where: str) -> list[str]:
+    """A file-name-safe name per image path: its stem, or the whole path with ``_`` for ``/`` where stems repeat.
+
+    Raises:
+        DataError: one path occurs twice.
+    """
+    texts = [p.replace("\\", "/").removeprefix("./") for p in paths]
+    repeated = [p for p, n in Counter(texts).items() if n > 1]
+    if repeated:
+        raise DataError(f"{where}: image {repeated[0]!r} is listed {Counter(texts)[repeated[0]]} times; expected once")
+    stems = [_stem(p) for p in texts]
+    if len(set(stems)) < len(stems):
+        stems = [(_stem(p, whole=True)).replace("/", "_") for p in texts]
+    if len(set(stems)) < len(stems):  # a_b.png beside a/b.png, or b.png beside b.jpg
+        stems = [f"{i:04d}_{s}" for i, s in enumerate(stems)]
+    return stems
+
+
+def _stem(path: str, whole: bool = False) -> str:
+    text = path.strip("/") if whole else path.rstrip("/").rsplit("/", 1)[-1]
+    return next((text[: -len(s)] for s in IMAGE_SUFFIXES if text.endswith(s)), text)
+
+
+def every_nth(frames: Sequence[Frame], n: int) -> tuple[list[Frame], list[Frame]]:
+    """(the others, every n-th beginning with the first)."""
+    return [f for i, f in enumerate(frames) if i % n], list(frames[::n])
+
+
+class PosedImages(Dataset):
+    """Image files with poses, and a rule for starting points."""
+
+    train: ImageViews
+    test: ImageViews
+
+    def __init__(
+        self,
+        name: str,
+        train: ImageViews,
+        test: ImageViews,
+        linear: bool,
+        background: Tensor,
+        random_background: bool,
+        downsampling: str,
+        up: Tensor,
+        start: StartingPoints,
+    ) -> None:
+        cameras = [train.view(i).camera for i in range(len(train))]
+        self.name = name
+        self.train = train
+        self.test = test
+        self.channels = 3
+        self.color_space = "linear" if linear else "srgb"
+        self.data_source = "real"
+        self.extent = camera_extent(cameras)
+        self.background = background
+        self.random_background = random_background
+        self.downsampling = downsampling
+        self.up = up
+        self.center = focus_point(cameras).float()
+        self._start = start
+
+    def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
+        """Those of the training views, by the rule that the loader chose."""
+        return self._start(self.train, count, generator)
+
+
+def posed_images(
+    where: str,
+    name: str,
+    train: Sequence[Frame],
+    test: Sequence[Frame],
+    settings: Mapping[str, Any],
+    context: SceneContext,
+    up: Tensor | None = None,
+    points: PointCloud | None = None,
+    prefix: str = "",
+    start: StartingPoints | None = None,
+    to_linear: bool = False,
+    kind: type[Made] = PosedImages,  # type: ignore[assignment]
+) -> Made:
+    """The data set of two splits.
+
+    Args:
+        where: file or folder that errors name.
+        settings: the common settings, already checked.
+        up: (3,) upward direction; None takes the mean of the cameras' own.
+        points: starting points that the format brings, if any.
+        prefix: reduction already in the files, e.g. "images_4".
+        start: another rule for starting points; None takes ``points``, else the visual hull of the alpha masks, else a box in
+            front of the cameras, which suits scenes at rest (:func:`neuprim.core.data.initial.initial_points`).
+        to_linear: turn sRGB files into linear light.
+        kind: the class to make.
+
+    Raises:
+        DataError: an empty split, an image without alpha beside one with, sRGB beside linear files, or damaged images.
+        ConfigError: a random background for images without alpha, or a down-sampling factor larger than an image.
+    """
+    for split, frames in (("training", train), ("test", test)):
+        if not frames:
+            raise DataError(f"{where}: the {split} split has no images; expected at least one")
+    both = [*train, *test]
+    for frame in both:
+        if frame.info.linear != both[0].info.linear:
+            raise DataError(f"{frame.path}: mixes OpenEXR (linear) and PNG/JPEG (sRGB) with {both[0].path}; expected one kind")
+        if frame.info.channels != both[0].info.channels:
+            raise DataError(
+                f"{frame.path}: image has {frame.info.channels} channels, {both[0].path} has {both[0].info.channels}; expected all RGB or all RGBA"
+            )
+    alpha = both[0].info.channels == 4
+    background = settings["background"]
+    if background == "auto":
+        background = "white" if alpha else "black"
+    if background == "random" and not alpha:
+        raise ConfigError(f"scene.background is 'random', but the images in {where} have no alpha; expected auto, white or black")
+    factor = settings["downsample"]
+    views = [ImageViews(frames, factor, to_linear=to_linear) for frames in (train, test)]
+    if settings["preload"]:
+        for split, images in zip(("training", "test"), views, strict=True):
+            images.preload(lambda fraction, split=split: context.progress(f"reading {split} images", fraction))  # type: ignore[misc]
+    return kind(
+        name=name,
+        train=views[0],
+        test=views[1],
+        linear=to_linear or both[0].info.linear,
+        background=torch.full((3,), 0.0 if background == "black" else 1.0),
+        random_background=background == "random",
+        downsampling=", then ".join(t for t in (prefix, _reduction(both, views[0].view(0).camera, factor)) if t) or "none",
+        up=_mean_up([f.camera for f in train]) if up is None else up,
+        start=start or (lambda views, count, generator: initial_points(views, points, count, generator)),
+    )
+
+
+def _reduction(frames: Sequence[Frame], reduced: Camera, factor: int) -> str:
+    """E.g. "200x200 from 800x800 by area", "1/4 by area" where sizes differ, "" for none."""
+    if factor == 1:
+        return ""
+    sizes = {(f.info.width, f.info.height) for f in frames}
+    if len(sizes) > 1:
+        return f"1/{factor} by area"
+    width, height = sizes.pop()
+    return f"{reduced.width}x{reduced.height} from {width}x{height} by area"
+
+
+def _mean_up(cameras: Sequence[Camera]) -> Tensor:
+    """(3,) mean of the cameras' upward directions; +z where they cancel."""
+    up = -torch.stack([c.viewmat[1, :3] for c in cameras]).mean(0)
+    if up.norm() < 1e-3:
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    return (up / up.norm()).float()

@@ -1,0 +1,174 @@
+"""The visual hull: the voxels that no alpha mask rules out (Laurentini, 1994), found coarse to fine.
+
+Each voxel is tested by the box of pixels around its projection, counted in a summed-area table: coarse levels use a box
+that covers the whole voxel, so that thin parts are never lost before the finest grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.data import ViewSet
+from neuprim.core.data.focus import focus_point
+from neuprim.core.errors import DataError
+
+__all__ = ["EmptyHull", "hull_surface"]
+
+_VIEWS = 100
+_MASK_SIDE = 400
+_COARSE = 64
+
+
+class EmptyHull(DataError):
+    """No voxel is left, so masks and cameras disagree, or nothing is opaque."""
+
+
+@dataclass(frozen=True)
+class _Silhouette:
+    """A mask's camera and the (H+1, W+1) int32 summed-area table of its pixels that may show matter."""
+
+    camera: Camera
+    table: Tensor
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Cubic voxels: lower corner (3,), side, and (X, Y, Z) bool of those that remain."""
+
+    corner: Tensor
+    voxel: float
+    full: Tensor
+
+    def centers(self, cells: Tensor) -> Tensor:
+        return self.corner + (cells.double() + 0.5) * self.voxel
+
+
+def hull_surface(
+    views: ViewSet, resolution: int, seen_views: float = 0.5, wrong_views: float = 0.02, matter: float = 0.5
+) -> tuple[Tensor, float]:
+    """Centres (M, 3) float32 of the hull's surface voxels, and the voxel side, scene units.
+
+    A voxel stays if enough views look at it and all but a few of the views show matter there.
+
+    Args:
+        resolution: voxels along the hull's longest side.
+        seen_views: which part of the views must look at a voxel, the more the fewer there are.
+        wrong_views: which part of the views may show no matter there.
+        matter: the alpha above which a pixel shows matter.
+
+    Raises:
+        EmptyHull: no voxel is left.
+    """
+    silhouettes = _silhouettes(views, matter)
+    cameras = [s.camera for s in silhouettes]
+    center = focus_point(cameras)
+    half = torch.stack([c.position.double() for c in cameras]).sub(center).norm(dim=-1).median().item() or 1.0
+    everything = torch.ones((_COARSE,) * 3, dtype=torch.bool)
+    grid = _carved(_Grid(center - half, 2.0 * half / _COARSE, everything), silhouettes, 0.87, seen_views, wrong_views)
+    grid = _carved(_refined(grid, _COARSE), silhouettes, 0.87, seen_views, wrong_views)
+    grid = _carved(
+        _refined(grid, resolution), silhouettes, 0.25, seen_views, wrong_views
+    )  # wider and the hull swells, narrower and it tears
+    core = -F.max_pool3d(-F.pad(grid.full[None].float(), (1,) * 6), 3, stride=1)[0] > 0.5
+    return grid.centers((grid.full & ~core).nonzero()).float(), grid.voxel
+
+
+def _silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
+    """Masks of evenly chosen views, in an order in which neighbours in the list look from different sides."""
+    chosen = sorted({round(i * (len(views) - 1) / max(1, min(len(views), _VIEWS) - 1)) for i in range(min(len(views), _VIEWS))})
+    chosen.sort(key=lambda i: i * 0.6180339887 % 1.0)
+    found = []
+    for index in chosen:
+        camera, pixels = views.view(index).camera, views.pixels(index)
+        if pixels.alpha is None:
+            continue
+        matter = pixels.alpha > threshold
+        if pixels.mask is not None:
+            matter |= ~pixels.mask  # pixels that do not count rule nothing out
+        n = -(-max(camera.width, camera.height) // _MASK_SIDE)
+        small = F.max_pool2d(matter[None].float(), n, ceil_mode=True)[0]
+        table = F.pad(small.to(torch.int32).cumsum(0).cumsum(1), (1, 0, 1, 0)).to(torch.int32)
+        scaled = Camera(camera.viewmat, camera.fx / n, camera.fy / n, camera.cx / n, camera.cy / n, small.shape[1], small.shape[0])
+        found.append(_Silhouette(scaled, table))
+    return found
+
+
+def _refined(grid: _Grid, resolution: int) -> _Grid:
+    """A grid over the box of what is full, ``resolution`` voxels along its longest side, full where the coarse one is."""
+    cells = grid.full.nonzero()
+    low, high = cells.min(0).values, cells.max(0).values + 1
+    voxel = grid.voxel * float((high - low).max()) / resolution
+    counts = ((high - low).double() * grid.voxel / voxel).ceil().long().clamp(1, resolution)
+    parents = [
+        (((torch.arange(int(n)) + 0.5) * voxel / grid.voxel).long() + lo).clamp_max(hi - 1)
+        for n, lo, hi in zip(counts, low, high, strict=True)
+    ]
+    full = grid.full[parents[0]][:, parents[1]][:, :, parents[2]]
+    return _Grid(grid.corner + low.double() * grid.voxel, voxel, full)
+
+
+def _carved(grid: _Grid, silhouettes: list[_Silhouette], reach: float, seen_views: float, wrong_views: float) -> _Grid:
+    """The grid without the voxels that the masks rule out; ``reach`` is half the side of the tested box, in voxels."""
+    cells = grid.full.nonzero()
+    poses = torch.stack([s.camera.viewmat[:3].double() for s in silhouettes]).numpy()
+    cameras = [s.camera for s in silhouettes]
+    lenses = np.array([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras], dtype=np.float64)
+    sizes = np.array([s.table.numel() for s in silhouettes], dtype=np.int64)
+    tables = torch.cat([s.table.reshape(-1) for s in silhouettes]).numpy()
+    allowed, needed = int(wrong_views * len(silhouettes)), max(1.0, seen_views * len(silhouettes))
+    points = grid.centers(cells).numpy()
+    keep = _test_points(points, poses, lenses, np.cumsum(sizes) - sizes, tables, reach * grid.voxel, allowed, needed)
+    cells = cells[torch.from_numpy(keep)]
+    if len(cells) == 0:
+        raise EmptyHull(
+            f"the visual hull of {len(silhouettes)} alpha masks is empty: no point in front of the cameras is opaque in all views; "
+            "expected masks of one scene and poses that agree with them"
+        )
+    full = torch.zeros_like(grid.full)
+    full[tuple(cells.unbind(-1))] = True
+    return _Grid(grid.corner, grid.voxel, full)
+
+
+@exact_kernel
+def _test_points(points: Any, poses: Any, lenses: Any, offsets: Any, tables: Any, reach: float, allowed: int, needed: float) -> Any:
+    """(M,) bool of the points that ``needed`` views look at and at most ``allowed`` of those rule out.
+
+    Args:
+        points: (M, 3). poses: (V, 3, 4) world to camera. lenses: (V, 6) fx fy cx cy width height, all float64.
+        offsets: (V,) where a view's summed-area table, (height+1, width+1), begins in ``tables``.
+        reach: half the side of the cube around a point whose projection is searched for matter.
+    """
+    keep = np.zeros(len(points), dtype=np.bool_)
+    for i in range(len(points)):
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        seen, wrong = 0, 0
+        for j in range(len(poses)):
+            pose = poses[j]
+            z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+            if z <= 1e-6:
+                continue
+            fx, fy, cx, cy, width, height = lenses[j]
+            u = fx * (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]) / z + cx
+            v = fy * (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]) / z + cy
+            if not (0.0 <= u < width and 0.0 <= v < height):
+                continue
+            seen += 1
+            du, dv = fx * reach / z, fy * reach / z
+            left, right = int(max(u - du, 0.0)), int(min(u + du + 1.0, width))
+            top, bottom = int(max(v - dv, 0.0)), int(min(v + dv + 1.0, height))
+            low = offsets[j] + top * (int(width) + 1)
+            high = offsets[j] + bottom * (int(width) + 1)
+            if tables[high + right] - tables[low + right] - tables[high + left] + tables[low + left] == 0:
+                wrong += 1
+                if wrong > allowed:
+                    break
+        keep[i] = wrong <= allowed and seen >= needed
+    return keep

@@ -1,0 +1,256 @@
+"""Posed image files as a ViewSet: decoded on demand, undistorted, down-sampled, and kept as compact copies."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.data import Pixels, View, ViewSet
+from neuprim.core.data.distortion import Distortion, resample, source_grid
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.io.images import ImageInfo, read_image, read_mask, srgb_to_linear
+from neuprim.core.model.fields import Conditions
+
+__all__ = ["Frame", "ImageViews", "SomeViews"]
+
+_CACHE_BYTES = 2 * 2**30
+_GRIDS = 4
+_LINEAR = srgb_to_linear(torch.arange(256) / 255.0)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image file and its pose.
+
+    Attributes:
+        name: unique within its split.
+        camera: the undistorted view at the file's own size.
+        info: the file's header.
+        mask: image whose zero pixels do not count, or None.
+        distortion: the lens that took the file, or None for a pinhole.
+        conditions: what the frame depends on besides its camera (time, light, ...); empty for static scenes.
+    """
+
+    name: str
+    path: Path
+    camera: Camera
+    info: ImageInfo
+    mask: Path | None = None
+    distortion: Distortion | None = None
+    conditions: Conditions = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """(H, W, C) uint8, half or float copy of a view's final pixels, and which of them count."""
+
+    data: Tensor
+    premultiplied: bool
+    mask: Tensor | None
+
+
+@exact_kernel
+def _premultiply(rgba, rgb, alpha):  # type: ignore[no-untyped-def]
+    scale = np.float32(1.0 / 255.0)
+    for i in range(rgba.shape[0]):
+        a = np.float32(rgba[i, 3]) * scale
+        alpha[i] = a
+        for c in range(3):
+            rgb[i, c] = np.float32(rgba[i, c]) * scale * a
+
+
+def _premultiplied(rgba: Tensor) -> tuple[Tensor, Tensor]:
+    """(H, W, 3) and (H, W) floats of straight-alpha 8-bit pixels, in one pass: this happens at every training step."""
+    rgb, alpha = torch.empty(*rgba.shape[:2], 3), torch.empty(rgba.shape[:2])
+    _premultiply(rgba.reshape(-1, 4).numpy(), rgb.reshape(-1, 3).numpy(), alpha.reshape(-1).numpy())
+    return rgb, alpha
+
+
+class ImageViews(ViewSet):
+    """One split of image files.
+
+    Copies are kept as uint8 (PNG, JPEG) or half (OpenEXR, where the values fit) up to ``cache_bytes``; beyond that images
+    are read again each time. Safe to use from several threads.
+
+    Args:
+        frames: of one split; sizes may differ.
+        downsample: whole factor; left-over pixels at the right and bottom edges are cut off first.
+        to_linear: turn sRGB files into linear light, before they are premultiplied or averaged.
+
+    Attributes:
+        scale: multiplies the colours of linear light, and nothing else; 1 at first.
+
+    Raises:
+        ConfigError: an image is smaller than the factor.
+    """
+
+    def __init__(self, frames: Sequence[Frame], downsample: int = 1, cache_bytes: int = _CACHE_BYTES, to_linear: bool = False) -> None:
+        self._frames = list(frames)
+        self._to_linear = to_linear
+        self.scale = 1.0
+        self._factor = downsample
+        self._cameras = [_reduced(f, downsample) for f in self._frames]
+        self._cache_bytes = cache_bytes
+        self._used = 0
+        self._stored: dict[int, _Stored] = {}
+        self._grids: dict[tuple[object, ...], tuple[Tensor, Tensor]] = {}
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def view(self, index: int) -> View:
+        return View(self._frames[index].name, self._cameras[index], self._frames[index].conditions)
+
+    def file(self, index: int) -> Path:
+        """The image file of view ``index``."""
+        return self._frames[index].path
+
+    def pixels(self, index: int) -> Pixels:
+        """Pixels of view ``index``.
+
+        Raises:
+            DataError: the file is missing, damaged or changed size since the data set was opened, or its mask leaves nothing.
+        """
+        stored = self._load(range(len(self))[index])
+        if self._to_linear:
+            return self._linear(stored)
+        if stored.data.dtype == torch.uint8 and stored.data.shape[-1] == 4 and not stored.premultiplied:
+            return Pixels(*_premultiplied(stored.data), stored.mask)
+        data = stored.data.float()
+        if stored.data.dtype == torch.uint8:
+            data = data / 255.0
+        if data.shape[-1] == 3:
+            return Pixels(data, None, stored.mask)
+        rgb, alpha = data[..., :3], data[..., 3]
+        return Pixels(rgb.contiguous() if stored.premultiplied else rgb * alpha[..., None], alpha.contiguous(), stored.mask)
+
+    def _linear(self, stored: _Stored) -> Pixels:
+        rgb, alpha = stored.data[..., :3], stored.data[..., 3] if stored.data.shape[-1] == 4 else None
+        rgb = _LINEAR[rgb.int()] if rgb.dtype == torch.uint8 else rgb.float()
+        if alpha is not None:
+            alpha = alpha / 255.0 if alpha.dtype == torch.uint8 else alpha.float().contiguous()
+            rgb = rgb if stored.premultiplied else rgb * alpha[..., None]
+        return Pixels((rgb * self.scale).contiguous(), alpha, stored.mask)
+
+    def preload(self, progress: Callable[[float], None] = lambda fraction: None) -> None:
+        """Decode every image now if all copies fit the cache; otherwise do nothing.
+
+        Raises:
+            DataError: as :meth:`pixels`, for the first damaged file.
+        """
+        if self._used + sum(self._bytes(f, c) for f, c in zip(self._frames, self._cameras, strict=True)) > self._cache_bytes:
+            return
+        with ThreadPoolExecutor(4) as pool:
+            for done, _ in enumerate(pool.map(self._load, range(len(self)))):
+                progress((done + 1) / len(self))
+
+    def _bytes(self, frame: Frame, camera: Camera) -> int:
+        processed = frame.distortion is not None or self._factor > 1
+        values = frame.info.channels * (2 if frame.info.linear or (self._to_linear and processed) else 1)
+        return camera.width * camera.height * (values + (frame.mask is not None or frame.distortion is not None))
+
+    def _load(self, index: int) -> _Stored:
+        found = self._stored.get(index)
+        if found is not None:
+            return found
+        stored = self._read(self._frames[index])
+        size = stored.data.nbytes + (0 if stored.mask is None else stored.mask.nbytes)
+        with self._lock:
+            if index not in self._stored and self._used + size <= self._cache_bytes:
+                self._stored[index] = stored
+                self._used += size
+        return stored
+
+    def _read(self, frame: Frame) -> _Stored:
+        size = (frame.info.width, frame.info.height)
+        image = read_image(frame.path, size)
+        if image.shape[-1] != frame.info.channels or (image.dtype != torch.uint8) != frame.info.linear:
+            raise DataError(f"{frame.path}: file changed while it was in use; expected {frame.info.channels} channels")
+        mask = None if frame.mask is None else read_mask(frame.mask, size)
+        if frame.info.linear and image.shape[-1] == 4 and not bool(((image[..., 3] >= -1e-3) & (image[..., 3] <= 1.001)).all()):
+            raise DataError(f"{frame.path}: alpha reaches {image[..., 3].float().abs().max().item():.4g}; expected 0..1")
+        if frame.distortion is not None or self._factor > 1:
+            image, mask = self._process(frame, image, mask)
+            premultiplied = True
+        else:
+            premultiplied = frame.info.linear
+        if mask is not None and not mask.any():
+            raise DataError(f"{frame.path}: mask and lens distortion leave no pixel that counts; expected at least one")
+        if image.dtype == torch.float32 and image.abs().max() <= 65504.0:
+            image = image.half()
+        return _Stored(image, premultiplied, mask)
+
+    def _process(self, frame: Frame, image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """Undistorted and reduced, colours premultiplied, in the file's own number type."""
+        eight_bit = image.dtype == torch.uint8
+        if eight_bit and self._to_linear:
+            rgb = _LINEAR[image[..., :3].int()]
+            values = rgb if image.shape[-1] == 3 else torch.cat([rgb * (image[..., 3:] / 255.0), image[..., 3:] / 255.0], dim=-1)
+            eight_bit = False
+        else:
+            values = image.float()
+        if eight_bit and values.shape[-1] == 4:
+            values = torch.cat([values[..., :3] * (values[..., 3:] / 255.0), values[..., 3:]], dim=-1)
+        if frame.distortion is not None:
+            source, valid = self._grid(frame.camera, frame.distortion)
+            values = resample(values, source)
+            mask = valid if mask is None else valid & (resample(mask[..., None].float(), source)[..., 0] > 0.999)
+        n = self._factor
+        if n > 1:
+            values = F.avg_pool2d(values.permute(2, 0, 1), n).permute(1, 2, 0).contiguous()
+            mask = None if mask is None else F.avg_pool2d(mask[None].float(), n)[0] > 0.999
+        return (values.round().clamp(0.0, 255.0).to(torch.uint8) if eight_bit else values), mask
+
+    def _grid(self, camera: Camera, distortion: Distortion) -> tuple[Tensor, Tensor]:
+        key = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, distortion)
+        with self._lock:
+            if key not in self._grids:
+                if len(self._grids) >= _GRIDS:  # captures with a lens per frame would otherwise keep one grid per image
+                    self._grids.pop(next(iter(self._grids)))
+                self._grids[key] = source_grid(camera, distortion)
+            return self._grids[key]
+
+
+class SomeViews(ViewSet):
+    """Some views of another set, which keeps their pixels; e.g. those of one moment.
+
+    Args:
+        views: the whole set.
+        indices: of the chosen views, in the order they get here.
+    """
+
+    def __init__(self, views: ViewSet, indices: Sequence[int]) -> None:
+        self._views, self._indices = views, list(indices)
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def view(self, index: int) -> View:
+        return self._views.view(self._indices[index])
+
+    def pixels(self, index: int) -> Pixels:
+        return self._views.pixels(self._indices[index])
+
+
+def _reduced(frame: Frame, factor: int) -> Camera:
+    """The camera of a frame after area reduction: exactly 1/factor, as the remainder is cut off and not squeezed in."""
+    camera = frame.camera
+    if factor == 1:
+        return camera
+    width, height = camera.width // factor, camera.height // factor
+    if width == 0 or height == 0:
+        raise ConfigError(f"scene.downsample is {factor}, but {frame.path} has only {camera.width}x{camera.height} pixels")
+    return replace(
+        camera, fx=camera.fx / factor, fy=camera.fy / factor, cx=camera.cx / factor, cy=camera.cy / factor, width=width, height=height
+    )

@@ -1,0 +1,1 @@
+"""Files: images, films, PLY, OpenVDB, and writing them so that nothing is half there."""

@@ -1,0 +1,33 @@
+"""OpenVDB files without OpenVDB: numpy, zlib and the package ``blosc``.
+
+``read_header`` lists the grids of a file, ``read_grid`` reads one as a sparse :class:`Grid`, ``read_grids`` several, ``write_vdb`` writes them, and
+``sequence`` orders a folder of frames. Every failure is a :class:`~neuprim.core.errors.DataError` that names the file, what was
+found and what was expected; no claim in a file makes memory be taken that its bytes do not pay for.
+"""
+
+from neuprim.core.io.vdb.grid import DENSE_LIMIT, Bounds, Grid, Tiles, scale_transform
+from neuprim.core.io.vdb.header import FileHeader, GridHeader, read_header
+from neuprim.core.io.vdb.read import LEAF_LIMIT, read_grid, read_grids
+from neuprim.core.io.vdb.sequence import Frame, FrameSurvey, Sequence, Survey, sequence
+from neuprim.core.io.vdb.write import COMPRESSIONS, write_vdb
+
+__all__ = [
+    "COMPRESSIONS",
+    "DENSE_LIMIT",
+    "LEAF_LIMIT",
+    "Bounds",
+    "FileHeader",
+    "Frame",
+    "FrameSurvey",
+    "Grid",
+    "GridHeader",
+    "Sequence",
+    "Survey",
+    "Tiles",
+    "read_grid",
+    "read_grids",
+    "read_header",
+    "scale_transform",
+    "sequence",
+    "write_vdb",
+]

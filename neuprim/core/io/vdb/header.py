@@ -1,0 +1,230 @@
+"""What an OpenVDB file says about itself: version, metadata, and a description of every grid, with no tree decoded."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuprim.core.errors import DataError, nearest
+from neuprim.core.io.vdb.stream import BLOSC, MASK, ZIP, Cursor, compression_label, opened
+
+__all__ = ["MAGIC", "VERSIONS", "FileHeader", "GridHeader", "parse_header", "read_header"]
+
+MAGIC = 0x56444220
+VERSIONS = (222, 224)
+"""Oldest and newest file version read: 222 brought the present node layout, 223 Blosc, 224 changed point grids only."""
+
+LEVEL_SET = "level set"
+_VALUES = {"Tree_float_5_4_3": 1, "Tree_vec3s_5_4_3": 3}
+_HALF = "_HalfFloat"
+_DOUBLES = {
+    "UniformScaleMap": 15,
+    "ScaleMap": 15,
+    "UniformScaleTranslateMap": 18,
+    "ScaleTranslateMap": 18,
+    "TranslationMap": 3,
+    "AffineMap": 16,
+    "UnitaryMap": 16,
+}
+_METADATA = {
+    "bool": "?", "int32": "i", "int64": "q", "float": "f", "double": "d",
+    "vec2i": "2i", "vec2s": "2f", "vec2d": "2d", "vec3i": "3i", "vec3s": "3f", "vec3d": "3d",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class GridHeader:
+    """One grid as its file describes it.
+
+    Attributes:
+        name: unique in its file: second and later grids of one name get ``[1]``, ``[2]``, … as in OpenVDB.
+        type: OpenVDB's tree type, without the suffix for half floats.
+        half: its values are stored as 16-bit floats.
+        flags: compression bits.
+        metadata: the grid's own; values of types not known here are bytes.
+        map: name of the transform's class.
+        transform: (4, 4) float64, index to world, acting on column vectors; None if the map is of a class not known here.
+        parent: the grid whose tree this one shares; empty for nearly all.
+        tree_at, block, end: byte offsets of the tree, of its leaf buffers, and of the first byte after the grid.
+    """
+
+    name: str
+    type: str
+    half: bool
+    flags: int
+    metadata: Mapping[str, Any]
+    map: str
+    transform: np.ndarray | None
+    parent: str
+    tree_at: int
+    block: int
+    end: int
+
+    @property
+    def kind(self) -> str:
+        """The grid class: ``fog volume``, ``level set``, ``staggered`` or ``unknown``."""
+        value = self.metadata.get("class")
+        return value if isinstance(value, str) and value else "unknown"
+
+    @property
+    def channels(self) -> int:
+        """1 for float, 3 for vec3s, 0 for types that are not read."""
+        return _VALUES.get(self.type, 0)
+
+    @property
+    def compression(self) -> str:
+        return compression_label(self.flags)
+
+    @property
+    def voxel_size(self) -> tuple[float, float, float] | None:
+        """Edge lengths of a voxel in world units."""
+        if self.transform is None:
+            return None
+        x, y, z = np.linalg.norm(self.transform[:3, :3], axis=0).tolist()
+        return x, y, z
+
+    def undecodable(self) -> str | None:
+        """Why the voxels cannot be decoded, or None."""
+        if "ptdataidx" in self.type or "ptidx" in self.type:
+            return f"holds points ({self.type}), which have no density; rasterise them to a fog volume first"
+        if not self.channels:
+            return f"has values of type {self.type}; Tree_float_5_4_3 and Tree_vec3s_5_4_3 (also as half floats) are read"
+        if self.transform is None:
+            return f"has a transform of class {self.map}; known: {', '.join(_DOUBLES)}"
+        return None
+
+    def refusal(self) -> str | None:
+        """Why this grid cannot serve as a volume, or None."""
+        if self.kind == LEVEL_SET:
+            return "is a level set: signed distances to a surface, not densities; convert it to a fog volume first"
+        return self.undecodable()
+
+
+@dataclass(frozen=True)
+class FileHeader:
+    """An OpenVDB file's head and the headers of all of its grids, in file order."""
+
+    path: Path
+    version: int
+    library: tuple[int, int]
+    metadata: Mapping[str, Any]
+    grids: tuple[GridHeader, ...]
+
+    def grid(self, name: str) -> GridHeader:
+        """The grid called ``name``.
+
+        Raises:
+            DataError: there is none; the message has the nearest names.
+        """
+        for grid in self.grids:
+            if grid.name == name:
+                return grid
+        names = [grid.name for grid in self.grids]
+        raise DataError(f"{self.path}: no grid {name!r}{nearest(name, names) or '; the file has no grids'}")
+
+
+def read_header(path: Path) -> FileHeader:
+    """Describes a file without decoding a tree.
+
+    Raises:
+        DataError: not an OpenVDB file, a version outside :data:`VERSIONS`, written as a stream, truncated or damaged.
+    """
+    with opened(Path(path)) as cursor:
+        return parse_header(cursor)
+
+
+def parse_header(cursor: Cursor) -> FileHeader:
+    """:func:`read_header` for an open file whose cursor is at the start."""
+    if cursor.end < 8 or cursor.unpack("q", "the magic number") != (MAGIC,):
+        raise cursor.fail(f"starts with {cursor.data[:8].hex(' ')}; expected {MAGIC.to_bytes(8, 'little').hex(' ')} (an OpenVDB file)")
+    (version,) = cursor.unpack("I", "the file version")
+    if not VERSIONS[0] <= version <= VERSIONS[1]:
+        raise cursor.fail(f"OpenVDB file version {version}; expected {VERSIONS[0]} to {VERSIONS[1]}")
+    major, minor, offsets = cursor.unpack("IIB", "the library version")
+    if not offsets:
+        raise cursor.fail("written as a stream, without offsets of grids; expected a file (save it again with OpenVDB)")
+    cursor.skip(36, "the file's identifier")
+    metadata = _metadata(cursor, "file metadata")
+    (count,) = cursor.unpack("I", "the number of grids")
+    grids: list[GridHeader] = []
+    for i in range(count):
+        grids.append(_grid(cursor, f"grid {i + 1} of {count}"))
+        cursor.at = grids[-1].end
+    names = [grid.name for grid in grids]
+    if len(set(names)) != len(names):
+        raise cursor.fail(f"two grids have the name {next(n for n in names if names.count(n) > 1)!r}; expected unique names")
+    return FileHeader(cursor.path, version, (major, minor), metadata, tuple(grids))
+
+
+def _grid(cursor: Cursor, what: str) -> GridHeader:
+    name, _, suffix = cursor.text(f"name of {what}").partition("\x1e")  # OpenVDB's mark between a name and its number
+    name += f"[{suffix}]" if suffix else ""
+    what = f"grid {name!r}"
+    kind, parent = cursor.text(f"type of {what}"), cursor.text(f"parent of {what}")
+    start, block, end = cursor.unpack("3q", f"offsets of {what}")
+    if parent:
+        block = end  # OpenVDB leaves it 0: the tree is the parent's
+    if not cursor.at <= start <= block <= end <= len(cursor.data):
+        raise cursor.fail(
+            f"{what} claims bytes {start} to {block} to {end}; expected rising offsets from {cursor.at} to at most {len(cursor.data)}"
+        )
+    inner = Cursor(cursor.path, cursor.data, start, end)
+    (flags,) = inner.unpack("I", f"compression of {what}")
+    if flags & ~(ZIP | MASK | BLOSC):
+        raise inner.fail(f"{what} has compression bits {flags:#x}; expected a sum of 1 (zip), 2 (active values) and 4 (blosc)")
+    metadata = _metadata(inner, f"metadata of {what}")
+    mapping, transform = _transform(inner, what)
+    half = kind.endswith(_HALF)
+    parent, _, suffix = parent.partition("\x1e")
+    parent += f"[{suffix}]" if suffix else ""
+    return GridHeader(name, kind.removesuffix(_HALF), half, flags, metadata, mapping, transform, parent, inner.at, block, end)
+
+
+def _metadata(cursor: Cursor, what: str) -> dict[str, Any]:
+    (count,) = cursor.unpack("I", f"count of {what}")
+    found: dict[str, Any] = {}
+    for _ in range(count):
+        name, kind = cursor.text(f"a name in {what}"), cursor.text(f"a type in {what}")
+        (size,) = cursor.unpack("I", f"size of {name!r} in {what}")
+        raw = cursor.take(size, f"value of {name!r} in {what}")
+        layout = _METADATA.get(kind)
+        if kind == "string":
+            found[name] = raw.decode("utf-8", errors="replace")
+        elif layout is None:
+            found[name] = raw
+        elif size != struct.calcsize("<" + layout):
+            raise cursor.fail(f"{name!r} in {what} has {size} bytes; expected {struct.calcsize('<' + layout)} for a {kind}")
+        else:
+            values = struct.unpack("<" + layout, raw)
+            found[name] = values if len(values) > 1 else values[0]
+    return found
+
+
+def _transform(cursor: Cursor, what: str) -> tuple[str, np.ndarray | None]:
+    mapping = cursor.text(f"transform of {what}")
+    if mapping not in _DOUBLES:
+        return mapping, None
+    values = np.array(cursor.unpack(f"{_DOUBLES[mapping]}d", f"{mapping} of {what}"))
+    matrix = np.eye(4)
+    if _DOUBLES[mapping] == 16:
+        matrix = values.reshape(4, 4).T.copy()  # OpenVDB multiplies row vectors from the left
+    elif mapping == "TranslationMap":
+        matrix[:3, 3] = values
+    else:
+        moved = 3 * mapping.endswith("TranslateMap")
+        matrix[:3, 3] = values[:moved] if moved else 0.0
+        matrix[range(3), range(3)] = values[moved : moved + 3]
+    with np.errstate(all="ignore"):
+        size = np.linalg.norm(matrix[:3, :3], axis=0)
+        sound = bool(np.isfinite(matrix).all() and np.isfinite(size).all() and (size > 0).all())
+        sound = sound and abs(np.linalg.det(matrix[:3, :3] / size)) > 1e-12 and bool((matrix[3] == (0, 0, 0, 1)).all())
+    if not sound:
+        raise cursor.fail(
+            f"{what} has the transform {np.array2string(matrix, separator=', ')}; expected finite numbers and voxels of some volume"
+        )
+    return mapping, matrix

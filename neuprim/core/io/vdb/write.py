@@ -1,0 +1,266 @@
+"""Writing OpenVDB files of version 224, in the layout that :mod:`neuprim.core.io.vdb.tree` reads and OpenVDB itself writes."""
+
+from __future__ import annotations
+
+import struct
+import uuid
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuprim.core.errors import DataError, nearest
+from neuprim.core.io.files import atomic_path
+from neuprim.core.io.vdb.grid import TILE_SIZES, Grid
+from neuprim.core.io.vdb.header import MAGIC
+from neuprim.core.io.vdb.stream import BLOSC, MASK, ZIP, blosc_module, compression_label
+from neuprim.core.io.vdb.tree import ALL_VALUES, LOWER, UPPER, Slots
+
+__all__ = ["COMPRESSIONS", "write_vdb"]
+
+COMPRESSIONS = {"none": MASK, "zip": ZIP | MASK, "blosc": BLOSC | MASK}
+"""How values are packed; inactive ones that are the background are never stored."""
+
+_VERSION = 224
+_LIBRARY = (10, 0)
+_EMPTY_BOX = ((2**31 - 1,) * 3, (-(2**31),) * 3)
+_OURS = ("class", "name", "file_bbox_min", "file_bbox_max", "file_voxel_count", "file_compression", "is_saved_as_half_float")
+_STALE = ("file_mem_bytes", "file_delayed_load")
+
+
+def write_vdb(path: Path, grids: Sequence[Grid], *, compression: str = "blosc", metadata: Mapping[str, Any] | None = None) -> None:
+    """Writes grids to a file, whole or not at all.
+
+    Args:
+        path: replaced if it exists.
+        grids: one or more, with different names. Those with ``half`` are rounded to 16-bit floats.
+        compression: one of :data:`COMPRESSIONS`.
+        metadata: of the file: str, bool, int, float, or three ints or floats each.
+
+    Raises:
+        DataError: names that repeat, leaves or tiles that overlap or are out of place, values that no half float holds, a
+            transform that is no invertible affine map, or metadata of another type.
+        BackendUnavailable: Blosc is asked for, and the package ``blosc`` is missing.
+    """
+    path = Path(path)
+    if compression not in COMPRESSIONS:
+        raise DataError(f"{path}: compression {compression!r}{nearest(compression, COMPRESSIONS)}")
+    names = [grid.name for grid in grids]
+    if len(set(names)) != len(names):
+        raise DataError(f"{path}: grids named {', '.join(map(repr, names))}; expected different names")
+    flags = COMPRESSIONS[compression]
+    identifier = str(uuid.uuid4()).encode()
+    head = struct.pack("<qIIIB", MAGIC, _VERSION, *_LIBRARY, 1) + identifier + _metadata(metadata or {}, str(path))
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(head + struct.pack("<I", len(grids)))
+        for grid in grids:
+            where = f"{path}: grid {grid.name!r}"
+            writer = _TreeWriter(grid, flags, where)
+            kind = ("Tree_vec3s_5_4_3" if grid.channels == 3 else "Tree_float_5_4_3") + "_HalfFloat" * grid.half
+            start = file.tell() + len(_text(grid.name) + _text(kind) + _text("")) + 24
+            tree = struct.pack("<I", flags) + _grid_metadata(grid, flags, where) + _transform(grid.transform, where) + writer.topology
+            file.write(_text(grid.name) + _text(kind) + _text(""))
+            file.write(struct.pack("<3q", start, start + len(tree), start + len(tree) + len(writer.buffers)))
+            file.write(tree)
+            file.write(writer.buffers)
+
+
+# ---------------------------------------------------------------- head of a grid
+
+
+def _text(value: str) -> bytes:
+    raw = value.encode()
+    return struct.pack("<I", len(raw)) + raw
+
+
+def _metadata(values: Mapping[str, Any], where: str) -> bytes:
+    parts = [struct.pack("<I", len(values))]
+    for name, value in values.items():
+        kind, raw = _metadatum(value)
+        if not kind:
+            raise DataError(f"{where}: metadata {name!r} is {value!r}; expected text, bool, int (64 bits), float, or three ints or floats")
+        parts.append(_text(name) + _text(kind) + struct.pack("<I", len(raw)) + raw)
+    return b"".join(parts)
+
+
+def _metadatum(value: Any) -> tuple[str, bytes]:
+    if isinstance(value, str):
+        return "string", value.encode()
+    if isinstance(value, bool):
+        return "bool", struct.pack("<?", value)
+    many = isinstance(value, (tuple, list)) and len(value) == 3
+    try:
+        if isinstance(value, int):
+            return "int64", struct.pack("<q", value)
+        if isinstance(value, float):
+            return "double", struct.pack("<d", value)
+        if many and all(isinstance(v, int) for v in value):
+            return "vec3i", struct.pack("<3i", *value)
+        if many and all(isinstance(v, (int, float)) for v in value):
+            return "vec3d", struct.pack("<3d", *value)
+    except (struct.error, OverflowError):
+        pass
+    return "", b""
+
+
+def _grid_metadata(grid: Grid, flags: int, where: str) -> bytes:
+    kept = {k: v for k, v in grid.metadata.items() if k not in (*_OURS, *_STALE) and _metadatum(v)[0]}  # foreign types are bytes
+    low, high = grid.bounds or ((0, 0, 0), (0, 0, 0))
+    box = (low, tuple(v - 1 for v in high)) if grid.bounds else _EMPTY_BOX  # OpenVDB's boxes include their upper corner
+    ours = (grid.kind, grid.name, *box, grid.active_voxels, compression_label(flags), bool(grid.half))
+    return _metadata(dict(sorted({**kept, **dict(zip(_OURS, ours, strict=True))}.items())), where)
+
+
+def _transform(matrix: np.ndarray, where: str) -> bytes:
+    """The simplest of OpenVDB's maps that is this transform."""
+    matrix = np.asarray(matrix, np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or (matrix[3] != (0, 0, 0, 1)).any() or np.linalg.det(matrix) == 0:
+        raise DataError(f"{where}: transform {matrix.tolist()}; expected an invertible affine (4, 4) matrix")
+    scale, translation = np.diag(matrix)[:3], matrix[:3, 3]
+    if (matrix[:3, :3] != np.diag(scale)).any():
+        return _text("AffineMap") + matrix.T.astype("<f8").tobytes()
+    name = ("Uniform" if (scale == scale[0]).all() else "") + ("ScaleTranslateMap" if translation.any() else "ScaleMap")
+    parts = [scale, np.abs(scale), 1 / scale, 1 / scale**2, 0.5 / scale]
+    if translation.any():
+        parts.insert(0, translation)
+    return _text(name) + np.concatenate(parts).astype("<f8").tobytes()
+
+
+# ---------------------------------------------------------------- tree
+
+
+class _TreeWriter:
+    """Turns a grid into ``topology`` and ``buffers``, the two parts of its tree."""
+
+    def __init__(self, grid: Grid, flags: int, where: str) -> None:
+        self._grid, self._where = grid, where
+        self._pack = _packer(flags, (2 if grid.half else 4) * grid.channels)
+        self._flags = flags
+        self._check()
+        self._origins = grid.origins.astype(np.int64)
+        self._tile_origins = grid.tiles.origins.astype(np.int64)
+        self._leaf_parts = [b""] * len(grid.values)
+        self._masks = np.packbits(grid.masks.reshape(-1, 512), axis=1, bitorder="little")
+        self._buffers: list[bytes] = []
+        self.topology = self._root()
+        self.buffers = b"".join(self._buffers)
+
+    def _check(self) -> None:
+        grid, tiles = self._grid, self._grid.tiles
+        if not np.isin(tiles.sizes, TILE_SIZES).all() or (grid.origins % 8).any() or (tiles.origins % tiles.sizes[:, None]).any():
+            raise DataError(f"{self._where}: leaves and tiles must start at multiples of their size (8, 128 or 4096 voxels)")
+        places = np.concatenate([np.c_[grid.origins, np.full(len(grid.origins), 8)], np.c_[tiles.origins, tiles.sizes]]).astype(np.int64)
+        for size in TILE_SIZES:
+            here = [tuple(p) for p in (places[places[:, 3] == size, :3] // size).tolist()]
+            smaller = {tuple(p) for p in (places[places[:, 3] < size, :3] // size).tolist()}
+            if len(set(here)) != len(here) or not smaller.isdisjoint(here):
+                raise DataError(f"{self._where}: leaves or tiles overlap in blocks of {size} voxels; expected each voxel once")
+        if grid.half:
+            for values in (grid.values, tiles.values):
+                largest = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
+                if largest >= 65520:  # what rounds to infinity
+                    raise DataError(f"{self._where}: a value of magnitude {largest:g} does not fit a half float (65504 at most)")
+
+    def _root(self) -> bytes:
+        grid = self._grid
+        root = np.flatnonzero(grid.tiles.sizes == TILE_SIZES[2])
+        small = np.flatnonzero(grid.tiles.sizes < TILE_SIZES[2])
+        nodes = _grouped(TILE_SIZES[2], self._origins, self._tile_origins[small])
+        parts = [struct.pack("<i", 1), grid.background.astype("<f4").tobytes(), struct.pack("<II", len(root), len(nodes))]
+        for i in root:
+            tile = struct.pack("<3i", *self._tile_origins[i].tolist()) + grid.tiles.values[i].astype("<f4").tobytes()
+            parts.append(tile + struct.pack("<?", bool(grid.tiles.active[i])))
+        for origin, (leaves, tiles) in nodes:
+            parts.append(struct.pack("<3i", *origin))
+            self._upper(parts, origin, leaves, small[tiles])
+        return b"".join(parts)
+
+    def _upper(self, parts: list[bytes], origin: tuple[int, int, int], leaves: np.ndarray, tiles: np.ndarray) -> None:
+        here = tiles[self._grid.tiles.sizes[tiles] == UPPER.edge]
+        below = tiles[self._grid.tiles.sizes[tiles] < UPPER.edge]
+        nodes = _grouped(UPPER.edge, self._origins[leaves], self._tile_origins[below])
+        nodes.sort(key=lambda node: _slot(np.array([node[0]]), origin, UPPER)[0])
+        self._node(parts, _slot(np.array([n[0] for n in nodes]).reshape(-1, 3), origin, UPPER), origin, here, UPPER)
+        for corner, (inner, small) in nodes:
+            mine = leaves[inner]
+            slots = _slot(self._origins[mine], corner, LOWER)
+            mine = mine[np.argsort(slots)]
+            self._node(parts, slots, corner, below[small], LOWER)
+            for leaf in mine:
+                mask = self._masks[leaf].tobytes()
+                parts.append(mask)
+                self._buffers.append(mask + self._values(self._grid.values[leaf], self._grid.masks[leaf]))
+
+    def _node(self, parts: list[bytes], children: np.ndarray, origin: tuple[int, int, int], tiles: np.ndarray, slots: Slots) -> None:
+        """Appends an internal node: masks of children and of active tiles, and the tiles' values."""
+        grid = self._grid
+        has_child, active = np.zeros(slots.count, bool), np.zeros(slots.count, bool)
+        values = np.empty((slots.count, *grid.background.shape), np.float32)
+        values[:] = grid.background
+        has_child[children] = True
+        at = _slot(self._tile_origins[tiles], origin, slots)
+        active[at] = grid.tiles.active[tiles]
+        values[at] = grid.tiles.values[tiles]
+        parts += [np.packbits(has_child, bitorder="little").tobytes(), np.packbits(active, bitorder="little").tobytes()]
+        parts.append(self._values(values, active))
+
+    def _values(self, values: np.ndarray, active: np.ndarray) -> bytes:
+        """The value code, an inactive value if it needs one, and the stored values."""
+        grid = self._grid
+        inactive = values[~active]
+        code, extra = 0, b""
+        if (inactive != grid.background).any():
+            if (inactive == inactive[0]).all():
+                code, extra = 2, inactive[0].astype("<f4").tobytes()
+            else:
+                code = ALL_VALUES
+        stored = values if code == ALL_VALUES else values[active]
+        if not len(stored) and grid.half and self._flags & (ZIP | BLOSC):
+            return bytes([code]) + extra  # OpenVDB stores no length for no half floats
+        return bytes([code]) + extra + self._pack(stored.astype("<f2" if grid.half else "<f4").tobytes())
+
+
+def _grouped(size: int, leaves: np.ndarray, tiles: np.ndarray) -> list[tuple[tuple[int, int, int], tuple[np.ndarray, np.ndarray]]]:
+    """The blocks of ``size`` voxels that hold leaves or tiles, with the indices of both in each, in order of their corners."""
+    corners, inverse = np.unique(np.concatenate([leaves, tiles]) // size * size, axis=0, return_inverse=True)
+    order = np.argsort(inverse, kind="stable")
+    parts = np.split(order, np.cumsum(np.bincount(inverse.ravel(), minlength=len(corners)))[:-1]) if len(corners) else []
+    count = len(leaves)
+    return [((x, y, z), (part[part < count], part[part >= count] - count)) for (x, y, z), part in zip(corners.tolist(), parts, strict=True)]
+
+
+def _slot(corners: np.ndarray, origin: tuple[int, int, int], slots: Slots) -> np.ndarray:
+    """The slot numbers, in a node at ``origin``, of the children at ``corners`` (n, 3)."""
+    edge = round(slots.count ** (1 / 3))
+    x, y, z = ((corners - np.array(origin)) // slots.edge).astype(np.int64).T
+    return np.asarray((x * edge + y) * edge + z)
+
+
+def _packer(flags: int, unit: int) -> Callable[[bytes], bytes]:
+    """The function that packs values of ``unit`` bytes, with their length in front as OpenVDB has it."""
+    if not flags & (ZIP | BLOSC):
+        return lambda raw: raw
+    if flags & BLOSC:
+        blosc = blosc_module()
+        # what the Blosc library itself makes of no bytes, which the Python package refuses to pack: a header alone
+        nothing = struct.pack("<4B3I", 2, 1, 0x23, unit, 0, 1, 16)
+
+        def squeeze(raw: bytes) -> bytes:
+            if not raw:
+                return nothing
+            packed: bytes = blosc.compress(raw, typesize=unit, clevel=9, shuffle=blosc.SHUFFLE, cname="lz4")
+            return packed
+
+    else:
+
+        def squeeze(raw: bytes) -> bytes:
+            return zlib.compress(raw)
+
+    def pack(raw: bytes) -> bytes:
+        packed = squeeze(raw)
+        small = len(packed) < len(raw) or (not raw and bool(flags & BLOSC))
+        return struct.pack("<q", len(packed) if small else -len(raw)) + (packed if small else raw)
+
+    return pack

@@ -1,0 +1,99 @@
+"""Real spherical harmonics up to degree 3, in the order and signs of 3D Gaussian splatting."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.core.errors import FormError
+from neuprim.core.model.checks import Shape, Sizes, tensors_fault
+from neuprim.core.model.colours.sh_constants import C0, C1, C2, C3
+
+__all__ = ["C0", "basis", "coefficient_count", "colors", "initial_dc"]
+
+
+def coefficient_count(degree: int) -> int:
+    """Coefficients per channel of all bands up to ``degree``."""
+    return (degree + 1) ** 2
+
+
+def basis(directions: Tensor, degree: int) -> Tensor:
+    """(N, (degree + 1)^2) basis values at unit ``directions`` (N, 3).
+
+    Raises:
+        ValueError: for a degree outside 0..3.
+    """
+    if not 0 <= degree <= 3:
+        raise ValueError(f"spherical-harmonics degree {degree}; expected 0..3")
+    x, y, z = directions.unbind(-1)
+    rows = [torch.full_like(x, C0)]
+    if degree >= 1:
+        rows += [-C1 * y, C1 * z, -C1 * x]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        rows += [C2[0] * x * y, C2[1] * y * z, C2[2] * (2 * zz - xx - yy), C2[3] * x * z, C2[4] * (xx - yy)]
+    if degree >= 3:
+        rows += [
+            C3[0] * y * (3 * xx - yy),
+            C3[1] * x * y * z,
+            C3[2] * y * (4 * zz - xx - yy),
+            C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+            C3[4] * x * (4 * zz - xx - yy),
+            C3[5] * z * (xx - yy),
+            C3[6] * x * (xx - 3 * yy),
+        ]
+    return torch.stack(rows, -1)
+
+
+def colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degree: int) -> Tensor:
+    """(N, C) max(0, SH(direction origin -> mean) + 1/2); fused on float32 CPU tensors.
+
+    Args:
+        means: (N, 3) scene units. origin: (3,) the camera's position.
+        dc: (N, C) zero-order coefficients.
+        rest: (N, at least (degree + 1)^2 - 1, C) of the higher bands; None only at degree 0.
+        degree: bands in use, 0..3.
+
+    Raises:
+        FormError: a tensor does not fit; the fused kernel would read beyond its end.
+    """
+    _check(means, dc, rest, origin, degree)
+    if degree == 0:
+        return (dc * C0 + 0.5).clamp_min(0.0)
+    assert rest is not None  # checked above
+    if dc.device.type == "cpu" and dc.dtype == means.dtype == torch.float32:
+        from neuprim.core.model.colours.sh_cpu import fused_colors  # numba, loaded when first needed
+
+        return fused_colors(means, dc, rest, origin, degree)
+    offset = means - origin.to(means)
+    direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-30)
+    bands = basis(direction, degree)[:, 1:]
+    return (dc * C0 + 0.5 + (bands[:, :, None] * rest[:, : bands.shape[1]]).sum(1)).clamp_min(0.0)
+
+
+def _check(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degree: int) -> None:
+    if not isinstance(degree, int) or not 0 <= degree <= 3:
+        raise FormError(f"sh.colors: degree {degree!r}; expected 0..3")
+    needed = coefficient_count(degree) - 1
+    if needed and rest is None:
+        raise FormError(f"sh.colors: rest is None; expected (N, at least {needed}, C) for degree {degree}")
+    tensors: list[tuple[str, Any, tuple[Shape, ...]]] = [("means", means, (("N", 3),)), ("dc", dc, (("N", "C"),))]
+    if needed:
+        tensors += [("rest", rest, (("N", "bands", "C"),)), ("origin", origin, ((3,),))]
+    sizes: Sizes = {}
+    fault = tensors_fault(tensors, sizes)
+    if fault is None and needed and sizes["bands"][0] < needed:
+        fault = f"rest has {sizes['bands'][0]} bands; expected at least {needed} for degree {degree}"
+    if fault is not None:
+        raise FormError(f"sh.colors: {fault}")
+
+
+_DARKEST = 1e-3
+"""Initial colours start at least this far above zero: at zero and below, max(0, .) passes no gradient and black stays black."""
+
+
+def initial_dc(color: Tensor) -> Tensor:
+    """(N, C) float32 zero-order coefficients of a colour (N, C) that is the same from everywhere."""
+    return ((color.clamp_min(_DARKEST) - 0.5) / C0).float()

@@ -1,0 +1,204 @@
+"""A model: geometry and the tensors of its two fields, one row per primitive."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.errors import NonFiniteError
+from neuprim.core.model.checks import (
+    check_colour,
+    check_density,
+    check_geometry,
+    check_result,
+    check_rows,
+    check_shading,
+    check_start,
+    method,
+    source,
+)
+from neuprim.core.model.fields import ColourField, Conditions, Constant, DensityField, LoweredColour, LoweredDensity, RayNet, Shade
+from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry
+from neuprim.core.model.schema import InitContext, ParameterSpec
+from neuprim.core.settings import RenderSettings
+
+__all__ = ["Living", "Lowered", "Primitives"]
+
+
+@dataclass(frozen=True)
+class Lowered:
+    """What one frame hands to the renderer, whatever the task.
+
+    ``rows`` (M,) int64 says which primitives these are where a field left some out; None for all. ``shade``, if any, is a factor on
+    each pixel (see :meth:`~neuprim.core.model.fields.ColourField.shade`). ``fields`` are the class names of density and colour field, for
+    messages; None for forms that no field made.
+    """
+
+    geometry: Geometry
+    density: LoweredDensity
+    colour: LoweredColour
+    rows: Tensor | None = None
+    shade: Shade | None = None
+    fields: tuple[str, str] | None = None
+
+    def owner(self, kind: Literal["density", "colour"]) -> str:
+        """Whose form it is, for messages: ``"density field Waves"``."""
+        return source(kind, None if self.fields is None else self.fields[kind == "colour"])
+
+    def source(self, kind: Literal["density", "colour"]) -> str:
+        """The same with the form: ``"density field Waves lowered to Cosine"``."""
+        return f"{self.owner(kind)} lowered to {type(getattr(self, kind)).__name__}"
+
+    def center_colors(self, position: Tensor) -> Tensor:
+        """(M, C) colours at the primitives' centres, seen from ``position`` (3,)."""
+        count = self.geometry.count
+        if isinstance(self.colour, Constant):
+            return self.colour.rgb
+        if isinstance(self.colour, RayNet):
+            return self.colour.radiance(torch.arange(count), torch.zeros(count, 3, dtype=torch.float64))
+        means = self.geometry.means
+        directions = torch.nn.functional.normalize(means - position.to(means), dim=1)
+        found = self.colour.radiance(torch.arange(count), means, directions)
+        return check_result(found, (count, self.colour.channels), f"{self.source('colour')}: radiance")
+
+
+@dataclass(frozen=True)
+class Living:
+    """The M primitives that can absorb anything under some conditions.
+
+    Attributes:
+        rows: (M,) int64 ascending rows of the model; None where all are.
+        params: all their tensors; own: those of the density field.
+        stored: their ellipsoids as stored, which :meth:`~neuprim.core.model.fields.DensityField.density` takes; geometry: where they are.
+    """
+
+    field: DensityField
+    conditions: Conditions
+    rows: Tensor | None
+    params: dict[str, Tensor]
+    own: dict[str, Tensor]
+    stored: Geometry
+    geometry: Geometry
+
+    def sigma(self, prim: Tensor, x: Tensor) -> Tensor:
+        """World density (P,), 1/scene unit, unclamped, of the living primitives ``prim`` (P,), 0..M-1, at points ``x`` (P, 3)."""
+        found = self.field.density(self.own, self.stored, prim, x, self.conditions)
+        return check_result(found, (len(prim),), method(self.field, "density"))
+
+
+class Primitives:
+    """N primitives with a density and a colour field.
+
+    Attributes:
+        density, colour: the fields.
+        specs: every parameter, geometry first; the only list of tensors there is.
+        params: name -> (N, *shape) tensor, in the order of ``specs``.
+
+    Raises:
+        ValueError: when names clash or a tensor's shape differs from its spec.
+    """
+
+    def __init__(self, density: DensityField, colour: ColourField, params: Mapping[str, Tensor]) -> None:
+        self.density, self.colour = density, colour
+        self.specs: tuple[ParameterSpec, ...] = (*GEOMETRY_SPECS, *density.parameters(), *colour.parameters())
+        names = [s.name for s in self.specs]
+        if len(set(names)) != len(names) or set(names) != set(params):
+            raise ValueError(f"parameters {sorted(params)} do not match the specs {sorted(names)}")
+        self.params: dict[str, Tensor] = {n: params[n] for n in names}
+        if self.params["means"].dim() != 2:
+            raise ValueError(f"parameter means has shape {tuple(self.params['means'].shape)}, expected (N, 3)")
+        for spec in self.specs:
+            found, expected = tuple(self.params[spec.name].shape), (self.count, *spec.shape)
+            if found != expected:
+                raise ValueError(f"parameter {spec.name} has shape {found}, expected {expected}")
+
+    @classmethod
+    def initialise(cls, density: DensityField, colour: ColourField, context: InitContext) -> Primitives:
+        """Fresh primitives from the specs' own initialisers.
+
+        Raises:
+            FormError: one of them returned something of another shape.
+        """
+        own = [("starting points", spec) for spec in GEOMETRY_SPECS]
+        own += [(method(field, "parameters"), spec) for field in (density, colour) for spec in field.parameters()]
+        return cls(density, colour, {spec.name: check_start(spec, context, who) for who, spec in own})
+
+    @property
+    def count(self) -> int:
+        return int(self.params["means"].shape[0])
+
+    @property
+    def parameters_per_primitive(self) -> int:
+        return sum(s.size for s in self.specs)
+
+    @property
+    def geometry(self) -> Geometry:
+        return Geometry(self.params["means"], self.params["log_scales"], self.params["quats"])
+
+    def of(self, field: DensityField | ColourField) -> dict[str, Tensor]:
+        """The tensors one field owns."""
+        return {s.name: self.params[s.name] for s in field.parameters()}
+
+    def lower(self, camera: AnyCamera, conditions: Conditions, settings: RenderSettings | None = None) -> Lowered:
+        """Fold a frame's conditions into closed forms; differentiable. Primitives that are not alive in it are left out.
+
+        ``settings`` are for images that a colour field needs first, such as a shadow's; None: the defaults.
+
+        Raises:
+            FormError: a field hands over tensors that do not fit.
+        """
+        living = self.living(conditions)
+        geometry = living.geometry
+        names = (type(self.density).__name__, type(self.colour).__name__)
+        sizes = check_geometry(geometry, "geometry")
+        density = self.density.lower(living.own, geometry, conditions)
+        check_density(density, sizes, names[0])  # before the colour looks at it, which may draw it
+        tint = {s.name: living.params[s.name] for s in self.colour.parameters()}
+        colour = self.colour.lower(tint, geometry, camera, conditions)
+        check_colour(colour, sizes, names[1])
+        found = self.colour.shade(geometry, density, conditions, settings or RenderSettings())
+        shading = check_shading(found, geometry.count, method(self.colour, "shade"))
+        if shading.primitives is not None:
+            colour = colour.scaled(shading.primitives)
+        return Lowered(geometry, density, colour, living.rows, shading.pixels, names)
+
+    def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:
+        """Where the primitives that live in a frame are, and their density; no camera needed."""
+        living = self.living(conditions)
+        density = self.density.lower(living.own, living.geometry, conditions)
+        check_density(density, check_geometry(living.geometry, "geometry"), type(self.density).__name__)
+        return living.geometry, density
+
+    def living(self, conditions: Conditions, dtype: torch.dtype | None = None) -> Living:
+        """Which primitives live in a frame, and where; differentiable. With ``dtype``, everything is detached and of that type."""
+        rows = self.density.alive(self.of(self.density), conditions)
+        if rows is not None:
+            check_rows(rows, self.count, f"{method(self.density, 'alive')} returned")
+        params = self.params if rows is None else {name: value.index_select(0, rows) for name, value in self.params.items()}
+        if dtype is not None:
+            params = {name: value.detach().to(dtype) for name, value in params.items()}
+            conditions = {name: value.to(dtype) for name, value in conditions.items()}
+        own = {s.name: params[s.name] for s in self.density.parameters()}
+        stored = Geometry(params["means"], params["log_scales"], params["quats"])
+        moved = self.density.move(own, stored, conditions)
+        if moved is not stored:
+            check_geometry(moved, method(self.density, "move"), stored.count)
+        return Living(self.density, conditions, rows, params, own, stored, moved)
+
+    def rows(self, index: Tensor) -> dict[str, Tensor]:
+        """Detached copies of some rows of every parameter."""
+        return {name: value.detach()[index].clone() for name, value in self.params.items()}
+
+    def check_finite(self, what: str = "parameter") -> None:
+        """Raise :class:`NonFiniteError` naming the first parameter and primitive that is NaN or infinite."""
+        for name, value in self.params.items():
+            if value.numel() and not bool(torch.isfinite(value.detach().sum())):
+                bad = ~torch.isfinite(value.detach()).reshape(self.count, -1).all(dim=1)
+                if bool(bad.any()):
+                    row = int(bad.nonzero()[0])
+                    raise NonFiniteError(f"{what} {name} of primitive {row} is not finite: {value.detach()[row].flatten()[:8].tolist()}")

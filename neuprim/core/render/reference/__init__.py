@@ -1,0 +1,1 @@
+"""The oracle: plain torch in float64, with autograd."""

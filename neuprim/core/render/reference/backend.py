@@ -1,0 +1,212 @@
+"""The oracle: the closed form of the method in plain torch, float64, with autograd.
+
+Every other backend is judged against this file, so it stays close to the mathematics: whitened rays, the middle of the
+chord, one (cos, sinc) pair per neuron, front-to-back compositing. It is also the backend for densities and colours that
+do not lower to a form the fast kernels know.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.model.checks import check_result
+from neuprim.core.model.fields import Constant, Cosine, RayNet
+from neuprim.core.model.geometry import quaternion_to_matrix
+from neuprim.core.model.primitives import Lowered
+from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
+from neuprim.core.render.reference.rays import Rays, pixel_directions, view_of
+from neuprim.core.settings import RenderSettings
+
+__all__ = ["pixel_directions", "render"]
+
+_BLOCK = 32  # pixels on a side; bounds memory, changes nothing
+
+
+class _FlooredSqrt(torch.autograd.Function):
+    """sqrt(D) whose derivative uses max(D, floor): gradients grow as D^-1/2 at a silhouette, and float32 cannot follow."""
+
+    @staticmethod
+    def forward(ctx: Any, D: Tensor, floor: float) -> Tensor:
+        ctx.save_for_backward(D)
+        ctx.floor = floor
+        return D.sqrt()
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+        (D,) = ctx.saved_tensors
+        return grad * 0.5 * D.clamp_min(ctx.floor).rsqrt(), None
+
+
+class _Tally(torch.autograd.Function):
+    """Identity on the weights of one block; its backward adds them up per primitive for the population statistics."""
+
+    @staticmethod
+    def forward(ctx: Any, weights: Tensor, rows: Tensor, pixels: Tensor, stats: RenderStats) -> Tensor:
+        ctx.save_for_backward(weights, rows, pixels)
+        ctx.stats = stats
+        return weights.clone()
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[override]
+        weights, rows, pixels = ctx.saved_tensors
+        stats: RenderStats = ctx.stats
+        if stats.pixel_error is not None and stats.weight is not None and stats.error_weight is not None:
+            error = stats.pixel_error.reshape(-1)[pixels].to(weights)
+            stats.weight.index_add_(0, rows, weights.sum(1).to(stats.weight))
+            stats.error_weight.index_add_(0, rows, (weights @ error).to(stats.error_weight))
+        return grad, None, None, None
+
+
+def _sinc(z: Tensor) -> Tensor:
+    small = z.abs() < 1e-3
+    safe = torch.where(small, torch.ones_like(z), z)
+    z2 = z * z
+    series = 1 - z2 / 6 * (1 - z2 / 20 * (1 - z2 / 42))
+    return torch.where(small, series, safe.sin() / safe)
+
+
+class _Frame:
+    """Per-primitive quantities of one view, in float64, in camera axes."""
+
+    def __init__(self, lowered: Lowered, camera: AnyCamera) -> None:
+        g = lowered.geometry
+        view = camera.viewmat.double()
+        self.rotation = view[:3, :3]
+        self.origin = -self.rotation.T @ view[:3, 3]
+        log_scales = g.log_scales.double()
+        first = log_scales.detach().argmax(dim=-1, keepdim=True)
+        log_m = log_scales.gather(-1, first)
+        self.m = log_m.exp()[:, 0]
+        self.axes = (log_scales - log_m).exp()  # s/m, never over- or underflows
+        quats = g.quats.double()
+        self.local = quaternion_to_matrix(quats)  # ellipsoid axes -> scene
+        self.center = g.means.double() @ self.rotation.T + view[:3, 3]
+        B = self.rotation @ self.local
+        self.whiten = B.transpose(1, 2) / self.axes[:, :, None]  # camera -> whitened, times m
+        self.start = -(self.whiten @ (self.center / self.m[:, None])[:, :, None])[..., 0]  # camera centre, whitened
+
+
+def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
+    """Render a lowered model; see :func:`neuprim.core.render.render` for shapes. Computes in float64, returns the model's dtype."""
+    frame = _Frame(lowered, camera)
+    count = lowered.geometry.count
+    seen = view_of(camera, lowered.geometry, frame.center, settings.near)
+    channels = lowered.colour.rgb.shape[1] if isinstance(lowered.colour, Constant) else lowered.colour.channels
+    stats = RenderStats("reference", weight=torch.zeros(count), error_weight=torch.zeros(count))
+    rows_of_blocks = []
+    for y0 in range(0, camera.height, _BLOCK):
+        line = []
+        for x0 in range(0, camera.width, _BLOCK):
+            h, w = min(_BLOCK, camera.height - y0), min(_BLOCK, camera.width - x0)
+            rays, touched = seen.block(y0, x0, h, w)
+            ys, xs = torch.meshgrid(torch.arange(y0, y0 + h), torch.arange(x0, x0 + w), indexing="ij")
+            pixels = (ys * camera.width + xs).reshape(-1)
+            out = _trace(lowered, frame, rays, touched, pixels, channels, settings, stats)
+            line.append(out.reshape(h, w, channels + 2))
+        rows_of_blocks.append(torch.cat(line, 1))
+    image = torch.cat(rows_of_blocks, 0) if rows_of_blocks else torch.zeros(camera.height, camera.width, channels + 2, dtype=torch.float64)
+    dtype = lowered.geometry.means.dtype
+    rgb, transmittance, z = image[..., :channels], image[..., channels], image[..., channels + 1]
+    if background is not None:
+        rgb = rgb + transmittance[..., None] * background.double()
+    alpha = 1 - transmittance
+    depth = mean_depth(z, alpha).to(dtype) if settings.depth else None
+    return RenderOutput(rgb.to(dtype), alpha.to(dtype), depth, stats)
+
+
+def _trace(
+    lowered: Lowered,
+    frame: _Frame,
+    rays: Rays,
+    rows: Tensor,
+    pixels: Tensor,
+    channels: int,
+    settings: RenderSettings,
+    stats: RenderStats,
+) -> Tensor:
+    """(P, channels + 2): premultiplied colour, transmittance and sum of w z of P rays against depth-sorted ``rows``."""
+    d, P = rays.directions, len(pixels)
+    with torch.no_grad():  # which (primitive, ray) pairs meet at all
+        v = frame.whiten[rows].detach() @ d.T  # (R, 3, P)
+        p = frame.start[rows].detach()[:, :, None]
+        a = (v * v).sum(1)
+        tm = -(p * v).sum(1) / a
+        x = p + tm[:, None] * v
+        D = 1 - (x * x).sum(1)
+        far = tm + (D.clamp_min(0) / a).sqrt()
+        t_near = rays.near / frame.m[rows].detach()[:, None]
+        meet = (D > 0) & (far > t_near)
+        i, j = meet.nonzero(as_tuple=True)
+    prim = rows[i]
+    stats.pairs += int(prim.numel())
+
+    # Chord of every pair, t in units of m: x(t) = p + t v in whitened space.
+    dj = d[j]
+    v = (frame.whiten[prim] @ dj[:, :, None])[..., 0]
+    p = frame.start[prim]
+    a = (v * v).sum(-1)
+    tm = -(p * v).sum(-1) / a
+    x = p + tm[:, None] * v
+    h = _FlooredSqrt.apply(1 - (x * x).sum(-1), settings.depth_floor) / a.sqrt()
+    m = frame.m[prim]
+    t_near = rays.near[j] / m
+    t0 = torch.maximum(tm - h, t_near)
+    t1 = tm + h
+    mid, half = (t0 + t1) / 2, (t1 - t0) / 2
+    xm = p + mid[:, None] * v  # whitened chord middle
+
+    world_d = dj @ frame.rotation
+    local = (frame.local[prim] @ (frame.axes[prim] * xm)[:, :, None])[..., 0]  # (x - mu)/m of the chord middle, scene axes
+    if isinstance(lowered.density, Cosine):
+        f = lowered.density
+        W1 = f.W1.double()[prim]
+        phase = f.omega0 * ((W1 * local[:, None, :]).sum(-1) + f.b1.double()[prim])
+        rate = f.omega0 * (W1 * world_d[:, None, :]).sum(-1)
+        mean_f = f.b2.double().reshape(-1)[prim] + (f.w2.double()[prim] * phase.cos() * _sinc(rate * half[:, None])).sum(-1)
+        optical_depth = 2 * half * mean_f
+    else:
+        origin = frame.origin.expand_as(world_d)
+        found = lowered.density.line_integral(prim, origin, world_d, t0 * m, t1 * m)
+        optical_depth = check_result(found, (len(prim),), f"{lowered.source('density')}: line_integral").double()
+
+    alpha = -torch.expm1(-optical_depth.clamp_min(0))
+    alpha = alpha.clamp_max(settings.alpha_max)
+    counts = (optical_depth.detach() > 0) & (alpha.detach() >= settings.alpha_min)
+    alpha = torch.where(counts, alpha, torch.zeros_like(alpha))
+
+    # Front to back: composite, then stop once T < T_min. Rows are already sorted by depth of the centre.
+    dense = torch.zeros(len(rows), P, dtype=torch.float64).index_put((i, j), alpha)
+    if settings.sort == "entry":  # every ray by the depth of its entries; those that the near plane cuts are equal, and first
+        with torch.no_grad():
+            entry = torch.where(tm - h > t_near, (tm - h) * m * rays.depth[j], torch.zeros_like(h))
+            keys = torch.full_like(dense, torch.inf).index_put((i, j), entry)
+            by_entry = keys.argsort(dim=0, stable=True)
+        dense = dense.gather(0, by_entry)
+    ones = torch.ones(1, P, dtype=torch.float64)
+    with torch.no_grad():
+        before = torch.cat([ones, (1 - dense).cumprod(0)])[:-1]
+        live = before >= settings.transmittance_min
+    dense = torch.where(live, dense, torch.zeros_like(dense))
+    T = torch.cat([ones, (1 - dense).cumprod(0)])
+    weights = dense * T[:-1]
+    if settings.sort == "entry":
+        weights = weights.gather(0, by_entry.argsort(0))
+    if weights.requires_grad:
+        weights = _Tally.apply(weights, rows, pixels, stats)
+
+    if isinstance(lowered.colour, Constant):
+        rgb = weights.T @ lowered.colour.rgb.double()[rows]
+    else:
+        if isinstance(lowered.colour, RayNet):
+            c = lowered.colour.radiance(prim, local)
+        else:
+            xw = frame.origin + (mid * m)[:, None] * world_d
+            c = lowered.colour.radiance(prim, xw, world_d)
+            c = check_result(c, (len(prim), channels), f"{lowered.source('colour')}: radiance").double()
+        rgb = torch.zeros(P, channels, dtype=torch.float64).index_add(0, j, weights[i, j][:, None] * c)
+    z = torch.zeros(P, dtype=torch.float64).index_add(0, j, weights[i, j] * mid * m * rays.depth[j]) if settings.depth else T[-1] * 0
+    return torch.cat([rgb, T[-1][:, None], z[:, None]], -1)

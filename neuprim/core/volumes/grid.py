@@ -1,0 +1,196 @@
+"""The model's extinction on a regular grid: sigma(x) = sum over primitives of max(0, f(x~)) / m, inside their ellipsoids.
+
+A primitive's f may be negative in places, where it is clamped at 0; a renderer clamps the integral along a ray instead.
+
+Along an axis of the grid a neuron's phase is linear in the index, so its cosine at a grid point is a product of one complex number per
+axis: a primitive that spans n^3 points costs 3 n sines and cosines per neuron, and two multiplications per neuron and point.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.compute.threads import parallel_for
+from neuprim.core.errors import ConfigError
+from neuprim.core.model.fields import Conditions, Cosine
+from neuprim.core.model.primitives import Primitives
+
+__all__ = ["POINTS_LIMIT", "agreement", "density_at", "density_grid", "lattice"]
+
+_SLAB = 8  # planes per unit of work; fixed, and the result does not depend on it
+_PAIRS = 1 << 17  # of points and primitives that a density in torch code is asked for at once
+
+POINTS_LIMIT = 2**30
+"""Most points of a grid, 4 GiB of float32."""
+
+
+def lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, tuple[int, int, int]]:
+    """(4, 4) scene_from_index and shape of a regular grid of cell centres that fills a (2, 3) box, ``resolution`` along its longest side."""
+    low, high = np.asarray(bounds, np.float64)
+    step = float((high - low).max()) / resolution
+    x, y, z = (max(1, round(float(side) / step)) for side in high - low)
+    matrix = torch.eye(4, dtype=torch.float64) * step
+    matrix[3, 3] = 1.0
+    matrix[:3, 3] = torch.from_numpy(low + step / 2)
+    return matrix, (x, y, z)
+
+
+def agreement(truth: np.ndarray, found: np.ndarray) -> dict[str, float] | None:
+    """Pearson ``correlation`` and ``relative_l2`` = |found - truth| / |truth| of two grids; None where the truth is the same everywhere."""
+    a, b = truth.astype(np.float64), found.astype(np.float64)
+    if a.std() == 0:
+        return None
+    correlation = float(np.corrcoef(a.ravel(), b.ravel())[0, 1]) if b.std() > 0 else 0.0
+    return {"correlation": correlation, "relative_l2": float(np.linalg.norm(b - a) / np.linalg.norm(a))}
+
+
+def density_grid(
+    model: Primitives, conditions: Conditions, scene_from_index: Tensor, shape: tuple[int, int, int], threads: int = 0
+) -> Tensor:
+    """(X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``.
+
+    What lowers to a :class:`~neuprim.core.model.fields.Cosine` runs in compiled code on all cores; any other density is asked point by
+    point, in blocks. Beside the grid it takes a few MB.
+
+    Args:
+        conditions: of the frame, e.g. ``{"time": tensor(0.5)}``.
+        scene_from_index: (4, 4) float64 affine map, invertible.
+        threads: 0 for all cores; the result does not depend on it.
+
+    Raises:
+        ConfigError: more than :data:`POINTS_LIMIT` points, or a map that is singular or not finite.
+    """
+    forward = scene_from_index.detach().double().numpy()
+    count = int(np.prod(np.array(shape, np.float64)))
+    if count > POINTS_LIMIT:
+        raise ConfigError(f"a grid of {' x '.join(map(str, shape))} points: expected at most {POINTS_LIMIT}")
+    if not np.isfinite(forward).all() or abs(np.linalg.det(forward[:3, :3])) == 0:
+        raise ConfigError(f"scene_from_index {forward.tolist()}: expected a finite, invertible affine map")
+    back = np.linalg.inv(forward)
+    grid = np.zeros(shape, np.float32)
+    with torch.no_grad():
+        geometry, form = model.lower_density(conditions)
+        wide = [x.detach().double().numpy() for x in (geometry.means, geometry.scales, geometry.rotations)]
+        if not isinstance(form, Cosine):
+            _ask(model, conditions, wide, forward, back, grid)
+            return torch.from_numpy(grid)
+        wide += [x.detach().double().numpy() for x in (form.W1, form.b1, form.w2, form.b2.reshape(-1))]
+    arguments = [np.ascontiguousarray(x) for x in (*wide, forward[:3], back[:3])]
+    parallel_for(_fill, shape[0], _SLAB, threads, *arguments, form.omega0, grid)
+    return torch.from_numpy(grid)
+
+
+def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Tensor:
+    """(M,) float64 extinction, 1/scene unit, at (M, 3) points: every primitive at every point, in float64. Slow, short, and the oracle."""
+    with torch.no_grad():
+        living = model.living(conditions, torch.float64)
+        geometry = living.geometry
+        total = torch.zeros(len(points), dtype=torch.float64)
+        whiten = geometry.rotations / geometry.scales[:, None, :]
+        for part in torch.arange(len(points)).split(max(1, _PAIRS // max(geometry.count, 1))):
+            x = points[part].double()
+            y = torch.einsum("mna,nab->mnb", x[:, None, :] - geometry.means, whiten)
+            row, prim = (y.square().sum(-1) < 1.0).nonzero(as_tuple=True)
+            total.index_add_(0, part[row], living.sigma(prim, x[row]).clamp_min(0))
+    return total
+
+
+def _ask(model: Primitives, conditions: Conditions, wide: list[Any], P: np.ndarray, Q: np.ndarray, grid: np.ndarray) -> None:
+    """Adds a density in torch code, primitive by primitive in a fixed order, so that the sums are the same every time."""
+    living = model.living(conditions, torch.float64)
+    means, scales, R = wide
+    limit = np.array(grid.shape)
+    for n in range(len(means)):
+        center = Q[:3, :3] @ means[n] + Q[:3, 3]
+        reach = np.linalg.norm((Q[:3, :3] @ R[n]) * scales[n], axis=1)
+        low = np.clip(np.ceil(np.clip(center - reach, -1e9, 1e9)), 0, limit).astype(int)
+        high = np.clip(np.floor(np.clip(center + reach, -1e9, 1e9)) + 1, 0, limit).astype(int)
+        size = high - low
+        if (size <= 0).any():
+            continue
+        planes = max(1, _PAIRS // int(size[1] * size[2]))
+        for start in range(low[0], high[0], planes):
+            block = (slice(start, min(start + planes, high[0])), slice(low[1], high[1]), slice(low[2], high[2]))
+            index = np.stack(np.meshgrid(*(np.arange(s.start, s.stop) for s in block), indexing="ij"), -1)
+            x = index @ P[:3, :3].T + P[:3, 3]
+            inside = (np.square(((x - means[n]) @ R[n]) / scales[n]).sum(-1) < 1.0).nonzero()
+            points = torch.from_numpy(x[inside])
+            found = living.sigma(torch.full((len(points),), n), points).clamp_min(0).numpy()
+            grid[block][inside] += found.astype(np.float32)
+
+
+@exact_kernel
+def _fill(
+    start: int, stop: int, means: Any, scales: Any, R: Any, W1: Any, b1: Any, w2: Any, b2: Any, P: Any, Q: Any, omega0: float, grid: Any
+) -> None:
+    """Planes start:stop. P (3, 4) maps indices to the scene, Q (3, 4) back."""
+    K = W1.shape[1]
+    longest = max(grid.shape[1], grid.shape[2], stop - start)
+    low, high, steps, y = np.empty(3, np.int64), np.empty(3, np.int64), np.empty((3, 3)), np.empty(3)
+    cosines, sines, row, origin = np.empty((3, K, longest)), np.empty((3, K, longest)), np.empty(grid.shape[2]), np.empty(3)
+    for n in range(means.shape[0]):
+        empty = False
+        for a in range(3):  # the ellipsoid's box in indices
+            center, reach = Q[a, 3], 0.0
+            for j in range(3):
+                center += Q[a, j] * means[n, j]
+                side = (Q[a, 0] * R[n, 0, j] + Q[a, 1] * R[n, 1, j] + Q[a, 2] * R[n, 2, j]) * scales[n, j]
+                reach += side * side
+            reach = np.sqrt(reach)
+            low[a] = max(int(np.ceil(max(center - reach, -1e9))), 0)
+            high[a] = min(int(np.floor(min(center + reach, 1e9))) + 1, grid.shape[a])
+            if a == 0:
+                low[0], high[0] = max(low[0], start), min(high[0], stop)
+            empty = empty or low[a] >= high[a]
+        if empty:
+            continue
+        m = max(scales[n, 0], scales[n, 1], scales[n, 2])
+        for a in range(3):
+            origin[a] = P[a, 0] * low[0] + P[a, 1] * low[1] + P[a, 2] * low[2] + P[a, 3] - means[n, a]
+            for j in range(3):  # a step along grid axis a, on the whitened axes j
+                steps[a, j] = (R[n, 0, j] * P[0, a] + R[n, 1, j] * P[1, a] + R[n, 2, j] * P[2, a]) / scales[n, j]
+        for q in range(K):
+            for a in range(3):
+                rate = omega0 * (W1[n, q, 0] * P[0, a] + W1[n, q, 1] * P[1, a] + W1[n, q, 2] * P[2, a]) / m
+                first = 0.0
+                if a == 0:
+                    first = omega0 * ((W1[n, q, 0] * origin[0] + W1[n, q, 1] * origin[1] + W1[n, q, 2] * origin[2]) / m + b1[n, q])
+                for i in range(high[a] - low[a]):
+                    cosines[a, q, i] = np.cos(first + rate * i)
+                    sines[a, q, i] = np.sin(first + rate * i)
+        length = high[2] - low[2]
+        square = steps[2, 0] ** 2 + steps[2, 1] ** 2 + steps[2, 2] ** 2
+        for i in range(high[0] - low[0]):
+            for j in range(high[1] - low[1]):
+                half, rest = 0.0, -1.0  # |y + k step|^2 = 1 at the ends of the row inside the ellipsoid
+                for a in range(3):
+                    y[a] = (R[n, 0, a] * origin[0] + R[n, 1, a] * origin[1] + R[n, 2, a] * origin[2]) / scales[n, a]
+                    y[a] += steps[0, a] * i + steps[1, a] * j
+                    half -= y[a] * steps[2, a]
+                    rest += y[a] * y[a]
+                inner = half * half - square * rest
+                if not inner > 0.0:
+                    continue
+                root = np.sqrt(inner)
+                first_k = max(int(np.ceil(max((half - root) / square, -1.0))), 0)
+                last_k = min(int(np.ceil(min((half + root) / square, 1e9))), length)
+                if first_k >= last_k:
+                    continue
+                f = row[: last_k - first_k]  # slices, as the compiler makes vector code of them only
+                f[:] = b2[n]
+                for q in range(K):
+                    c = cosines[0, q, i] * cosines[1, q, j] - sines[0, q, i] * sines[1, q, j]
+                    s = sines[0, q, i] * cosines[1, q, j] + cosines[0, q, i] * sines[1, q, j]
+                    c, s = c * w2[n, q], s * w2[n, q]
+                    cos_k, sin_k = cosines[2, q, first_k:last_k], sines[2, q, first_k:last_k]
+                    for k in range(len(f)):
+                        f[k] += c * cos_k[k] - s * sin_k[k]
+                sums = grid[low[0] + i, low[1] + j, low[2] + first_k : low[2] + last_k]
+                for k in range(len(f)):
+                    if f[k] > 0.0:
+                        sums[k] += np.float32(f[k] / m)

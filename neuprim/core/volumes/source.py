@@ -1,0 +1,94 @@
+"""The voxel files a scene was made from: how they lie beside the model, and what they hold."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuprim.core.errors import DataError
+from neuprim.core.volumes.truth import DensityTruth
+
+__all__ = ["Placement", "VolumeSource"]
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How scene units follow from the world of the files.
+
+    Attributes:
+        scene_from_world: (4, 4) float64.
+        numbers: of the frames.
+        times: name -> value per frame of the condition that tells frames apart, e.g. ``{"time": [0.0, 0.5, 1.0]}``.
+        sigma_per_unit: extinction, 1/scene unit, of a grid value of 1.
+        grid: name of the grid that absorbs.
+        exact: whether that grid alone makes the extinction; if not, other grids add to it.
+    """
+
+    scene_from_world: np.ndarray
+    numbers: Sequence[int]
+    times: Mapping[str, Sequence[float]]
+    sigma_per_unit: float
+    grid: str
+    exact: bool = True
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers, exact when read back."""
+        return {
+            "scene_from_world": self.scene_from_world.tolist(),
+            "numbers": list(self.numbers),
+            "times": {name: list(values) for name, values in self.times.items()},
+            "sigma_per_unit": self.sigma_per_unit,
+            "grid": self.grid,
+            "exact": self.exact,
+        }
+
+    @staticmethod
+    def from_json(record: Mapping[str, Any], where: str) -> Placement:
+        """What :meth:`to_json` gave; ``where`` names the file in errors.
+
+        Raises:
+            DataError: anything else.
+        """
+        try:
+            made = Placement(
+                np.array(record["scene_from_world"], np.float64).reshape(4, 4),
+                [int(n) for n in record["numbers"]],
+                {str(name): [float(v) for v in values] for name, values in record["times"].items()},
+                float(record["sigma_per_unit"]),
+                str(record["grid"]),
+                bool(record["exact"]),
+            )
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise DataError(f"{where}: header field 'world' is damaged ({error!r})") from None
+        matrix = made.scene_from_world
+        sound = np.isfinite(matrix).all() and (matrix[3] == (0, 0, 0, 1)).all() and abs(np.linalg.det(matrix)) > 0
+        if not sound or not 0 < made.sigma_per_unit < np.inf or any(len(v) != len(made.numbers) for v in made.times.values()):
+            raise DataError(f"{where}: header field 'world' is damaged; expected an invertible affine matrix, and a time per frame")
+        return made
+
+
+class VolumeSource(DensityTruth):
+    """The files themselves, one frame at a time; ``frames`` are those of the placement.
+
+    Attributes:
+        placement: see :class:`Placement`.
+    """
+
+    placement: Placement
+
+    @abstractmethod
+    def transform(self, frame: int) -> np.ndarray | None:
+        """(4, 4) float64, index to world, of the absorbing grid of a frame; None where the frame lacks it."""
+
+    @abstractmethod
+    def of(self, path: Path) -> DensityTruth:
+        """Another file, or folder of frames, read by the same rules and placed as these are.
+
+        Raises:
+            DataError: nothing in ``path`` fits.
+        """

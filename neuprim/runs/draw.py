@@ -1,0 +1,289 @@
+"""Measure and draw the model of a run directory: on its held-out views, along an orbit or given cameras."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from neuprim.config import RunConfig, scene_of, suspects_of, task_of
+from neuprim.core.cameras.file import read_cameras
+from neuprim.core.channels import Channels, channels_of, stored_channels
+from neuprim.core.checkpoint import load_model
+from neuprim.core.conditions import flag, read_conditions
+from neuprim.core.data import Dataset, View
+from neuprim.core.data.check import check_dataset
+from neuprim.core.data.records import Record
+from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.io import images
+from neuprim.core.io.files import cache_directory, write_npy
+from neuprim.core.io.film import write_film
+from neuprim.core.model.fields import Conditions
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.task import SceneContext, TaskSpec
+from neuprim.plugins.blame import blamed
+from neuprim.plugins.mechanism import PluginError
+from neuprim.plugins.provenance import warn_of_neuprim
+from neuprim.runs.measure import draw, draw_sum, measure, summary
+
+__all__ = ["FORMATS", "LOGS", "evaluate_run", "load_dataset", "load_run", "read_metrics", "render_run"]
+
+ANIMATIONS = ("webp", "gif", "mp4")
+_RAW = ("exr", "npy")
+FORMATS = ("png", "exr", "npy", *ANIMATIONS)
+"""What ``neuprim render`` writes: pictures of what the task's channels look like, but all channels as they are in EXR and npy."""
+
+LOGS = "logs"
+"""Folder of a run directory for tracebacks of plugins."""
+
+
+def load_dataset(
+    config: RunConfig,
+    task: TaskSpec,
+    progress: Callable[[str, float], None] = lambda text, fraction: None,
+    run_dir: Path | None = None,
+) -> Dataset:
+    """The data set of a run's configuration.
+
+    Args:
+        run_dir: the finished run that the configuration was read from: messages name its file, and the traceback of a loader of
+            another package is kept there, should it crash. None: a run that is only about to be made.
+
+    Raises:
+        NeuprimError: what the loader refuses, or that it crashed.
+    """
+    context = SceneContext(config.seed, cache_directory() / "scenes", progress)
+    load = scene_of(config, task, None if run_dir is None else run_dir / "config.yaml").spec.load
+    scene = suspects_of(config).scene
+    with blamed(scene.origin, scene.what, (config.output_dir if run_dir is None else run_dir) / LOGS):
+        dataset = load(config.scene, context)
+    if not isinstance(dataset, Dataset):
+        found = f"a {type(dataset).__name__}" if dataset is not None else "None"
+        raise PluginError(f"{scene.what} of {scene.origin.origin}: its loader returned {found}; expected a neuprim.core.data.Dataset")
+    return dataset
+
+
+def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Primitives, dict[str, Any]]:
+    """Configuration, task, model and model header of a run directory.
+
+    Warns where another version of neuprim or of the task's package made the run.
+
+    Args:
+        named: whether what is said about these names the file; not for a directory that the user does not know.
+
+    Raises:
+        CheckpointError, ConfigError: naming the file that is missing or damaged.
+    """
+    file = run_dir / "config.yaml"
+    config, place = RunConfig.from_yaml(file), file if named else None
+    task = task_of(config, place)
+    if config.made_by is not None:
+        warn_of_neuprim(config.made_by, place)
+    model, header = load_model(run_dir / "model.safetensors", task)
+    return config, task, model, header
+
+
+def evaluate_run(run_dir: Path) -> dict[str, Any]:
+    """The metrics of a run's last checkpoint, measured again from disk alone; the same numbers as the run's own."""
+    config, task, model, header = load_run(run_dir)
+    suspects = suspects_of(config)
+    with suspects.watch(run_dir / LOGS):
+        dataset = load_dataset(config, task, run_dir=run_dir)
+        suspects.know(dataset)
+        check_dataset(dataset, task.conditions)
+        path = run_dir / "model.safetensors"
+        training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
+        channels = channels_of(task, dataset)
+        views = measure(model, dataset, config.renderer, channels)
+        return summary(config, model, dataset, channels, views, path.stat().st_size, training)
+
+
+def render_run(
+    run_dir: Path,
+    camera: str,
+    size: tuple[int, int] | None,
+    format: str | None,
+    out: Path | None,
+    frames: int,
+    conditions: Mapping[str, str],
+    fps: float | None = None,
+    environment: EnvironmentFile | None = None,
+    tell: Callable[[str], None] = lambda text: None,
+    progress: Callable[[str, float], None] = lambda text, fraction: None,
+) -> list[Path]:
+    """Draw a run's model: ``camera`` is "orbit", "test" or a JSON file of cameras (see :mod:`neuprim.core.cameras.file`).
+
+    Writes one file per view, or one animation for the formats of :data:`ANIMATIONS` with more than one view; returns the files.
+    Without a format, the suffix of ``out`` decides, else views that differ in a condition become a WebP animation and others PNGs.
+
+    Args:
+        conditions: name -> text, e.g. ``{"time": "0:1"}``.
+        fps: of an animation; None lets it last four seconds, at 5 to 30 frames per second.
+        environment: light from all around instead of the task's light.
+        tell: called with lines for the user, e.g. what the model never saw.
+        progress: called with (text, fraction 0..1) while images are drawn.
+
+    Raises:
+        DataError, ConfigError, CheckpointError: bad cameras, conditions, or run directory.
+        BackendUnavailable: a format whose package is missing.
+    """
+    config, task, model, header = load_run(run_dir)
+    suspects = suspects_of(config)
+    watch = suspects.watch(run_dir / LOGS)
+    background = torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)])
+    channels = stored_channels(run_dir, header, task, model.colour.channels)
+    lights: Sequence[Conditions] = ()
+    if environment is not None:
+        with watch:
+            around = _illumination(environment, config, task, header, conditions)
+        lights = around.frames(environment.guesses)
+        if not lights:
+            raise ConfigError(f"--environment-unseen drop: all light of {environment.path} comes from where the model never saw any")
+        hint = " (--environment-unseen drop leaves it out)" if environment.guesses and any(around.guessed) else ""
+        for note in around.notes:
+            tell(f"{environment.path}: {note}{hint}")
+    if camera.endswith(".json"):
+        views = [View(name, c) for name, c in read_cameras(Path(camera), size)]
+    else:
+        dataset = load_dataset(config, task, run_dir=run_dir)
+        suspects.know(dataset)
+        with watch:
+            views = dataset.orbit(frames) if camera == "orbit" else [dataset.test.view(i) for i in range(len(dataset.test))]
+    if size is not None:
+        views = [replace(v, camera=v.camera.resized(*size)) for v in views]
+    if lights:  # these replace the views' own; the first stands for all where only their presence counts
+        views = [replace(v, conditions={**v.conditions, **lights[0]}) for v in views]
+    with watch:
+        views, animated = with_conditions(views, task, conditions, tell)
+    format = format or _format_of(out, animated)
+    if channels.partial and format not in _RAW:
+        tell(f"shown: {channels.shown}; --format exr and npy hold all channels")
+
+    single = out is not None and out.suffix.lower() == f".{format}"
+    folder = out if out is not None and not single else run_dir / "renders" / camera.removesuffix(".json").split("/")[-1]
+    animate = format in ANIMATIONS and len(views) > 1
+    if single and len(views) > 1 and not animate:
+        raise ConfigError(
+            f"--out {out}: {len(views)} views do not fit one .{format} file; give a folder, or --format webp for an animation"
+        )
+    done = 0
+
+    def image(view: View) -> torch.Tensor:
+        def drawn() -> None:
+            nonlocal done
+            done += 1
+            progress(f"view {done // each + (done % each > 0)} of {len(views)}", done / (each * len(views)))
+
+        each = max(len(lights), 1)
+        with watch:
+            if lights:
+                return draw_sum(model, view, lights, config.renderer, background, drawn)
+            result = draw(model, view, config.renderer, background)
+        drawn()
+        return result
+
+    if animate:
+        target = out if single and out is not None else folder.with_suffix(f".{format}")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        stack = [channels.display(image(v)) for v in views]
+        write_film(target, stack, fps or min(30.0, max(len(views) / 4.0, 5.0)))
+        return [target]
+    paths = []
+    for v in views:
+        path = out if single and out is not None else folder / f"{_file_name(v.name)}.{format}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _write(path, format, image(v), channels, fps)
+        paths.append(path)
+    return paths
+
+
+def _write(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fps: float | None) -> None:
+    """One image: all channels, linear in EXR and as the data set has them in npy; or what its channels look like."""
+    if format == "exr":
+        linear = pixels if channels.color_space == "linear" else images.srgb_to_linear(pixels.clamp_min(0.0))
+        images.write_exr(path, linear, half=False, names=channels.names)
+    elif format == "npy":
+        write_npy(path, pixels.contiguous().numpy())
+    elif format == "png":
+        images.write_png(path, channels.display(pixels))
+    elif format == "webp":
+        images.write_webp(path, channels.display(pixels))
+    else:
+        write_film(path, [channels.display(pixels)], fps or 12.0)
+
+
+def _illumination(
+    choice: EnvironmentFile, config: RunConfig, task: TaskSpec, header: Mapping[str, Any], conditions: Mapping[str, str]
+) -> Illumination:
+    """The frames that stand for an environment."""
+    if task.environment is None:
+        raise ConfigError(f"--environment {choice.path}: task {task.name!r} has no light that it could replace")
+    facts = header.get("data")
+    if facts is None:  # written before models kept them
+        facts = load_dataset(config, task).facts()
+    if not isinstance(facts, dict):
+        raise DataError(f"the model's header: data is {type(facts).__name__}; expected an object")
+    up = Record(facts, "the model's header: data").array("up", (3,), "3 numbers")
+    found = task.environment(read_environment(choice.path, up, choice.rotation, choice.scale), choice.samples, facts)
+    clash = sorted(conditions.keys() & found.conditions[0].keys())
+    if clash:
+        raise ConfigError(f"{flag(clash[0])} and --environment: give one of them")
+    return found
+
+
+def _format_of(out: Path | None, animated: bool) -> str:
+    suffix = "" if out is None else out.suffix.lower().removeprefix(".")
+    return suffix if suffix in FORMATS else "webp" if animated else "png"
+
+
+def with_conditions(
+    views: list[View], task: TaskSpec, texts: Mapping[str, str], warn: Callable[[str], None] = lambda text: None
+) -> tuple[list[View], bool]:
+    """Views with the conditions the user gave, and whether one of these is animated; an animated condition repeats or stretches the
+    cameras to its length.
+
+    Raises:
+        ConfigError: a view lacks a condition that the task needs, or as :func:`neuprim.core.conditions.read_conditions`.
+    """
+    animated = False
+    given = read_conditions(task.conditions, texts, warn)
+    for spec in task.conditions:
+        if spec.name in given:
+            values = given[spec.name]
+            if len(values) == 1:
+                views = [replace(v, conditions={**v.conditions, spec.name: values[0]}) for v in views]
+            else:
+                animated = True
+                count = max(len(values), len(views))
+                pick = [(views[i * len(views) // count], values[i * len(values) // count]) for i in range(count)]
+                views = [replace(v, name=f"{v.name}_{i:03d}", conditions={**v.conditions, spec.name: x}) for i, (v, x) in enumerate(pick)]
+        for v in views:
+            if spec.name not in v.conditions:
+                raise ConfigError(f"view {v.name} has no {spec.name}, which task {task.name!r} needs; give {flag(spec.name)}")
+    return views, animated
+
+
+def _file_name(name: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name)
+
+
+def read_metrics(run_dir: Path) -> dict[str, Any]:
+    """``metrics.json`` of a run.
+
+    Raises:
+        DataError: missing or damaged.
+    """
+    path = run_dir / "metrics.json"
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: {error}") from error
+    if not isinstance(data, dict) or not math.isfinite(float(data.get("ssim") or 0.0)):
+        raise DataError(f"{path}: expected an object with metrics")
+    return data

@@ -1,0 +1,212 @@
+"""``neuprim export`` and ``neuprim import``: models out of run directories and back."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+
+from neuprim.config import RunConfig
+from neuprim.core import checkpoint
+from neuprim.core.conditions import flag, named, read_conditions, split_words
+from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
+from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
+from neuprim.core.io.drafts import Draft, drafted, refuse_taken
+from neuprim.core.model.fields import ConditionSpec
+from neuprim.plugins.blame import origin_of
+from neuprim.plugins.crashes import reported
+from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin, load_exporter
+from neuprim.runs.draw import load_run
+from neuprim.runs.export_record import record_export
+from neuprim.runs.open import trained_model
+
+__all__ = ["export_run", "import_model", "import_run", "print_report"]
+
+# ---------------------------------------------------------------- export
+
+
+def export_run(
+    run_dir: Path, name: str, out: Path | None = None, words: Sequence[str] = (), overwrite: bool = False, console: Console | None = None
+) -> ExportReport:
+    """Write a run's model in a format: whole, or not at all, and over files that exist only with ``overwrite``, whoever's format it is.
+
+    Args:
+        words: ``KEY=VALUE`` options of the exporter, and conditions of the task, also as ``--NAME TEXT``.
+        console: where progress goes; None: nowhere.
+
+    Raises:
+        NeuprimError: no such run, format or option, something that the format cannot hold, files in its way, or an exporter that crashed.
+    """
+    exporter = load_exporter(name)
+    final = _destination(run_dir, exporter, out)
+    refuse_taken(final, overwrite)
+    shown = _Progress(console)
+    run = trained_model(run_dir, shown)
+    options, conditions = _options(words, exporter, run.task.conditions)
+    notes: list[str] = []
+    read_conditions(run.task.conditions, conditions, notes.append)
+    with drafted(final, overwrite) as draft:
+        job = ExportJob(run, draft.out, options, conditions, shown)
+        with reported(EXPORTERS, name, [run_dir / "logs", final.absolute().parent]):
+            report = exporter.write(job)
+        files = _files(report, draft, name)
+        draft.publish()
+    report = replace(report, files=files, notes=(*notes, *(draft.words(note) for note in report.notes)))
+    return record_export(name, job, report)
+
+
+def _destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
+    """What the user named, or the exporter's own name for it in the run."""
+    if out is None:
+        return run_dir / "export" / (exporter.default or exporter.name + "".join(exporter.suffixes[:1]))
+    fits = any(out.name.lower().endswith(suffix) and len(out.name) > len(suffix) for suffix in exporter.suffixes)
+    if exporter.suffixes and (not fits or out.is_dir()):
+        raise ConfigError(f"--out {out}: expected a file name with {' or '.join(exporter.suffixes)}")
+    return out
+
+
+def _files(report: Any, draft: Draft, name: str) -> tuple[Path, ...]:
+    """Where the files of a report will be."""
+    who = f"exporter {name!r} of {origin_of(EXPORTERS, name).origin}"
+    if not isinstance(report, ExportReport):
+        raise PluginError(f"{who}: write returned {type(report).__name__}; expected an ExportReport")
+    files = []
+    for path in map(Path, report.files):
+        place = draft.place(path)
+        if place is None:
+            raise PluginError(f"{who}: wrote {path} instead of {draft.out}, past everything that keeps files from being replaced")
+        if not path.exists():
+            raise PluginError(f"{who}: reports {path}, which it did not write")
+        files.append(place)
+    return tuple(files)
+
+
+def _options(words: Sequence[str], exporter: Exporter, specs: Sequence[ConditionSpec]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Every option of the exporter, and the texts of the conditions; where both have one name, ``NAME=`` means the option."""
+    options = {name: default for name, (default, _) in exporter.options.items()}
+    conditions, rest = split_words(words, specs, bare=False)
+    if conditions and not exporter.conditions:
+        raise ConfigError(f"{flag(next(iter(conditions)))}: --format {exporter.name} takes no conditions")
+    given = set()
+    for word in rest:
+        key, equals, text = word.partition("=")
+        if not equals or not key:
+            raise ConfigError(f"{word!r}: expected KEY=VALUE")
+        condition = named(key, specs) if exporter.conditions and key not in exporter.options else None
+        if key in given or (condition or "") in conditions:
+            raise ConfigError(f"{key}: given twice")
+        if condition is not None:
+            conditions[condition] = text
+        elif key in exporter.options:
+            given.add(key)
+            options[key] = _scalar(text)
+        else:
+            known = [*exporter.options, *((spec.name for spec in specs) if exporter.conditions else ())]
+            raise ConfigError(f"{key}: no such option of --format {exporter.name}{nearest(key, known) or '; it has none'}")
+    return options, conditions
+
+
+def _scalar(text: str) -> Any:
+    """A number, true, false, null, or the text; unlike YAML's, 1e-3 is a number and 1:40 is text."""
+    named = {"true": True, "false": False, "null": None, "": None}
+    if text in named:
+        return named[text]
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+class _Progress:
+    """A line per stage and quarter; nothing without a console."""
+
+    def __init__(self, console: Console | None) -> None:
+        self.console, self.last = console, ("", -1.0)
+
+    def __call__(self, text: str, fraction: float) -> None:
+        if self.console is not None and (text != self.last[0] or fraction >= self.last[1] + 0.25):
+            self.last = (text, fraction)
+            self.console.print(f"{text}, {fraction:.0%}" if fraction > 0 else text, highlight=False, soft_wrap=True)
+
+
+def print_report(report: ExportReport, as_json: bool) -> None:
+    """The report on standard output, for people or for programs."""
+    if as_json:
+        errors = {name: value if math.isfinite(value) else None for name, value in report.errors.items()}
+        record = {"files": [str(p) for p in report.files], "lossless": report.lossless, "errors": errors, "notes": list(report.notes)}
+        print(json.dumps(record, indent=1, allow_nan=False))
+        return
+    print(*report.files, sep="\n")
+    print("lossless" if report.lossless else "lossy")
+    width = max((len(name) for name in report.errors), default=0)
+    for name, value in report.errors.items():
+        print(f"{name:{width}}  {value:.4f}")
+    for note in report.notes:
+        print(f"note: {note}")
+
+
+# ---------------------------------------------------------------- import
+
+
+def import_run(path: Path, out: Path, name: str | None = None) -> Path:
+    """Make a run directory of a file that a lossless exporter wrote; returns ``out``.
+
+    It has ``config.yaml`` and ``model.safetensors``, so that it renders, is measured and exports like the run that it came from.
+
+    Raises:
+        ConfigError: ``out`` exists and is not empty, or no format reads such files.
+        DataError, CheckpointError: the file is damaged or foreign.
+    """
+    if not path.is_file():
+        raise DataError(f"{path}: no such file")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f"--out {out}: exists and is not an empty folder")
+    reader = _reader(path, name)
+    assert reader.read is not None
+    with reported(EXPORTERS, name or reader.name, [out.absolute().parent]):
+        stored = reader.read(path)
+    return import_model(stored, path, out)
+
+
+def _reader(path: Path, name: str | None) -> Exporter:
+    name = name or path.suffix.lower().removeprefix(".")
+    try:
+        exporter = load_exporter(name)
+    except UnknownPlugin:
+        raise ConfigError(f"{path}: no format reads .{name} files; lossless formats are exported by --format ply or npz") from None
+    if exporter.read is None:
+        raise ConfigError(f"{path}: --format {name} is lossy and cannot be imported; ply and npz can")
+    return exporter
+
+
+def import_model(stored: StoredModel, path: Path, out: Path) -> Path:
+    """Write a stored model as a run directory and load it once, so that nothing unsound gets the name ``out``."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    draft = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    try:
+        draft.chmod(0o755)
+        (draft / "config.yaml").write_text(stored.config, encoding="utf-8", newline="")
+        header: Mapping[str, Any] = {key: value for key, value in stored.header.items() if key not in ("format", "kind")}
+        tensors = {name: torch.from_numpy(value) for name, value in stored.tensors.items()}
+        try:
+            checkpoint.write(draft / "model.safetensors", "model", tensors, header)
+            RunConfig.from_yaml(draft / "config.yaml")
+            load_run(draft, named=False)
+        except (NeuprimError, ValueError, TypeError) as error:  # of a file that is not yet there under this name
+            raise DataError(f"{path}: {str(error).replace(str(draft), 'its model')}") from error
+        if out.exists():
+            out.rmdir()
+        draft.rename(out)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+    return out

@@ -1,0 +1,232 @@
+"""``neuprim inspect``: a run's density on screen, as pictures, as a page, or as OpenVDB files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuprim.core.errors import BackendUnavailable, ConfigError
+from neuprim.core.extensions import Inspector
+from neuprim.core.io import images
+from neuprim.core.io.drafts import refuse_taken
+from neuprim.core.io.film import write_film
+from neuprim.core.model.fields import Conditions
+from neuprim.core.volumes.grid import POINTS_LIMIT, agreement, density_grid, lattice
+from neuprim.core.volumes.truth import DensityTruth
+from neuprim.plugins.crashes import is_ours, reported
+from neuprim.plugins.inspect.against import open_truth, pair, write_volume
+from neuprim.plugins.inspect.field import FieldFrame, ViewOptions
+from neuprim.plugins.inspect.frames import box_of, condition_frames, in_words, round_up
+from neuprim.plugins.inspect.headless import has_display, prepare_headless, require_pyvista
+from neuprim.plugins.inspect.page import write_page
+from neuprim.plugins.inspect.window import Window, panels_of
+from neuprim.plugins.registry import INSPECTORS, load_inspector
+from neuprim.runs.open import trained_model
+
+__all__ = ["OUTPUTS", "Request", "inspect_run"]
+
+FILMS = (".webp", ".gif", ".mp4")
+OUTPUTS = (".png", *FILMS, ".html", ".vdb")
+"""What ``--out`` may end in."""
+
+_COARSE = 48  # points along the box's longest side on which the scale of all frames is found
+_DEPTH = 6.0  # optical depth that a volume is shown with where it is deepest
+
+
+@dataclass(frozen=True)
+class Request:
+    """The words of the command.
+
+    Attributes:
+        show: names of inspectors.
+        conditions: name -> text, as ``{"time": "0:1"}``.
+        grid: points along the longest side of the box.
+        box: (2, 3) scene units; None: around the truth, or around what the model absorbs.
+        against: an OpenVDB file or folder, or "scene".
+        up: "x", "y" or "z"; None: the scene's setting, or z.
+        overwrite: whether files that exist may be replaced.
+        say: prints a line.
+    """
+
+    run_dir: Path
+    show: Sequence[str] = ("volume",)
+    conditions: Mapping[str, str] = field(default_factory=dict)
+    grid: int = 128
+    box: np.ndarray | None = None
+    options: ViewOptions = field(default_factory=ViewOptions)
+    against: str | None = None
+    out: Path | None = None
+    size: tuple[int, int] | None = None
+    up: str | None = None
+    overwrite: bool = False
+    say: Callable[[str], None] = print
+
+
+def inspect_run(request: Request) -> list[Path]:
+    """Does it, and returns the files that were written; none where a window was shown.
+
+    Several frames become numbered files for .png and .vdb, an animation for .webp, .gif and .mp4, and a slider in a page or a window.
+
+    Raises:
+        ConfigError, DataError, CheckpointError: the user's words or files, files in the way.
+        PluginError: an inspector that crashed.
+        BackendUnavailable: pyvista is missing, VTK cannot draw here, or there is no display and no ``out``.
+    """
+    kind = "" if request.out is None else request.out.suffix.lower()
+    if request.out is not None and kind not in OUTPUTS:
+        raise ConfigError(f"--out {request.out}: expected a name that ends in {', '.join(OUTPUTS)}")
+    inspectors = [_watched(load_inspector(name), name, request) for name in dict.fromkeys(request.show)]
+    if request.out is None and not has_display():
+        raise BackendUnavailable("there is no display to open a window on; give --out FILE.png, .webp, .html or .vdb")
+    if kind not in (".html", ".vdb"):
+        require_pyvista()
+        if kind:
+            prepare_headless()
+    if request.against is None and any(i.shows == "both" for i in inspectors):
+        raise ConfigError("--show difference: there is no ground truth; give --against FILE.vdb, DIR or scene")
+    film = _Film(request)
+    if film.channels.partial and any(i.shows == "model" for i in inspectors):
+        request.say(f"shown: {film.channels.shown}")
+    if kind == ".html":
+        assert request.out is not None
+        write_page(request.out, film, inspectors)
+        return [request.out]
+    if kind == ".vdb":
+        return _each(request, film, lambda path, frame: write_volume(path, frame))
+    window = Window(panels_of(inspectors, request.against is not None), film.up, bool(kind), request.size)
+    try:
+        if not kind:
+            window.interact(len(film), film.frame)
+            return []
+        return _pictures(request, film, window, kind)
+    finally:
+        window.close()
+
+
+def _watched(inspector: Inspector, name: str, request: Request) -> Inspector:
+    """The inspector, whose crashes are reported."""
+    folders = [request.run_dir / "logs", *([] if request.out is None else [request.out.absolute().parent])]
+
+    def add(plotter: Any, frame: FieldFrame) -> None:
+        with reported(INSPECTORS, name, folders):
+            inspector.add(plotter, frame)
+
+    return inspector if is_ours(INSPECTORS, name) else replace(inspector, add=add)
+
+
+def _paths(out: Path, count: int) -> list[Path]:
+    """The files to write: of several frames numbered ones, or a film or page of all."""
+    suffix = out.suffix.lower()
+    if count == 1 or suffix not in (".png", ".vdb"):
+        return [out]
+    return [out.with_name(f"{out.stem}_{i:04d}{suffix}") for i in range(count)]
+
+
+def _pictures(request: Request, film: _Film, window: Window, kind: str) -> list[Path]:
+    assert request.out is not None
+
+    def drawn(frame: FieldFrame) -> Tensor:
+        window.draw(frame)
+        return torch.from_numpy(window.picture().copy()).float() / 255.0
+
+    if kind == ".png":
+        return _each(request, film, lambda path, frame: images.write_png(path, drawn(frame)))
+    request.out.parent.mkdir(parents=True, exist_ok=True)
+    write_film(request.out, [drawn(film.frame(i)) for i in range(len(film))], min(24.0, max(len(film) / 4.0, 4.0)))
+    return [request.out]
+
+
+def _each(request: Request, film: _Film, write: Callable[[Path, FieldFrame], Any]) -> list[Path]:
+    assert request.out is not None
+    request.out.parent.mkdir(parents=True, exist_ok=True)
+    paths = _paths(request.out, len(film))
+    for i, path in enumerate(paths):
+        write(path, film.frame(i))
+    return paths
+
+
+class _Film:
+    """The frames that were asked for, made one at a time; box and scale are the same for all."""
+
+    def __init__(self, request: Request) -> None:
+        run = trained_model(request.run_dir)
+        self.model = run.model
+        self.truth: DensityTruth | None = None
+        self.channels, self.needed = run.channels, tuple(c.name for c in run.task.conditions)
+        self.up = request.up or str(run.scene.get("up", "z"))
+        self.up = self.up if self.up in ("x", "y", "z") else "z"
+        self.options, self.name = request.options, request.run_dir.resolve().name
+        wanted = condition_frames(run.task.conditions, request.conditions, request.say)
+        pairs: list[tuple[Conditions, int]] = [(conditions, -1) for conditions in wanted]
+        if request.against is not None:
+            self.truth, words = open_truth(request.against, run.volume)
+            request.say(words)
+            pairs = pair(wanted, self.truth, bool(request.conditions))
+        self.pairs = pairs
+        for path in [] if request.out is None else _paths(request.out, len(pairs)):
+            refuse_taken(path, request.overwrite)
+        box = request.box if request.box is not None else self._box()
+        if request.grid**3 > POINTS_LIMIT:
+            raise ConfigError(f"--grid {request.grid}: expected at most {round(POINTS_LIMIT ** (1 / 3))}")
+        self.matrix, self.shape = lattice(box, request.grid)
+        self.numbers = [self._compare(i, request) for i in range(len(self))]
+        self.top, self.gain, self.focus = self._scale(box)
+        low, high = ([round(x, 4) for x in corner] for corner in np.asarray(box).tolist())
+        request.say(
+            f"extinction of {self.model.count} primitives on {' x '.join(map(str, self.shape))} points from {low} to {high} scene units, "
+            "in 1/scene unit, each primitive clamped at 0 from below"
+        )
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def _box(self) -> np.ndarray:
+        if self.truth is not None:
+            return np.asarray(self.truth.bounds.numpy())
+        return box_of(self.model, [conditions for conditions, _ in self.pairs])
+
+    def _compare(self, index: int, request: Request) -> dict[str, float] | None:
+        """The frame's agreement with the truth on the grid that the data set itself compares on, whatever is shown."""
+        if self.truth is None:
+            return None
+        conditions, number = self.pairs[index]
+        matrix, shape = lattice(self.truth.bounds, self.truth.resolution)
+        found = density_grid(self.model, conditions, matrix, shape).numpy()
+        numbers = agreement(self.truth.grid(number, matrix, shape).numpy(), found)
+        words = "nothing to compare with" if numbers is None else "  ".join(f"{k} {v:.4f}" for k, v in numbers.items())
+        request.say(f"{self.truth.frames[number].name}  {in_words(conditions)}  {words}")
+        return numbers
+
+    def _scale(self, box: np.ndarray) -> tuple[float, float, tuple[float, ...]]:
+        """Largest extinction shown, by how much volumes are shown more or less opaque than they are, and the middle of the matter."""
+        matrix, shape = lattice(box, _COARSE)
+        most, depth, total = 0.0, 0.0, np.zeros(shape)
+        for conditions, number in self.pairs:
+            grids = [density_grid(self.model, conditions, matrix, shape).numpy()]
+            if self.truth is not None:
+                grids.append(self.truth.grid(number, matrix, shape).numpy())
+            total += grids[-1]
+            for grid in grids:
+                filled = grid[grid > 0]
+                most = max(most, float(np.quantile(filled, 0.995))) if filled.size else most
+                depth = max(depth, *(float(grid.sum(axis).max()) * float(matrix[0, 0]) for axis in range(3)))
+        weights = total + 1e-12 * (total.max() or 1.0)
+        index = [float(np.average(np.arange(n), weights=weights.sum(tuple({0, 1, 2} - {a})))) for a, n in enumerate(shape)]
+        focus = matrix[:3, :3].numpy() @ np.array(index) + matrix[:3, 3].numpy()
+        return round_up(most), _DEPTH / depth if depth > 0 else 1.0, tuple(focus.tolist())
+
+    def frame(self, index: int) -> FieldFrame:
+        """A fresh frame; its grids live as long as it does."""
+        conditions, number = self.pairs[index]
+        made = FieldFrame(self.model, conditions, in_words(conditions), self.matrix, self.shape, self.top, self.gain, self.focus)
+        made = replace(made, channels=self.channels, needed=self.needed, options=self.options, numbers=self.numbers[index])
+        truth = self.truth
+        if truth is None:
+            return made
+        return replace(made, truth=lambda: truth.grid(number, self.matrix, self.shape).numpy(), truth_name=truth.frames[number].name)

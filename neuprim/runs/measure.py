@@ -1,0 +1,214 @@
+"""The numbers of a fitted model: every held-out view, their means, and what the data set adds.
+
+PSNR and SSIM compare float images in the data set's own colour space, unclamped and unquantised. A linear data set also gets
+both after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``), if its channels are red, green and blue; a task with a display
+of its own gets both of what that shows instead (``psnr_display``, ``ssim_display``). Where it marks a part of its views (the union of all that a
+camera ever sees of a volume), the error there counts on its own: a black background flatters.
+"""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import neuprim
+from neuprim.config import RunConfig
+from neuprim.core.channels import Channels
+from neuprim.core.data import Dataset, View
+from neuprim.core.data.check import check_mask, check_pixels
+from neuprim.core.io import images
+from neuprim.core.metrics import means, psnr, ssim, to_json
+from neuprim.core.model.fields import Conditions
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import RenderSettings, choose_backend, render
+
+__all__ = ["ViewMetrics", "draw", "draw_sum", "measure", "summary"]
+
+
+@dataclass(frozen=True)
+class ViewMetrics:
+    """One view's numbers.
+
+    Attributes:
+        psnr, ssim: in the data set's colour space.
+        seconds: of the forward pass alone.
+        more: further numbers by name: ``psnr_srgb``, ``ssim_srgb`` of linear images, or ``psnr_display``, ``ssim_display`` of what the
+            task's own display shows; ``psnr_mask`` and ``mse_mask`` inside the data set's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without anything on it; what
+            :meth:`~neuprim.core.data.Dataset.judge` adds.
+    """
+
+    name: str
+    psnr: float
+    ssim: float
+    seconds: float
+    more: dict[str, float] = field(default_factory=dict)
+
+
+def draw(model: Primitives, view: View, settings: RenderSettings, background: Tensor) -> Tensor:
+    """(H, W, C) image of one view, without gradients."""
+    with torch.no_grad():
+        return render(model, view.camera, view.conditions, settings, background).rgb
+
+
+def draw_sum(
+    model: Primitives,
+    view: View,
+    lights: Sequence[Conditions],
+    settings: RenderSettings,
+    background: Tensor,
+    drawn: Callable[[], None] = lambda: None,
+) -> Tensor:
+    """(H, W, C) sum of one view's images under conditions that change light alone, over the background once; without gradients.
+
+    Exact for what is linear in light, as opacity does not depend on it. Sums are float64.
+
+    Args:
+        lights: one or more; each replaces the view's conditions of the same names.
+        drawn: called after every image.
+    """
+    total, alpha = torch.zeros(()), torch.zeros(())
+    for light in lights:
+        with torch.no_grad():
+            frame = render(model, view.camera, {**view.conditions, **light}, settings)
+        total, alpha = total + frame.rgb.double(), frame.alpha
+        drawn()
+    return (total + (1.0 - alpha.double())[..., None] * background.double()).to(frame.rgb)
+
+
+def measure(
+    model: Primitives,
+    dataset: Dataset,
+    settings: RenderSettings,
+    channels: Channels,
+    seen: Callable[[int, View, Tensor, Tensor], None] | None = None,
+) -> list[ViewMetrics]:
+    """Every view of the test split, composited over the data set's background.
+
+    ``seen(index, view, rendered, truth)`` is called for each, e.g. to keep pictures.
+    """
+    views, background = dataset.test, dataset.background
+    result = []
+    for i in range(len(views)):
+        view, pixels = views.view(i), views.pixels(i)
+        check_pixels("test", view, pixels, dataset.channels)
+        truth = pixels.over(background)
+        start = time.perf_counter()
+        rendered = draw(model, view, settings, background)
+        seconds = time.perf_counter() - start
+        if pixels.mask is not None:
+            rendered = torch.where(pixels.mask[..., None], rendered, truth)
+        counted = dataset.mask(i)
+        if counted is not None:
+            check_mask("test", view, counted)
+        more = _more(rendered, truth, dataset, channels, counted, pixels.mask) | dataset.judge(i, rendered, truth)
+        result.append(ViewMetrics(view.name, psnr(rendered, truth, pixels.mask), ssim(rendered, truth), seconds, more))
+        if seen is not None:
+            seen(i, view, rendered, truth)
+    return result
+
+
+def _more(
+    rendered: Tensor, truth: Tensor, dataset: Dataset, channels: Channels, part: Tensor | None, valid: Tensor | None
+) -> dict[str, float]:
+    more: dict[str, float] = {}
+    if channels.own is not None:
+        shown, wanted = channels.display(rendered), channels.display(truth)
+        more |= {"psnr_display": psnr(shown, wanted, valid), "ssim_display": ssim(shown, wanted)}
+    elif dataset.color_space == "linear" and channels.plain:
+        shown, wanted = (images.linear_to_srgb(x.clamp_min(0.0)) for x in (rendered, truth))
+        more |= {"psnr_srgb": psnr(shown, wanted, valid), "ssim_srgb": ssim(shown, wanted)}
+    if part is not None and bool(part.any()):
+        black = dataset.background.to(truth).expand_as(truth)
+        more["psnr_mask"] = psnr(rendered, truth, part)
+        more["mse_mask"] = float((rendered - truth)[part].double().square().mean())
+        more["psnr_black_image"], more["psnr_black_image_mask"] = psnr(black, truth), psnr(black, truth, part)
+    return more
+
+
+def summary(
+    config: RunConfig,
+    model: Primitives,
+    dataset: Dataset,
+    channels: Channels,
+    views: Sequence[ViewMetrics],
+    model_bytes: int,
+    training: Mapping[str, Any],
+) -> dict[str, Any]:
+    """The content of ``metrics.json``. ``training`` holds iterations and train_seconds as the run recorded them."""
+    worst = min(views, key=lambda v: v.psnr)
+    lowered = model.lower(dataset.test.view(0).camera, dataset.test.view(0).conditions, config.renderer)
+    seconds = sorted(v.seconds for v in views)
+    return {
+        "task": config.task,
+        "scene": config.scene_name,
+        "dataset": dataset.name,
+        "preset": config.preset,
+        "split": "test",
+        **to_json("psnr", float(np.mean([v.psnr for v in views]))),
+        "ssim": float(np.mean([v.ssim for v in views])),
+        **_means(views),
+        **to_json("psnr_worst", worst.psnr),
+        "view_worst": worst.name,
+        "per_view": [_entry(v) for v in views],
+        **_per_frame(dataset, views),
+        "primitives": model.count,
+        "parameters": model.count * model.parameters_per_primitive,
+        "parameters_per_primitive": model.parameters_per_primitive,
+        "model_bytes": model_bytes,
+        **training,
+        "render_fps": 1.0 / max(seconds[len(seconds) // 2], 1e-9),
+        "backend": choose_backend(lowered, config.renderer),
+        "device": f"cpu ({platform.processor() or platform.machine()})",
+        "checkpoint": "last",
+        "downsampling": dataset.downsampling,
+        "background": [round(float(x), 6) for x in dataset.background],
+        "color_space": dataset.color_space,
+        "channels": list(channels.names),
+        **({"shown": channels.shown} if channels.shown else {}),
+        "data_source": dataset.data_source,
+        "train_views": len(dataset.train),
+        "seed": config.seed,
+        **dataset.diagnose(model),
+        "non_default": {key: list(pair) for key, pair in config.non_default.items()},
+        "versions": {
+            "neuprim": neuprim.__version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+        },
+        **({} if config.made_by is None else {"made_by": config.made_by.in_words()}),
+    }
+
+
+def _entry(view: ViewMetrics) -> dict[str, Any]:
+    entry = {"name": view.name, **to_json("psnr", view.psnr), "ssim": view.ssim, "seconds": view.seconds}
+    for name, value in view.more.items():
+        entry |= to_json(name, value)
+    return entry
+
+
+def _means(views: Sequence[ViewMetrics]) -> dict[str, Any]:
+    """Means over views of the further numbers, and PSNRs of mean squared errors ("pooled"); see ``Dataset.judge``."""
+    return means([v.more for v in views])
+
+
+def _per_frame(dataset: Dataset, views: Sequence[ViewMetrics]) -> dict[str, Any]:
+    """Means over the clips of each of their frames, for data sets that have clips of one length."""
+    clips = [[views[i] for i in clip.views] for clip in dataset.clips() if clip.source is None]
+    if not clips or len({len(c) for c in clips}) != 1:
+        return {}
+    frames = []
+    for same in zip(*clips, strict=True):
+        entry = to_json("psnr", float(np.mean([v.psnr for v in same]))) | {"ssim": float(np.mean([v.ssim for v in same]))}
+        for name in ("psnr_mask", "psnr_black_image"):
+            values = [v.more[name] for v in same if name in v.more]
+            entry |= to_json(name, float(np.mean(values))) if values else {}
+        frames.append(entry)
+    return {"per_frame": frames}

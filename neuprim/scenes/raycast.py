@@ -1,0 +1,171 @@
+"""Rays against the solids: what a ray meets first, and whether anything lies between two points.
+
+Embree does the work where its package ``embreex`` has a wheel; elsewhere (ARM) the compiled search of :mod:`.bvh` gives the same answers,
+about ten times slower. :attr:`Scene.engine` says which one runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from neuprim.core.errors import BackendUnavailable
+from neuprim.scenes.meshes import corner_normals
+from neuprim.scenes.shapes import Solid
+
+__all__ = ["Engine", "Hits", "Scene"]
+
+Engine = Literal["auto", "embree", "numba"]
+
+LIFT = 2e-4
+"""How far a shadow ray starts above the surface, in scene units: a hundred times the rounding of single precision in the unit box."""
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What N rays met. Only ``hit`` has a row per ray; the others have one per hit, M in all, in the rays' order.
+
+    Attributes:
+        hit: (N,) bool.
+        position: (M, 3) float32, scene units.
+        distance: (M,) float32, in lengths of the ray's direction.
+        normal: (M, 3) float32 unit shading normal, smooth across round parts.
+        face: (M, 3) float32 unit normal of the triangle itself.
+        albedo: (M, 3) float32 linear RGB.
+        gloss: (M,) float32, 0..1.
+        specular: (M,) float32 strength of the highlight.
+        solid: (M,) index into the scene's solids.
+    """
+
+    hit: NDArray[np.bool_]
+    position: NDArray[np.float32]
+    distance: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    face: NDArray[np.float32]
+    albedo: NDArray[np.float32]
+    gloss: NDArray[np.float32]
+    specular: NDArray[np.float32]
+    solid: NDArray[np.intp]
+
+    def lifted(self) -> NDArray[np.float32]:
+        """(M, 3) the positions just off the surface, where a shadow ray starts without meeting its own triangle."""
+        return self.position + np.float32(LIFT) * self.face
+
+
+class Scene:
+    """Solids ready for ray queries. Read-only after construction, so threads may share it.
+
+    Attributes:
+        solids: as given.
+        engine: "embree" or "numba", whichever runs.
+
+    Raises:
+        BackendUnavailable: ``engine="embree"`` without the package ``embreex``.
+    """
+
+    def __init__(self, solids: Sequence[Solid], engine: Engine = "auto") -> None:
+        self.solids = tuple(solids)
+        meshes = [solid.mesh for solid in self.solids]
+        start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+        self._vertices = np.concatenate([mesh.vertices.view(np.ndarray) for mesh in meshes]).astype(np.float32)
+        self._faces = np.concatenate([mesh.faces.view(np.ndarray) + first for mesh, first in zip(meshes, start, strict=False)]).astype(
+            np.int32
+        )
+        self._face_normals = np.concatenate([mesh.face_normals.view(np.ndarray) for mesh in meshes]).astype(np.float32)
+        self._corner_normals = np.concatenate([corner_normals(mesh) for mesh in meshes]).astype(np.float32)
+        self._owner = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
+        self._gloss = np.array([solid.gloss for solid in self.solids], dtype=np.float32)
+        self._specular = np.array([solid.specular for solid in self.solids], dtype=np.float32)
+        self.engine, self._search = _open(self._vertices, self._faces, engine)
+
+    def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
+        """The first surface each ray meets.
+
+        Args:
+            origins, directions: (N, 3) in scene units; directions need not have unit length.
+        """
+        o, d = _rays(origins, directions)
+        triangle, u, v, distance = self._search.first(o, d)
+        hit = triangle >= 0
+        rows = np.flatnonzero(hit)
+        triangle, distance = triangle[rows], distance[rows]
+        weight = np.stack([1 - u[rows] - v[rows], u[rows], v[rows]], axis=1, dtype=np.float32)
+        normal: NDArray[np.float32] = np.einsum("nk,nkc->nc", weight, self._corner_normals[triangle])
+        normal /= np.sqrt(np.einsum("nc,nc->n", normal, normal))[:, None]
+        position = (o[rows] + distance[:, None] * d[rows]).astype(np.float32, copy=False)
+        owner = self._owner[triangle]
+        albedo = np.empty_like(position)
+        for index in np.unique(owner):
+            mine = np.flatnonzero(owner == index)
+            albedo[mine] = self.solids[index].albedo(position[mine])
+        return Hits(hit, position, distance, normal, self._face_normals[triangle], albedo, self._gloss[owner], self._specular[owner], owner)
+
+    def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
+        """(N,) whether a surface lies within ``distance`` (in lengths of the direction) of the points (N, 3) along directions (N, 3).
+
+        Start from :meth:`Hits.lifted`, not from the bare position: a point on a triangle may meet that triangle.
+        """
+        o, d = _rays(points, directions)
+        return self._search.any(o, d, np.broadcast_to(np.asarray(distance, dtype=np.float32), len(o)))
+
+    def surface_points(self, count: int, generator: torch.Generator) -> NDArray[np.float32]:
+        """(count, 3) points spread evenly over all surfaces; where solids overlap, some lie inside another solid."""
+        triangles = self._vertices[self._faces].astype(np.float64)
+        a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+        area = np.linalg.norm(np.cross(a, b), axis=1)
+        draw = torch.rand(count, 3, dtype=torch.float64, generator=generator).numpy()
+        index = np.minimum(np.searchsorted(np.cumsum(area) / area.sum(), draw[:, 0], side="right"), len(area) - 1)
+        beyond = draw[:, 1] + draw[:, 2] > 1  # the other half of the parallelogram folds back
+        uv = np.where(beyond[:, None], 1 - draw[:, 1:], draw[:, 1:])
+        return (triangles[index, 0] + uv[:, :1] * a[index] + uv[:, 1:] * b[index]).astype(np.float32)
+
+
+class _Search(Protocol):
+    """Float32 rays (N, 3) against one triangle soup."""
+
+    def first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """(N,) each: triangle or -1, the weights u and v of its second and third corner, distance in lengths of ``d``."""
+
+    def any(self, o: NDArray, d: NDArray, distance: NDArray) -> NDArray[np.bool_]:
+        """(N,) whether a triangle is nearer than ``distance`` (N,)."""
+
+
+class _Embree:
+    def __init__(self, vertices: NDArray, faces: NDArray) -> None:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        self.scene = EmbreeScene()
+        TriangleMesh(scene=self.scene, vertices=vertices, indices=faces)
+        # The first query builds the tree; done here so that threads find it built.
+        self.scene.run(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
+
+    def first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        found = self.scene.run(o, d, query="INTERSECT", output=1)
+        return found["primID"], found["u"], found["v"], found["tfar"]
+
+    def any(self, o: NDArray, d: NDArray, distance: NDArray) -> NDArray[np.bool_]:
+        limit = np.ascontiguousarray(np.minimum(distance, 1e30), dtype=np.float32)
+        return self.scene.run(o, d, dists=limit, query="OCCLUDED") >= 0
+
+
+def _open(vertices: NDArray, faces: NDArray, engine: Engine) -> tuple[Literal["embree", "numba"], _Search]:
+    if engine != "numba":
+        try:
+            return "embree", _Embree(vertices, faces)
+        except ImportError as error:
+            if engine == "embree":
+                raise BackendUnavailable(f"ray casting with embree needs the package 'embreex' (pip install embreex): {error}") from error
+    from neuprim.scenes.bvh import Hierarchy
+
+    return "numba", Hierarchy(vertices, faces)
+
+
+def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    d = np.ascontiguousarray(directions, dtype=np.float32)
+    return np.ascontiguousarray(np.broadcast_to(np.asarray(origins, dtype=np.float32), d.shape)), d

@@ -48,7 +48,7 @@ def main() -> None:
     args = parser.parse_args()
     conditions = {"time": torch.tensor(args.time)}
     if args.run_dir:
-        from neuprim.runs.draw import load_run
+        from neuprim.runs.open import load_run
 
         model = load_run(args.run_dir)[2]
     else:

@@ -27,16 +27,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from fitting import finish
 from static_quality import cpu_name, spread
 from tables import ROOT, between_markers
 
 from neuprim.config import compose
 from neuprim.core.compute.threads import core_count
 from neuprim.core.train.trainer import Trainer
-from neuprim.plugins.registry import load_task
-from neuprim.runs.draw import load_dataset
-from neuprim.runs.fit import make_trainer, warm_up
+from neuprim.runs.fit import complete, start
 from neuprim.runs.measure import draw
 
 RESULTS = Path(__file__).parent / "results" / "dynamic_quality.json"
@@ -57,12 +54,9 @@ KEYS = (
 def fit(words: list[str], change: Callable[[Trainer], None] = lambda trainer: None) -> tuple[Trainer, dict[str, Any]]:
     """What `neuprim run` does, less its files: the trainer after its budget, and the metrics."""
     torch.set_num_threads(1)
-    config = compose(["task=dynamic", *words], check_output=False)
-    task = load_task(config.task)
-    trainer = make_trainer(config, task, load_dataset(config, task))
-    change(trainer)
-    warm_up(trainer)
-    return trainer, finish(config, trainer)
+    fitted = start(compose(["task=dynamic", *words], check_output=False))
+    change(fitted.trainer)
+    return fitted.trainer, complete(fitted).metrics()
 
 
 def shuffled_times(trainer: Trainer) -> None:

@@ -31,12 +31,8 @@ from static_quality import cpu_name, spread
 from tables import between_markers
 
 from neuprim.config import compose
-from neuprim.core.channels import channels_of
 from neuprim.core.checkpoint import save_model
-from neuprim.plugins.registry import load_task
-from neuprim.runs.draw import load_dataset
-from neuprim.runs.fit import make_trainer
-from neuprim.runs.measure import measure, summary
+from neuprim.runs.fit import fit
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "expressivity.json"
@@ -109,20 +105,12 @@ def train(job: Job, words: list[str], iterations: int, backend: str, target: Pat
         f"train.iterations={iterations}", "train.max_seconds=null", f"train.population.every={max(iterations // 20, 1)}",
         f"renderer.backend={backend}", "renderer.threads=1", f"output_dir='{target.resolve()}'",
     ], check_output=False)  # fmt: skip
-    task = load_task(config.task)
-    dataset = load_dataset(config, task)
-    trainer = make_trainer(config, task, dataset)
-    model = trainer.model
-    for _ in trainer.run():
-        pass
-    for field in (model.density, model.colour):
-        field.set_progress(1.0)
-    channels = channels_of(task, dataset)
-    views = measure(model, dataset, config.renderer, channels)
+    fitted = fit(config)
+    dataset = fitted.dataset
     target.mkdir(parents=True, exist_ok=True)
     (target / "config.yaml").write_text(config.to_yaml())
-    save_model(target / "model.safetensors", model, config.task, {"color_space": dataset.color_space})
-    metrics = summary(config, model, dataset, channels, views, 0, {"iterations": trainer.step, "train_seconds": trainer.elapsed})
+    save_model(target / "model.safetensors", fitted.model, config.task, {"color_space": dataset.color_space})
+    metrics = fitted.metrics()
     return {"scene": dataset.name, "form": job.form, "job": job.name, **{k: metrics[k] for k in KEYS}, "versions": metrics["versions"]}
 
 

@@ -27,8 +27,8 @@ from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render import render_lowered
 from neuprim.core.render.reference.backend import pixel_directions
 from neuprim.report.pictures import ERROR_SCALE
-from neuprim.runs.draw import load_dataset, load_run
 from neuprim.runs.measure import draw
+from neuprim.runs.open import load_dataset, load_run
 
 SIZE = 200
 """Pixels on a side of every panel; chair_200's own size, and what solids is ray-cast at for the truth."""

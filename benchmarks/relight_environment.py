@@ -29,8 +29,8 @@ from neuprim.core.data import View
 from neuprim.core.environment import Environment
 from neuprim.core.io.images import write_exr, write_png
 from neuprim.core.metrics import psnr
-from neuprim.runs.draw import load_dataset, load_run
 from neuprim.runs.measure import draw_sum
+from neuprim.runs.open import load_dataset, load_run
 from neuprim.scenes.raycast import Scene
 from neuprim.tasks.relight.environment import illuminate
 from neuprim.tasks.relight.lit.generate import INTENSITY, picture

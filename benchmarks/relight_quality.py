@@ -25,17 +25,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from fitting import finish
 from static_quality import cpu_name, spread
 from tables import ROOT, between_markers
 
-from neuprim.config import RunConfig, compose
+from neuprim.config import compose
 from neuprim.core.compute.threads import core_count
 from neuprim.core.data import Dataset
-from neuprim.core.train.trainer import Trainer
-from neuprim.plugins.registry import load_task
-from neuprim.runs.draw import load_dataset
-from neuprim.runs.fit import make_trainer, warm_up
+from neuprim.runs.fit import Fitted, complete, start, warm_up
 
 RESULTS = Path(__file__).parent / "results" / "relight_quality.json"
 PLAIN = "model.colour.visibility=none"
@@ -58,17 +54,16 @@ KEYS = (
 _ROUNDS, _STEPS, _GROWN = 6, 15, 150
 
 
-def prepared(words: list[str], dataset: Dataset | None) -> tuple[RunConfig, Trainer]:
+def prepared(words: list[str], dataset: Dataset | None) -> Fitted:
     config = compose(["task=relight", "scene=lit_solids", "train.eval_every=0", "train.max_seconds=null", *words], check_output=False)
-    task = load_task(config.task)
-    trainer = make_trainer(config, task, dataset or load_dataset(config, task))
-    warm_up(trainer)
-    return config, trainer
+    fitted = start(config, dataset=dataset)
+    warm_up(fitted.trainer)
+    return fitted
 
 
 def pace(variants: dict[str, list[str]], dataset: Dataset) -> dict[str, float]:
     """Seconds a step of each, taking turns; medians over rounds, of models that have trained a little."""
-    trainers = {name: prepared(words, dataset)[1] for name, words in variants.items()}
+    trainers = {name: prepared(words, dataset).trainer for name, words in variants.items()}
     for trainer in trainers.values():
         for _ in range(_GROWN):
             trainer.train_step()
@@ -83,8 +78,7 @@ def pace(variants: dict[str, list[str]], dataset: Dataset) -> dict[str, float]:
 
 
 def fit(words: list[str], dataset: Dataset) -> dict[str, Any]:
-    config, trainer = prepared(words, dataset)
-    found = finish(config, trainer)
+    found = complete(prepared(words, dataset)).metrics()
     return {k: found[k] for k in KEYS if k in found}
 
 
@@ -110,7 +104,7 @@ def main() -> None:
     if "losses" in args.parts:
         wanted["losses"] = {name: [*words, *common] for name, words in LOSSES.items()}
     if wanted:
-        dataset = prepared(common, None)[1].dataset
+        dataset = prepared(common, None).dataset
         everything = {(part, name): words for part, own in wanted.items() for name, words in own.items()}
         known = {f"{part}: {e['name']}": e["ms_a_step"] / 1e3 for part in wanted for e in recorded.get(part, [])} if args.go_on else {}
         names = {f"{part}: {name}": words for (part, name), words in everything.items()}

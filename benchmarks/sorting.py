@@ -40,7 +40,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 def from_run(folder: Path, index: int) -> tuple[str, tuple[Lowered, Camera, Tensor]]:
     """The model of a finished run, as leaves that take gradients, one of its test cameras, and its background; named."""
-    from neuprim.runs.draw import load_dataset, load_run
+    from neuprim.runs.open import load_dataset, load_run
 
     config, task, model, _ = load_run(folder)
     dataset = load_dataset(config, task)

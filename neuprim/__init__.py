@@ -2,11 +2,15 @@
 
 from typing import TYPE_CHECKING, Any
 
+from neuprim.moved import install as _install
+from neuprim.version import __version__
+
 if TYPE_CHECKING:
     from neuprim.functional import rasterize as rasterize
 
-__version__ = "0.1.0"
 __all__ = ["__version__", "rasterize"]
+
+_install()
 
 
 def __getattr__(name: str) -> Any:

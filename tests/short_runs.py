@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.console import Console
-
-import neuprim.runs.fit as running
+import neuprim.runs.run as running
 from neuprim.config import compose
 
 STEPS = 240
@@ -23,4 +21,4 @@ def words(scene: Path, out: Path, iterations: int = STEPS, *more: str) -> list[s
 
 
 def fit(overrides: list[str]) -> Path:
-    return running.run(compose(overrides), Console(quiet=True))
+    return running.run(compose(overrides))

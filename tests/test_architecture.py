@@ -60,7 +60,7 @@ def test_core_knows_no_task_plugin_or_command() -> None:
 def test_tasks_know_no_command_plugin_or_other_task() -> None:
     above = (
         "neuprim.cli",
-        "neuprim.runs.fit",
+        "neuprim.runs.run",
         "neuprim.runs.draw",
         "neuprim.report",
         "neuprim.config",
@@ -76,7 +76,7 @@ def test_tasks_know_no_command_plugin_or_other_task() -> None:
 def test_formats_and_inspectors_know_no_command() -> None:
     above = (
         "neuprim.cli",
-        "neuprim.runs.fit",
+        "neuprim.runs.run",
         "neuprim.runs.draw",
         "neuprim.report",
         "neuprim.runs.export",

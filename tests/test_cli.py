@@ -13,6 +13,7 @@ from neuprim.cli import _print_metrics, main
 from neuprim.config import RunConfig
 from neuprim.core.environment import EnvironmentFile
 from neuprim.core.errors import DataError, NonFiniteError
+from neuprim.runs.events import Events
 from tests.plugins.fakes import install, site, toy
 
 __all__ = ["site", "toy"]
@@ -23,7 +24,7 @@ def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Stand-ins for the modules that do the work; they record what they were asked."""
     made: list[Any] = []
 
-    def run(config: RunConfig) -> Path:
+    def run(config: RunConfig, events: Events) -> Path:
         made.append(config)
         config.output_dir.mkdir(parents=True)
         (config.output_dir / "config.yaml").write_text(config.to_yaml())
@@ -86,13 +87,13 @@ def test_a_failing_combination_does_not_lose_the_others(
 ) -> None:
     ran = []
 
-    def run(config: RunConfig) -> Path:
+    def run(config: RunConfig, events: Events) -> Path:
         ran.append(config.seed)
         if config.seed == 1:
             raise NonFiniteError("w2 of primitive 3")
         return config.output_dir
 
-    monkeypatch.setattr(sys.modules["neuprim.runs.fit"], "run", run)
+    monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", run)
     assert main(["run", "task=toy", "-m", "seed=1,2"]) == 2
     assert ran == [1, 2]
     assert capsys.readouterr().err == "neuprim: error: outputs/toy-ball-sweep/seed-1: w2 of primitive 3\n"
@@ -134,24 +135,24 @@ def test_one_line_and_status_2(calls: list[Any], capsys: pytest.CaptureFixture[s
 
 
 def test_errors_of_many_lines_become_one(calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    def run(config: RunConfig) -> Path:
+    def run(config: RunConfig, events: Events) -> Path:
         raise DataError("missing images:\n  a.png\n  b.png")
 
-    monkeypatch.setattr(sys.modules["neuprim.runs.fit"], "run", run)
+    monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", run)
     assert main(["run", "task=toy"]) == 2
     assert error_line(capsys) == "neuprim: error: missing images: a.png b.png\n"
 
 
 def test_interrupt_is_130_and_a_bug_keeps_its_traceback(calls: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop(config: RunConfig) -> Path:
+    def stop(config: RunConfig, events: Events) -> Path:
         raise KeyboardInterrupt
 
-    def bug(config: RunConfig) -> Path:
+    def bug(config: RunConfig, events: Events) -> Path:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(sys.modules["neuprim.runs.fit"], "run", stop)
+    monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", stop)
     assert main(["run", "task=toy"]) == 130
-    monkeypatch.setattr(sys.modules["neuprim.runs.fit"], "run", bug)
+    monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", bug)
     with pytest.raises(ZeroDivisionError):
         main(["run", "task=toy"])
 
@@ -162,14 +163,14 @@ def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
     """The words that it prints, read by a shell, are a command that resumes."""
     started: list[RunConfig] = []
 
-    def stop(config: RunConfig) -> Path:
+    def stop(config: RunConfig, events: Events) -> Path:
         config.output_dir.mkdir(parents=True, exist_ok=True)
         if config.seed == 3:
             (config.output_dir / "checkpoint.safetensors").touch()
         started.append(config)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(sys.modules["neuprim.runs.fit"], "run", stop)
+    monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", stop)
     nasty = "it's a=b, $c"
     quoted = "output_dir='it\\'s a=b, $c'"
     for words, where, there in (
@@ -198,10 +199,10 @@ def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
 
 
 def test_a_disk_that_refuses_is_no_bug(calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(config: RunConfig) -> Path:
+    def full(config: RunConfig, events: Events) -> Path:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(sys.modules["neuprim.runs.fit"], "run", full)
+    monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", full)
     assert main(["run", "task=toy"]) == 2
     assert error_line(capsys) == "neuprim: error: writing: No space left on device\n"
 

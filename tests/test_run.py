@@ -18,15 +18,18 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-import neuprim.runs.fit as running
+import neuprim.runs.fit as fitting
+import neuprim.runs.run as running
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint
 from neuprim.core.data import Clip
 from neuprim.core.data.common import PosedImages
 from neuprim.core.errors import CheckpointError, DataError, NonFiniteError
 from neuprim.core.train.trainer import StepReport, Trainer
-from neuprim.runs.draw import evaluate_run, read_metrics, render_run
-from neuprim.runs.measure import measure
+from neuprim.runs.curve import curve_psnr
+from neuprim.runs.draw import render_run
+from neuprim.runs.measure import evaluate_run, measure
+from neuprim.runs.open import read_metrics
 from tests.core import tiny
 from tests.short_runs import STEPS, fit, words
 
@@ -34,7 +37,7 @@ from tests.short_runs import STEPS, fit, words
 @pytest.fixture(scope="module", autouse=True)
 def short_orbits() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(running, "_ORBIT_FRAMES", 4)
+        patch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 4)
         yield
 
 
@@ -127,14 +130,14 @@ def test_masked_pixels_do_not_count_on_the_curve() -> None:
     ]
     trainer = tiny.trainer(dataset, 3)
     views = measure(trainer.model, dataset, trainer.renderer)
-    assert running._curve_psnr(trainer) == pytest.approx(sum(v.psnr for v in views) / len(views), abs=1e-9)
+    assert curve_psnr(trainer) == pytest.approx(sum(v.psnr for v in views) / len(views), abs=1e-9)
 
 
 def test_a_perfect_view_leaves_the_curve_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = tiny.TwoPrimitives()
-    monkeypatch.setattr(running, "draw", lambda model, view, settings, background: dataset.test.pixels(0).over(background))
+    monkeypatch.setattr("neuprim.runs.curve.draw", lambda model, view, settings, background: dataset.test.pixels(0).over(background))
     dataset.test.images = [dataset.test.images[0]] * 2  # type: ignore[attr-defined]
-    assert running._curve_psnr(tiny.trainer(dataset, 3)) == 200.0
+    assert curve_psnr(tiny.trainer(dataset, 3)) == 200.0
 
 
 def test_a_data_set_may_judge_views_and_keep_films_beside_them(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -280,13 +283,13 @@ def test_a_last_line_cut_short_by_a_kill(scene: Path, whole: Path, tmp_path: Pat
                 state["saved"] = {k: v.clone() for k, v in self.state()[0].items()}, self.state()[1]
             return super().train_step()
 
-    original = running.Trainer
-    running.Trainer = Halting  # type: ignore[misc]
+    original = fitting.Trainer
+    fitting.Trainer = Halting  # type: ignore[misc]
     try:
         with pytest.raises(Stop):
             fit(overrides)
     finally:
-        running.Trainer = original  # type: ignore[misc]
+        fitting.Trainer = original  # type: ignore[misc]
     held, header = state["saved"]
     checkpoint.write(out / "checkpoint.safetensors", "checkpoint", held, {"task": "static", **header})
     with open(out / "metrics.jsonl", "a") as file:

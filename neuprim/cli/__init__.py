@@ -14,12 +14,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from neuprim import __version__
 from neuprim.cli import arguments
 from neuprim.cli.environment_flags import add_environment_flags, environment_of
 from neuprim.cli.export_help import export_help
 from neuprim.core.errors import DISK, ConfigError, NeuprimError, nearest
 from neuprim.core.notices import warnings_as_lines
+from neuprim.version import __version__
 
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
@@ -222,10 +222,13 @@ def _run(args: argparse.Namespace) -> int:
 
 def _fit(config: RunConfig, words: list[str]) -> Path:
     """The run's directory; an interruption says where it is and what goes on with it, or with the sweep that ``words`` began."""
-    from neuprim.runs.fit import run
+    from neuprim.cli.console import plain_console
+    from neuprim.cli.progress import RunProgress
+    from neuprim.runs.run import run
 
     try:
-        return run(config)
+        with RunProgress(plain_console(stderr=True), f"{config.task}/{config.scene_name}") as events:
+            return run(config, events)
     except KeyboardInterrupt:
         from neuprim.config.overrides import resuming
 
@@ -236,7 +239,7 @@ def _fit(config: RunConfig, words: list[str]) -> Path:
 
 def _eval(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
-    from neuprim.runs.draw import evaluate_run
+    from neuprim.runs.measure import evaluate_run
 
     _print_metrics(evaluate_run(run_dir))
     return 0
@@ -269,9 +272,11 @@ def _render(args: argparse.Namespace) -> int:
 def _export(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
     from neuprim.cli.console import plain_console
-    from neuprim.runs.export import export_run, print_report
+    from neuprim.cli.export_report import print_report
+    from neuprim.cli.progress import LineProgress
+    from neuprim.runs.export import export_run
 
-    print_report(export_run(run_dir, args.format, args.out, args.options, args.force, plain_console(stderr=True)), args.json)
+    print_report(export_run(run_dir, args.format, args.out, args.options, args.force, LineProgress(plain_console(stderr=True))), args.json)
     return 0
 
 
@@ -310,7 +315,7 @@ def _tasks(args: argparse.Namespace) -> int:
 
 
 def _new_task(args: argparse.Namespace) -> int:
-    from neuprim.cli.new_task import new_task
+    from neuprim.plugins.new_task import new_task
 
     print(*new_task(args.name, args.out), sep="\n")
     return 0

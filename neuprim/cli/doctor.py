@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from neuprim import __version__
 from neuprim.cli.console import plain_console
+from neuprim.version import __version__
 
 __all__ = ["doctor"]
 

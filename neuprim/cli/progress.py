@@ -1,4 +1,4 @@
-"""What a run shows while it works: a bar with ETA, PSNR and primitive count on a terminal, a line now and then elsewhere."""
+"""What commands show while they work: a bar with ETA, PSNR and primitive count on a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from neuprim.core.train.trainer import StepReport
+from neuprim.runs.events import Evaluated, Event, Finishing, Note, Preparing, Step
 
-__all__ = ["DrawProgress", "RunProgress"]
+__all__ = ["DrawProgress", "LineProgress", "RunProgress"]
 
 
 class _Shown:
@@ -28,7 +28,7 @@ class _Shown:
 
 
 class RunProgress(_Shown):
-    """Context manager around one run."""
+    """Context manager around one run, whose events it is called with."""
 
     def __init__(self, console: Console, title: str) -> None:
         self.console, self.title = console, title
@@ -50,20 +50,33 @@ class RunProgress(_Shown):
         self._smooth: float | None = None
         self._held_out = ""
 
-    def note(self, text: str) -> None:
-        """A line that stays."""
+    def __call__(self, event: Event) -> None:
+        """Shows one event."""
+        match event:
+            case Preparing():
+                self._preparing(event)
+            case Step():
+                self._step(event)
+            case Evaluated():
+                self._held_out = f"  held-out {event.psnr:.2f} dB"
+            case Finishing():
+                self._finishing(event)
+            case Note():
+                self._note(event.text)
+
+    def _note(self, text: str) -> None:
         self.console.print(f"{self.title}: {text}", highlight=False, soft_wrap=True, markup=False, emoji=False)
 
-    def preparing(self, text: str, fraction: float) -> None:
-        """Work before the training loop."""
+    def _preparing(self, event: Preparing) -> None:
+        text, fraction = event.text, event.fraction
         self.bar.update(self.task, description=self.title, completed=fraction, info=text)
         if not self.live and (text != self._stage or fraction >= self._printed + 0.25):
             self._printed = fraction
-            self.note(f"{text}, {fraction:.0%}" if fraction > 0 else text)
+            self._note(f"{text}, {fraction:.0%}" if fraction > 0 else text)
         self._stage = text
 
-    def step(self, report: StepReport, progress: float) -> None:
-        """One training step."""
+    def _step(self, event: Step) -> None:
+        report, progress = event.report, event.progress
         self._smooth = report.psnr if self._smooth is None else 0.98 * self._smooth + 0.02 * report.psnr
         if self._stage != "training":
             self._stage, self._printed = "training", -1.0
@@ -72,17 +85,12 @@ class RunProgress(_Shown):
         self.bar.update(self.task, completed=progress, info=info)
         if not self.live and progress >= self._printed + 0.1:
             self._printed = progress
-            self.note(f"{progress:4.0%}  {report.seconds:6.1f} s  {info}")
+            self._note(f"{progress:4.0%}  {report.seconds:6.1f} s  {info}")
 
-    def held_out(self, psnr: float) -> None:
-        """A new point of the held-out curve."""
-        self._held_out = f"  held-out {psnr:.2f} dB"
-
-    def finishing(self, text: str) -> None:
-        """Work after the training loop."""
-        self.bar.update(self.task, completed=1.0, info=text)
+    def _finishing(self, event: Finishing) -> None:
+        self.bar.update(self.task, completed=1.0, info=event.text)
         if not self.live:
-            self.note(text)
+            self._note(event.text)
 
 
 class DrawProgress(_Shown):
@@ -112,3 +120,15 @@ class DrawProgress(_Shown):
         if not self.live and fraction < 1.0 and time.monotonic() > self._started + 30.0:
             self._started = time.monotonic()
             self.note(f"{text}, {fraction:.0%}")
+
+
+class LineProgress:
+    """A line per stage and quarter."""
+
+    def __init__(self, console: Console) -> None:
+        self.console, self.last = console, ("", -1.0)
+
+    def __call__(self, text: str, fraction: float) -> None:
+        if text != self.last[0] or fraction >= self.last[1] + 0.25:
+            self.last = (text, fraction)
+            self.console.print(f"{text}, {fraction:.0%}" if fraction > 0 else text, highlight=False, soft_wrap=True)

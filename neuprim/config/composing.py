@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuprim import __version__
 from neuprim.config.declared import check_names, check_preset, check_typed, complete_options, options_of, unused
 from neuprim.config.groups import check_groups, check_scene, presets, task_choices
 from neuprim.config.outputs import output_directory
@@ -26,6 +25,7 @@ from neuprim.plugins.blame import blamed
 from neuprim.plugins.names import split
 from neuprim.plugins.provenance import MadeBy, Maker
 from neuprim.plugins.registry import LOSSES, TASKS, UnknownPlugin, find_scene, load_loss
+from neuprim.version import __version__
 
 if TYPE_CHECKING:
     from neuprim.core.extensions import LossExtension

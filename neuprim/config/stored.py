@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuprim import __version__
 from neuprim.config.record import RunConfig
 from neuprim.plugins.blame import Suspects
 from neuprim.plugins.names import qualified
 from neuprim.plugins.provenance import MadeBy, Maker, load_recorded
 from neuprim.plugins.registry import LOSSES, SCENES, TASKS, FoundScene, find_scene, load_task
+from neuprim.version import __version__
 
 if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec

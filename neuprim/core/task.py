@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
 from neuprim.core.channels import Display
 from neuprim.core.data import Dataset, View
+from neuprim.core.data.context import SceneContext
 from neuprim.core.environment import Environment, Illumination
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField, Field
 from neuprim.core.volumes.source import VolumeSource
@@ -43,21 +43,6 @@ Loss = Callable[[Tensor, Tensor, Supervision], tuple[Tensor, dict[str, float]]]
 
 Illuminate = Callable[[Environment, int, Mapping[str, Any]], Illumination]
 """(light from all around, number of lights that stand for it, what the data set said in :meth:`Dataset.facts`) -> frames to add up."""
-
-
-@dataclass(frozen=True)
-class SceneContext:
-    """What a scene's loader gets beside its own settings.
-
-    Attributes:
-        seed: for generated scenes.
-        cache_dir: where generated data may be kept between runs (keyed by everything that matters).
-        progress: called with (text, fraction 0..1) during long work.
-    """
-
-    seed: int
-    cache_dir: Path
-    progress: Callable[[str, float], None] = lambda text, fraction: None
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from neuprim import __version__
 from neuprim.core.errors import DISK, NeuprimError
 from neuprim.plugins.blame import origin_of
 from neuprim.plugins.registry import Group, PluginError
 from neuprim.plugins.tracebacks import written
+from neuprim.version import __version__
 
 __all__ = ["is_ours", "reported"]
 

@@ -12,12 +12,12 @@ from typing import Any, TypeVar
 
 from packaging.version import InvalidVersion, Version
 
-from neuprim import __version__
 from neuprim.core.errors import CheckpointError, ConfigError, nearest
 from neuprim.core.notices import warn_once
 from neuprim.plugins.editable import not_installed_yet
 from neuprim.plugins.mechanism import Group, PluginInfo, UnknownPlugin, installed
 from neuprim.plugins.names import BUILT_IN, normalised, qualified
+from neuprim.version import __version__
 
 __all__ = ["MadeBy", "Maker", "check_resumed", "load_recorded", "missing", "warn_of_neuprim"]
 

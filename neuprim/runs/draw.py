@@ -1,9 +1,7 @@
-"""Measure and draw the model of a run directory: on its held-out views, along an orbit or given cameras."""
+"""Images of a finished run: of its held-out views, along an orbit or from given cameras."""
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,97 +9,28 @@ from typing import Any
 
 import torch
 
-from neuprim.config import RunConfig, scene_of, suspects_of, task_of
+from neuprim.config import RunConfig, suspects_of
 from neuprim.core.cameras.file import read_cameras
-from neuprim.core.channels import Channels, channels_of, stored_channels
-from neuprim.core.checkpoint import load_model
+from neuprim.core.channels import Channels, stored_channels
 from neuprim.core.conditions import flag, read_conditions
-from neuprim.core.data import Dataset, View
-from neuprim.core.data.check import check_dataset
+from neuprim.core.data import View
 from neuprim.core.data.records import Record
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io import images
-from neuprim.core.io.files import cache_directory, write_npy
+from neuprim.core.io.files import write_npy
 from neuprim.core.io.film import write_film
 from neuprim.core.model.fields import Conditions
-from neuprim.core.model.primitives import Primitives
-from neuprim.core.task import SceneContext, TaskSpec
-from neuprim.plugins.blame import blamed
-from neuprim.plugins.mechanism import PluginError
-from neuprim.plugins.provenance import warn_of_neuprim
-from neuprim.runs.measure import draw, draw_sum, measure, summary
+from neuprim.core.task import TaskSpec
+from neuprim.runs.measure import draw, draw_sum
+from neuprim.runs.open import LOGS, load_dataset, load_run
 
-__all__ = ["FORMATS", "LOGS", "evaluate_run", "load_dataset", "load_run", "read_metrics", "render_run"]
+__all__ = ["FORMATS", "render_run", "with_conditions"]
 
 ANIMATIONS = ("webp", "gif", "mp4")
 _RAW = ("exr", "npy")
 FORMATS = ("png", "exr", "npy", *ANIMATIONS)
 """What ``neuprim render`` writes: pictures of what the task's channels look like, but all channels as they are in EXR and npy."""
-
-LOGS = "logs"
-"""Folder of a run directory for tracebacks of plugins."""
-
-
-def load_dataset(
-    config: RunConfig,
-    task: TaskSpec,
-    progress: Callable[[str, float], None] = lambda text, fraction: None,
-    run_dir: Path | None = None,
-) -> Dataset:
-    """The data set of a run's configuration.
-
-    Args:
-        run_dir: the finished run that the configuration was read from: messages name its file, and the traceback of a loader of
-            another package is kept there, should it crash. None: a run that is only about to be made.
-
-    Raises:
-        NeuprimError: what the loader refuses, or that it crashed.
-    """
-    context = SceneContext(config.seed, cache_directory() / "scenes", progress)
-    load = scene_of(config, task, None if run_dir is None else run_dir / "config.yaml").spec.load
-    scene = suspects_of(config).scene
-    with blamed(scene.origin, scene.what, (config.output_dir if run_dir is None else run_dir) / LOGS):
-        dataset = load(config.scene, context)
-    if not isinstance(dataset, Dataset):
-        found = f"a {type(dataset).__name__}" if dataset is not None else "None"
-        raise PluginError(f"{scene.what} of {scene.origin.origin}: its loader returned {found}; expected a neuprim.core.data.Dataset")
-    return dataset
-
-
-def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Primitives, dict[str, Any]]:
-    """Configuration, task, model and model header of a run directory.
-
-    Warns where another version of neuprim or of the task's package made the run.
-
-    Args:
-        named: whether what is said about these names the file; not for a directory that the user does not know.
-
-    Raises:
-        CheckpointError, ConfigError: naming the file that is missing or damaged.
-    """
-    file = run_dir / "config.yaml"
-    config, place = RunConfig.from_yaml(file), file if named else None
-    task = task_of(config, place)
-    if config.made_by is not None:
-        warn_of_neuprim(config.made_by, place)
-    model, header = load_model(run_dir / "model.safetensors", task)
-    return config, task, model, header
-
-
-def evaluate_run(run_dir: Path) -> dict[str, Any]:
-    """The metrics of a run's last checkpoint, measured again from disk alone; the same numbers as the run's own."""
-    config, task, model, header = load_run(run_dir)
-    suspects = suspects_of(config)
-    with suspects.watch(run_dir / LOGS):
-        dataset = load_dataset(config, task, run_dir=run_dir)
-        suspects.know(dataset)
-        check_dataset(dataset, task.conditions)
-        path = run_dir / "model.safetensors"
-        training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
-        channels = channels_of(task, dataset)
-        views = measure(model, dataset, config.renderer, channels)
-        return summary(config, model, dataset, channels, views, path.stat().st_size, training)
 
 
 def render_run(
@@ -271,19 +200,3 @@ def with_conditions(
 
 def _file_name(name: str) -> str:
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in name)
-
-
-def read_metrics(run_dir: Path) -> dict[str, Any]:
-    """``metrics.json`` of a run.
-
-    Raises:
-        DataError: missing or damaged.
-    """
-    path = run_dir / "metrics.json"
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: {error}") from error
-    if not isinstance(data, dict) or not math.isfinite(float(data.get("ssim") or 0.0)):
-        raise DataError(f"{path}: expected an object with metrics")
-    return data

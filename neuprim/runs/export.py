@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import math
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
 
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint
@@ -24,23 +21,29 @@ from neuprim.core.model.fields import ConditionSpec
 from neuprim.plugins.blame import origin_of
 from neuprim.plugins.crashes import reported
 from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin, load_exporter
-from neuprim.runs.draw import load_run
 from neuprim.runs.export_record import record_export
-from neuprim.runs.open import trained_model
+from neuprim.runs.open import load_run, trained_model
 
-__all__ = ["export_run", "import_model", "import_run", "print_report"]
+__all__ = ["export_run", "import_model", "import_run"]
+
+Progress = Callable[[str, float], None]
 
 # ---------------------------------------------------------------- export
 
 
 def export_run(
-    run_dir: Path, name: str, out: Path | None = None, words: Sequence[str] = (), overwrite: bool = False, console: Console | None = None
+    run_dir: Path,
+    name: str,
+    out: Path | None = None,
+    words: Sequence[str] = (),
+    overwrite: bool = False,
+    progress: Progress = lambda text, fraction: None,
 ) -> ExportReport:
     """Write a run's model in a format: whole, or not at all, and over files that exist only with ``overwrite``, whoever's format it is.
 
     Args:
         words: ``KEY=VALUE`` options of the exporter, and conditions of the task, also as ``--NAME TEXT``.
-        console: where progress goes; None: nowhere.
+        progress: called with (text, fraction 0..1).
 
     Raises:
         NeuprimError: no such run, format or option, something that the format cannot hold, files in its way, or an exporter that crashed.
@@ -48,13 +51,12 @@ def export_run(
     exporter = load_exporter(name)
     final = _destination(run_dir, exporter, out)
     refuse_taken(final, overwrite)
-    shown = _Progress(console)
-    run = trained_model(run_dir, shown)
+    run = trained_model(run_dir, progress)
     options, conditions = _options(words, exporter, run.task.conditions)
     notes: list[str] = []
     read_conditions(run.task.conditions, conditions, notes.append)
     with drafted(final, overwrite) as draft:
-        job = ExportJob(run, draft.out, options, conditions, shown)
+        job = ExportJob(run, draft.out, options, conditions, progress)
         with reported(EXPORTERS, name, [run_dir / "logs", final.absolute().parent]):
             report = exporter.write(job)
         files = _files(report, draft, name)
@@ -125,34 +127,6 @@ def _scalar(text: str) -> Any:
         except ValueError:
             continue
     return text
-
-
-class _Progress:
-    """A line per stage and quarter; nothing without a console."""
-
-    def __init__(self, console: Console | None) -> None:
-        self.console, self.last = console, ("", -1.0)
-
-    def __call__(self, text: str, fraction: float) -> None:
-        if self.console is not None and (text != self.last[0] or fraction >= self.last[1] + 0.25):
-            self.last = (text, fraction)
-            self.console.print(f"{text}, {fraction:.0%}" if fraction > 0 else text, highlight=False, soft_wrap=True)
-
-
-def print_report(report: ExportReport, as_json: bool) -> None:
-    """The report on standard output, for people or for programs."""
-    if as_json:
-        errors = {name: value if math.isfinite(value) else None for name, value in report.errors.items()}
-        record = {"files": [str(p) for p in report.files], "lossless": report.lossless, "errors": errors, "notes": list(report.notes)}
-        print(json.dumps(record, indent=1, allow_nan=False))
-        return
-    print(*report.files, sep="\n")
-    print("lossless" if report.lossless else "lossy")
-    width = max((len(name) for name in report.errors), default=0)
-    for name, value in report.errors.items():
-        print(f"{name:{width}}  {value:.4f}")
-    for note in report.notes:
-        print(f"note: {note}")
 
 
 # ---------------------------------------------------------------- import

@@ -10,10 +10,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from neuprim import __version__
 from neuprim.core.extensions import ExportJob, ExportReport
 from neuprim.core.io.files import write_json
 from neuprim.plugins.registry import EXPORTERS
+from neuprim.version import __version__
 
 __all__ = ["FILE", "record_export"]
 

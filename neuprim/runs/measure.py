@@ -12,24 +12,26 @@ import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-import neuprim
-from neuprim.config import RunConfig
-from neuprim.core.channels import Channels
+from neuprim.config import RunConfig, suspects_of
+from neuprim.core.channels import Channels, channels_of
 from neuprim.core.data import Dataset, View
-from neuprim.core.data.check import check_mask, check_pixels
+from neuprim.core.data.check import check_dataset, check_mask, check_pixels
 from neuprim.core.io import images
 from neuprim.core.metrics import means, psnr, ssim, to_json
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, choose_backend, render
+from neuprim.runs.open import LOGS, load_dataset, load_run
+from neuprim.version import __version__
 
-__all__ = ["ViewMetrics", "draw", "draw_sum", "measure", "summary"]
+__all__ = ["ViewMetrics", "draw", "draw_sum", "evaluate_run", "measure", "summary"]
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,21 @@ def _more(
     return more
 
 
+def evaluate_run(run_dir: Path) -> dict[str, Any]:
+    """The metrics of a run's last checkpoint, measured again from disk alone; the same numbers as the run's own."""
+    config, task, model, header = load_run(run_dir)
+    suspects = suspects_of(config)
+    with suspects.watch(run_dir / LOGS):
+        dataset = load_dataset(config, task, run_dir=run_dir)
+        suspects.know(dataset)
+        check_dataset(dataset, task.conditions)
+        path = run_dir / "model.safetensors"
+        training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
+        channels = channels_of(task, dataset)
+        views = measure(model, dataset, config.renderer, channels)
+        return summary(config, model, dataset, channels, views, path.stat().st_size, training)
+
+
 def summary(
     config: RunConfig,
     model: Primitives,
@@ -178,7 +195,7 @@ def summary(
         **dataset.diagnose(model),
         "non_default": {key: list(pair) for key, pair in config.non_default.items()},
         "versions": {
-            "neuprim": neuprim.__version__,
+            "neuprim": __version__,
             "python": platform.python_version(),
             "torch": torch.__version__,
             "numpy": np.__version__,

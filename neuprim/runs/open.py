@@ -1,22 +1,78 @@
-"""A run directory as plugins see it."""
+"""A finished run, opened again: its configuration, task, model, data and metrics, from disk alone."""
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-from neuprim.config import scene_of, suspects_of
+from neuprim.config import RunConfig, scene_of, suspects_of, task_of
+from neuprim.core.checkpoint import load_model
 from neuprim.core.data import Dataset
+from neuprim.core.errors import DataError
 from neuprim.core.extensions import TrainedModel
 from neuprim.core.io.files import cache_directory
-from neuprim.core.task import SceneContext
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.task import SceneContext, TaskSpec
 from neuprim.core.volumes.source import VolumeSource
 from neuprim.plugins.blame import blamed
-from neuprim.runs.draw import LOGS, load_dataset, load_run
+from neuprim.plugins.mechanism import PluginError
+from neuprim.plugins.provenance import warn_of_neuprim
 
-__all__ = ["trained_model"]
+__all__ = ["LOGS", "load_dataset", "load_run", "read_metrics", "trained_model"]
+
+LOGS = "logs"
+"""Folder of a run directory for tracebacks of plugins."""
 
 Progress = Callable[[str, float], None]
+
+
+def load_dataset(
+    config: RunConfig,
+    task: TaskSpec,
+    progress: Callable[[str, float], None] = lambda text, fraction: None,
+    run_dir: Path | None = None,
+) -> Dataset:
+    """The data set of a run's configuration.
+
+    Args:
+        run_dir: the finished run that the configuration was read from: messages name its file, and the traceback of a loader of
+            another package is kept there, should it crash. None: a run that is only about to be made.
+
+    Raises:
+        NeuprimError: what the loader refuses, or that it crashed.
+    """
+    context = SceneContext(config.seed, cache_directory() / "scenes", progress)
+    load = scene_of(config, task, None if run_dir is None else run_dir / "config.yaml").spec.load
+    scene = suspects_of(config).scene
+    with blamed(scene.origin, scene.what, (config.output_dir if run_dir is None else run_dir) / LOGS):
+        dataset = load(config.scene, context)
+    if not isinstance(dataset, Dataset):
+        found = f"a {type(dataset).__name__}" if dataset is not None else "None"
+        raise PluginError(f"{scene.what} of {scene.origin.origin}: its loader returned {found}; expected a neuprim.core.data.Dataset")
+    return dataset
+
+
+def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Primitives, dict[str, Any]]:
+    """Configuration, task, model and model header of a run directory.
+
+    Warns where another version of neuprim or of the task's package made the run.
+
+    Args:
+        named: whether what is said about these names the file; not for a directory that the user does not know.
+
+    Raises:
+        CheckpointError, ConfigError: naming the file that is missing or damaged.
+    """
+    file = run_dir / "config.yaml"
+    config, place = RunConfig.from_yaml(file), file if named else None
+    task = task_of(config, place)
+    if config.made_by is not None:
+        warn_of_neuprim(config.made_by, place)
+    model, header = load_model(run_dir / "model.safetensors", task)
+    return config, task, model, header
 
 
 def trained_model(run_dir: Path, progress: Progress = lambda text, fraction: None) -> TrainedModel:
@@ -40,3 +96,19 @@ def trained_model(run_dir: Path, progress: Progress = lambda text, fraction: Non
         return load_dataset(config, task, progress, run_dir)
 
     return TrainedModel(run_dir, task, model, header, config.scene, config.renderer, dataset, volume)
+
+
+def read_metrics(run_dir: Path) -> dict[str, Any]:
+    """``metrics.json`` of a run.
+
+    Raises:
+        DataError: missing or damaged.
+    """
+    path = run_dir / "metrics.json"
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: {error}") from error
+    if not isinstance(data, dict) or not math.isfinite(float(data.get("ssim") or 0.0)):
+        raise DataError(f"{path}: expected an object with metrics")
+    return data

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-import neuprim.runs.fit as running
+import neuprim.runs.run as running
 from neuprim.core import checkpoint
 from neuprim.core.cameras import Camera
 from neuprim.core.data import Pixels, PointCloud

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from rich.console import Console
 from torch import Tensor
 
-import neuprim.runs.fit as running
+import neuprim.runs.run as running
 from neuprim.config import compose
 from neuprim.core import checkpoint
 from neuprim.core.errors import BackendUnavailable, CheckpointError, ConfigError
@@ -254,7 +253,7 @@ def test_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: st
         "model.sh_degree=1", "train.iterations=120", "train.max_seconds=null", "train.log_every=5", "train.population.every=20",
         f"train.population.strategy={strategy}", "train.population.start=0", f"output_dir={out}",
     ]  # fmt: skip
-    running.run(compose(words), Console(quiet=True))
+    running.run(compose(words))
     lines = [json.loads(text) for text in (out / "metrics.jsonl").read_text().splitlines()]
     losses = [line["loss"] for line in lines]
     assert sum(losses[-4:]) < 0.7 * sum(losses[:4])
@@ -275,6 +274,6 @@ def test_rates_are_still_checked(tmp_path: Path) -> None:
         "train.rates.log_amplitud=1",
     ]
     with pytest.raises(ConfigError, match=r"train\.rates\.log_amplitud: no such parameter; did you mean 'log_amplitude'"):
-        running.run(compose(words), Console(quiet=True))
+        running.run(compose(words))
     with pytest.raises(ConfigError, match=r"model\.density\.form='gausian': expected cosine or gaussian"):
         compose(["model.density.form=gausian"])

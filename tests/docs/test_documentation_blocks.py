@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 import torch
-from rich.console import Console
 
 from neuprim.cli import _parsers
 from neuprim.config import compose, compose_all
@@ -22,7 +21,7 @@ from neuprim.core.errors import NeuprimError
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.plugins.registry import load_exporter, survey
-from neuprim.runs.fit import run
+from neuprim.runs.run import run
 from tests.docs.pages import PAGES, ROOT, Block, blocks, commands, name_of
 
 NOT_RUN: dict[str, int] = {}
@@ -58,7 +57,7 @@ def static_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("documented") / "static-solids"
     small = ["scene.size=48", "scene.train_views=6", "scene.test_views=2", "model.primitives=50", "model.neurons=2"]
     words = ["task=static", "scene=solids", f"output_dir='{out}'", *small, "train.iterations=5", "train.max_seconds=null"]
-    return run(compose(words), Console(quiet=True))
+    return run(compose(words))
 
 
 def with_run(static_run: Path) -> None:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.console import Console
-
 from neuprim.config import compose
-from neuprim.runs.fit import run
+from neuprim.runs.events import Events, silent
+from neuprim.runs.run import run
 from tests.plugins.fakes import install
 
 NAMES = ("450nm", "550 nm", "650nm", "NIR", "SWIR.1")
@@ -123,6 +122,6 @@ def install_spectral(site: Path, **changes: str) -> None:
     install(site, "neuprim-spectral", {"spectral": "spectraltask:TASK"}, {**FILES, "spectraltask/__init__.py": text})
 
 
-def fit(out: Path, *words: str, console: Console | None = None) -> Path:
+def fit(out: Path, *words: str, events: Events = silent) -> Path:
     """A short run of the task."""
-    return run(compose(["task=spectral", f"output_dir='{out}'", *words]), console or Console(quiet=True))
+    return run(compose(["task=spectral", f"output_dir='{out}'", *words]), events)

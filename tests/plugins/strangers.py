@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuprim.cli.new_task import new_task
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
+from neuprim.plugins.new_task import new_task
 from neuprim.plugins.registry import EXPORTERS, INSPECTORS, TASKS, Group
 from tests.plugins import marked
 from tests.plugins.fakes import install, site

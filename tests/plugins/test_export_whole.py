@@ -15,8 +15,9 @@ from neuprim.cli import main
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NeuprimError
 from neuprim.core.io.ply import read_ply, write_ply
 from neuprim.plugins.registry import list_exporters
-from neuprim.runs.draw import load_run, render_run
+from neuprim.runs.draw import render_run
 from neuprim.runs.export import export_run, import_run
+from neuprim.runs.open import load_run
 from tests.plugins import marked
 
 LOSSLESS = ("ply", "npz")

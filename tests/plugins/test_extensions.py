@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from neuprim.cli import main
 from neuprim.config import RunConfig, compose
@@ -15,8 +14,9 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.notices import NeuprimWarning
 from neuprim.plugins import registry
 from neuprim.plugins.registry import ALL, EXPORTERS, INSPECTORS, LOSSES, SCENES, TASKS, Group, PluginError, find_scene, load_task
-from neuprim.runs.draw import evaluate_run, load_dataset
-from neuprim.runs.fit import run
+from neuprim.runs.measure import evaluate_run
+from neuprim.runs.open import load_dataset
+from neuprim.runs.run import run
 from tests.plugins.fakes import TOY, install, site, toy
 
 __all__ = ["site", "toy"]
@@ -105,7 +105,7 @@ def test_a_scene_and_a_loss_of_other_packages_make_a_run(site: Path, tmp_path: P
     )
     assert (config.scene_name, config.scene, config.train.loss) == ("extra", {"wobble": 2.0}, "extra")
     assert config.non_default["train.loss"] == (None, "extra")
-    run(config, Console(quiet=True))
+    run(config)
     assert '"mse"' in (tmp_path / "r" / "metrics.jsonl").read_text()
     again = RunConfig.from_yaml(tmp_path / "r")
     assert again.train.loss == "extra"

@@ -26,8 +26,8 @@ from neuprim.plugins.inspect.page import encoded
 from neuprim.plugins.inspect.shapes import ellipsoids
 from neuprim.plugins.registry import load_task
 from neuprim.runs import inspect as inspecting
-from neuprim.runs.draw import load_dataset, load_run
 from neuprim.runs.inspect import Request, inspect_run
+from neuprim.runs.open import load_dataset, load_run
 from tests.plugins import runs
 
 BUILT_IN = {i.name: i for i in (views.VOLUME, views.ISOSURFACE, views.SLICES, views.PRIMITIVES, views.PRIMITIVE, views.DIFFERENCE)}

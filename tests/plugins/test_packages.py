@@ -13,9 +13,9 @@ import pytest
 
 import neuprim
 from neuprim.cli import main
-from neuprim.cli.new_task import new_task
 from neuprim.conformance import CHECKS
 from neuprim.core.errors import ConfigError
+from neuprim.plugins.new_task import new_task
 
 ROOT = Path(neuprim.__file__).parents[1]
 EXAMPLE = ROOT / "examples" / "neuprim-gaussian"

@@ -10,19 +10,19 @@ from typing import Any
 
 import pytest
 import yaml
-from rich.console import Console
 
 import neuprim
 from neuprim.cli import main
-from neuprim.cli.new_task import new_task
 from neuprim.config import RunConfig, compose
 from neuprim.core import checkpoint, notices
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.notices import NeuprimWarning
 from neuprim.plugins import provenance
+from neuprim.plugins.new_task import new_task
 from neuprim.plugins.provenance import MadeBy, Maker
-from neuprim.runs.draw import evaluate_run, load_run
-from neuprim.runs.fit import run
+from neuprim.runs.measure import evaluate_run
+from neuprim.runs.open import load_run
+from neuprim.runs.run import run
 from tests.plugins.fakes import install, install_groups, site, uninstall
 from tests.plugins.marked import static_run
 from tests.plugins.test_extensions import LOSS, add
@@ -51,7 +51,7 @@ def made(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run of ``task=glow`` of neuprim-glow 0.1, in the working directory."""
     monkeypatch.chdir(tmp_path)
     glow(site)
-    run(compose(["task=glow", *SMALL, *QUICK, "output_dir=r"]), Console(quiet=True))
+    run(compose(["task=glow", *SMALL, *QUICK, "output_dir=r"]))
     return Path("r")
 
 
@@ -153,7 +153,7 @@ def test_without_the_package_of_the_scene_or_the_loss(
     add(site, "scene")
     add(site, "loss", package="fake_loss")
     words = ["task=static", "scene=extra", "train.loss=extra", "output_dir=r"]
-    run(compose([*words, *QUICK, "model.primitives=12"]), Console(quiet=True))
+    run(compose([*words, *QUICK, "model.primitives=12"]))
     uninstall(site, "fake-loss")
     assert main(["eval", "r"]) == 0, "only training needs the loss"
     resume = ["run", *words, "resume=true"]
@@ -205,7 +205,7 @@ def test_another_version_is_one_warning(made: Path, site: Path, capsys: pytest.C
         "neuprim: warning: r/config.yaml: this run was made by neuprim-glow 0.1 (task glow); installed is neuprim-glow 0.2"
     ]
     with pytest.warns(NeuprimWarning, match=r"r/checkpoint.safetensors: .* neuprim-glow 0.1 \(task glow\); installed is neuprim-glow 0.2"):
-        run(compose(["task=glow", *SMALL, *QUICK, "train.iterations=3", "output_dir=r", "resume=true"]), Console(quiet=True))
+        run(compose(["task=glow", *SMALL, *QUICK, "train.iterations=3", "output_dir=r", "resume=true"]))
     made_by = RunConfig.from_yaml(made).made_by
     assert made_by is not None and made_by.task.version == "0.2", "what went on was made by what is installed"
 
@@ -229,9 +229,9 @@ def test_a_configuration_that_runs_again_names_what_runs_it(made: Path) -> None:
     config = RunConfig.from_yaml(made)
     assert config.made_by is not None and config.made_by.neuprim == "0.0.1"
     config.output_dir = Path("second")
-    run(config, Console(quiet=True))
+    run(config)
     config.made_by, config.output_dir = None, Path("third")
-    run(config, Console(quiet=True))
+    run(config)
     for folder in ("second", "third"):
         assert RunConfig.from_yaml(folder).made_by == MadeBy(neuprim.__version__, Maker("glow", "neuprim-glow", "0.1"))
 
@@ -297,7 +297,7 @@ def test_a_run_without_a_record_is_read_by_names(made: Path, site: Path) -> None
     header, tensors = checkpoint.read(made / "checkpoint.safetensors", "checkpoint")
     rest = {key: value for key, value in header.items() if key not in ("made_by", "format", "kind")}
     checkpoint.write(made / "checkpoint.safetensors", "checkpoint", tensors, rest)
-    run(compose(["task=glow", *SMALL, *QUICK, "train.iterations=3", "output_dir=r", "resume=true"]), Console(quiet=True))
+    run(compose(["task=glow", *SMALL, *QUICK, "train.iterations=3", "output_dir=r", "resume=true"]))
 
 
 @pytest.mark.parametrize(
@@ -351,7 +351,7 @@ def test_a_damaged_record_in_a_checkpoint(made: Path) -> None:
     checkpoint.write(made / "checkpoint.safetensors", "checkpoint", tensors, {**rest, "made_by": {"task": 3}})
     config = compose(["task=glow", *SMALL, *QUICK, "output_dir=r", "resume=true"])
     with pytest.raises(CheckpointError, match=r"^r/checkpoint.safetensors: made_by.task: found int; expected a mapping"):
-        run(config, Console(quiet=True))
+        run(config)
 
 
 def test_warnings_are_said_once_and_can_be_silenced(site: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from rich.console import Console
 from torch import Tensor
 
 from neuprim.cli import main
@@ -24,7 +23,8 @@ from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.uses import OPTIONAL, build_settings, loss_settings
 from neuprim.plugins.members import fault
 from neuprim.plugins.registry import list_losses, load_loss, load_task
-from neuprim.runs.fit import make_loss, run
+from neuprim.runs.fit import make_loss
+from neuprim.runs.run import run
 from neuprim.tasks.static import TASK
 from tests.plugins.fakes import install, site, toy
 from tests.plugins.test_extensions import LOSS, add
@@ -147,7 +147,7 @@ def test_options_that_a_loss_refuses_cost_no_loading_of_data(site: Path, tmp_pat
         f"output_dir='{tmp_path / 'run'}'",
     ]
     with pytest.raises(ConfigError, match="weight: expected more"):
-        run(compose(words), Console(quiet=True))
+        run(compose(words))
 
 
 # ---------------------------------------------------------------- shared settings that not everybody uses

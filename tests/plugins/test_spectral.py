@@ -19,8 +19,9 @@ from PIL import Image
 from rich.console import Console
 from torch import Tensor
 
-import neuprim.runs.fit as running
+import neuprim.runs.finish as finishing
 from neuprim.cli import main
+from neuprim.cli.progress import RunProgress
 from neuprim.conformance import check_task
 from neuprim.core import checkpoint
 from neuprim.core.channels import stored_channels
@@ -30,9 +31,11 @@ from neuprim.core.model.colours import sh
 from neuprim.core.render import render
 from neuprim.plugins.export import appearance, mesh
 from neuprim.plugins.registry import load_task
-from neuprim.runs.draw import FORMATS, evaluate_run, load_dataset, load_run, read_metrics, render_run
+from neuprim.runs.draw import FORMATS, render_run
 from neuprim.runs.export import export_run, import_run
 from neuprim.runs.inspect import Request, inspect_run
+from neuprim.runs.measure import evaluate_run
+from neuprim.runs.open import load_dataset, load_run, read_metrics
 from tests.plugins.fakes import site
 from tests.plugins.spectral import NAMES, fit, install_spectral
 
@@ -44,7 +47,7 @@ THROUGH = ", ".join(NAMES) + " through the display of task 'spectral'"
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(running, "_ORBIT_FRAMES", 3)
+    monkeypatch.setattr(finishing, "_ORBIT_FRAMES", 3)
     monkeypatch.setattr(appearance, "_SIZE", 48)
 
 
@@ -55,7 +58,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         folder = tmp_path_factory.mktemp("spectral")
         (folder / "site").mkdir()
         patch.syspath_prepend(str(folder / "site"))
-        patch.setattr(running, "_ORBIT_FRAMES", 3)
+        patch.setattr(finishing, "_ORBIT_FRAMES", 3)
         install_spectral(folder / "site")
         yield fit(folder / "run")
         forget()
@@ -72,7 +75,8 @@ def changed(site: Path, tmp_path: Path, *words: str, **changes: str) -> tuple[Pa
     forget()
     install_spectral(site, **changes)
     console = Console(file=io.StringIO(), width=200)
-    out = fit(tmp_path / "run", *words, console=console)
+    with RunProgress(console, "spectral") as events:
+        out = fit(tmp_path / "run", *words, events=events)
     return out, console.file.getvalue()  # type: ignore[attr-defined]
 
 
@@ -140,7 +144,7 @@ def test_rendering_needs_no_data_for_the_names(trained: Path, tmp_path: Path, mo
         raise DataError("the data are gone")
 
     monkeypatch.setattr("neuprim.runs.draw.load_dataset", gone)
-    monkeypatch.setattr("neuprim.runs.draw.find_scene", gone)
+    monkeypatch.setattr("neuprim.config.stored.find_scene", gone)
     pose = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0.5], [0, 0, 0, 1]]
     (tmp_path / "cameras.json").write_text(json.dumps({"w": 20, "h": 16, "camera_angle_x": 0.7, "frames": [{"transform_matrix": pose}]}))
     (exr,) = render_run(trained, str(tmp_path / "cameras.json"), None, "exr", tmp_path / "exr", 1, {})

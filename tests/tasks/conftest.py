@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from rich.console import Console
 
 from neuprim.config import compose
 from neuprim.core.data import ViewSet
 from neuprim.core.errors import NeuprimError
 from neuprim.core.task import SceneContext
-from neuprim.runs.draw import read_metrics
-from neuprim.runs.fit import run
+from neuprim.runs.open import read_metrics
+from neuprim.runs.run import run
 
 
 class Scenes:
@@ -96,7 +95,7 @@ class Scenes:
     def fitted(scene: str, path: Path, out: Path) -> dict[str, Any]:
         """Metrics of a short run, from data to report, that has learned something: its loss has fallen by half."""
         words = ["task=static", f"scene={scene}", f"scene.path={path}", f"output_dir={out}", "model.primitives=60", "model.neurons=4"]
-        run(compose([*words, "train.iterations=150", "train.max_seconds=null", "train.population.every=20"]), Console(quiet=True))
+        run(compose([*words, "train.iterations=150", "train.max_seconds=null", "train.population.every=20"]))
         assert (out / "report.html").exists()
         losses = [json.loads(line)["loss"] for line in (out / "metrics.jsonl").read_text().splitlines()]
         assert losses[-1] < 0.5 * losses[0], losses

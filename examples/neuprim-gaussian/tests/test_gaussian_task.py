@@ -14,8 +14,8 @@ from neuprim_gaussian.density import bell
 from neuprim.config import compose
 from neuprim.conformance import checks
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.runs.draw import read_metrics
-from neuprim.runs.fit import run
+from neuprim.runs.open import read_metrics
+from neuprim.runs.run import run
 
 SMALL = "scene.size=16 scene.train_views=4 scene.test_views=1 scene.supersampling=1 model.primitives=40 model.sh_degree=0"
 

@@ -19,8 +19,8 @@ import llvmlite.binding as llvm
 import numba
 from numba import njit
 
-import neuprim
 from neuprim.core.io import files
+from neuprim.version import __version__
 
 __all__ = ["FAST", "cache_directory", "exact_kernel", "inline", "kernel", "kernel_sources", "sources_hash"]
 
@@ -41,7 +41,7 @@ FAST = {"nnan", "nsz", "arcp", "contract", "afn", "reassoc"}
 """Floating-point freedom of the pixel kernels. NaN checks vanish under it: rows are checked before (``prepare``)."""
 
 
-_COMPILED = re.compile(rb"\bnumba\b|\bcpu\.compile import [^\n]*\b(?:exact_kernel|kernel|inline)\b")
+_COMPILED = re.compile(rb"\bnumba\b|\bcompute\.kernels import [^\n]*\b(?:exact_kernel|kernel|inline)\b")
 
 
 def kernel_sources(package: Path) -> list[Path]:
@@ -67,7 +67,7 @@ def cache_directory() -> Path:
     """Folder of the compiled kernels for this version of the sources."""
     if os.environ.get("NUMBA_CACHE_DIR"):
         return Path(os.environ["NUMBA_CACHE_DIR"])
-    return files.cache_directory() / "kernels" / f"{neuprim.__version__}-{sources_hash(Path(neuprim.__file__).parent)}"
+    return files.cache_directory() / "kernels" / f"{__version__}-{sources_hash(Path(__file__).parents[2])}"
 
 
 def _jit(**options: Any) -> Callable[[Any], Any]:

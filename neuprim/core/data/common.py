@@ -12,11 +12,11 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.data import Dataset, PointCloud, ViewSet, camera_extent
+from neuprim.core.data.context import SceneContext
 from neuprim.core.data.focus import focus_point
 from neuprim.core.data.initial import initial_points
 from neuprim.core.data.views import Frame, ImageViews
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.task import SceneContext
 
 __all__ = ["IMAGE_SUFFIXES", "PosedImages", "StartingPoints", "every_nth", "find_image", "missing_files", "posed_images", "unique_names"]
 

@@ -9,14 +9,15 @@ from typing import Any
 import pytest
 import torch
 from PIL import Image
-from rich.console import Console
 
 from neuprim.cli import main
 from neuprim.config import compose
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.io.vdb import write_vdb
-from neuprim.runs.draw import evaluate_run, load_run, render_run
-from neuprim.runs.fit import run
+from neuprim.runs.draw import render_run
+from neuprim.runs.measure import evaluate_run
+from neuprim.runs.open import load_run
+from neuprim.runs.run import run
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.time import parse_times
 from tests.reports import offered
@@ -40,7 +41,7 @@ def finished(files: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def fit(files: Path, target: Path, *words: str) -> Path:
     scene = ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'", "scene.look=smoke_fire"]
-    return run(compose([*scene, *SMALL, f"output_dir='{target}'", *words]), Console(quiet=True))
+    return run(compose([*scene, *SMALL, f"output_dir='{target}'", *words]))
 
 
 def metrics(folder: Path) -> dict[str, Any]:
@@ -168,7 +169,7 @@ def test_the_papers_preset_runs(files: Path, tmp_path: Path) -> None:
 
 def test_a_simulated_scene_says_so(tmp_path: Path) -> None:
     words = ["task=dynamic", "scene=smoke_fire", "scene.resolution=16", "scene.timesteps=4", *SMALL, "train.iterations=5"]
-    folder = run(compose([*words, f"output_dir='{tmp_path / 'run'}'"]), Console(quiet=True))
+    folder = run(compose([*words, f"output_dir='{tmp_path / 'run'}'"]))
     m = metrics(folder)
     assert m["data_source"] == "simulated" and "simulated" in m["dataset"]
     assert "simulated data" in (folder / "report.html").read_text()

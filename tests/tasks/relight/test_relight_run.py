@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from rich.console import Console
 
 from neuprim.cli import main
 from neuprim.config import compose
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.images import write_exr
 from neuprim.plugins.registry import load_task
-from neuprim.runs.draw import load_dataset, load_run, render_run
-from neuprim.runs.fit import make_trainer, run
+from neuprim.runs.draw import render_run
+from neuprim.runs.fit import make_trainer
+from neuprim.runs.open import load_dataset, load_run
+from neuprim.runs.run import run
 from tests.reports import offered
 
 SCENE = ["task=relight", "scene=lit_solids", "scene.size=32", "scene.train_views=24", "scene.test_views=6", "scene.supersampling=1"]
@@ -27,7 +28,7 @@ SMALL = ["model.primitives=150", "model.neurons=2", "model.colour.hidden=3", "tr
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     target = tmp_path_factory.mktemp("relight") / "run"
-    return run(compose([*SCENE, *SMALL, "train.iterations=600", f"output_dir='{target}'"]), Console(quiet=True))
+    return run(compose([*SCENE, *SMALL, "train.iterations=600", f"output_dir='{target}'"]))
 
 
 def test_a_run_learns(finished: Path) -> None:
@@ -100,7 +101,7 @@ def test_every_variant_runs(tmp_path: Path, words: list[str], colour: dict[str, 
     config = compose([*SCENE, *small, *words, "train.iterations=8", f"output_dir='{tmp_path / 'run'}'"])
     task = load_task("relight")
     start = make_trainer(config, task, load_dataset(config, task)).model
-    m = json.loads((run(config, Console(quiet=True)) / "metrics.json").read_text())
+    m = json.loads((run(config) / "metrics.json").read_text())
     assert m["iterations"] == 8 and len(m["per_view"]) == 6 and m["psnr_linear_clamped"] > 5
     end = load_run(tmp_path / "run")[2]
     assert colour.items() <= end.colour.settings().items()

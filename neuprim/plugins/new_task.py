@@ -9,10 +9,10 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from string import Template
 
-from neuprim import __version__
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.files import publish_folder
 from neuprim.plugins.registry import list_tasks
+from neuprim.version import __version__
 
 __all__ = ["new_task"]
 

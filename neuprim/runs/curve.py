@@ -1,0 +1,50 @@
+"""The curve of a run: lines of ``metrics.jsonl``, and the few held-out views behind its ``eval_psnr``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from neuprim.core.io.files import write_text
+from neuprim.core.metrics import psnr
+from neuprim.core.train.trainer import Trainer
+from neuprim.runs.measure import draw
+
+__all__ = ["curve_psnr", "next_evaluation", "open_curve"]
+
+_VIEWS = 5  # held-out views behind the curve's eval_psnr
+_PSNR_MAX = 200.0  # dB; equal images have an infinite one
+
+
+def open_curve(path: Path, step: int) -> Any:
+    """metrics.jsonl, cut back to what the checkpoint knows."""
+    kept = []
+    if step and path.exists():
+        for text in path.read_text(encoding="utf-8").splitlines():
+            try:
+                if json.loads(text)["step"] <= step:
+                    kept.append(text)
+            except (ValueError, KeyError, TypeError):
+                continue  # a line that a kill cut short
+    write_text(path, "".join(f"{text}\n" for text in kept))
+    return open(path, "a", encoding="utf-8")
+
+
+def next_evaluation(trainer: Trainer) -> float:
+    """The progress at which the curve gets its next point."""
+    every = trainer.settings.eval_every
+    return (int(trainer.progress / every + 1e-9) + 1) * every if every > 0 else float("inf")
+
+
+def curve_psnr(trainer: Trainer) -> float:
+    """Mean PSNR of a few held-out views as :func:`~neuprim.runs.measure.measure` has it, but at most 200 dB, so that a line of JSON can hold
+    it; does not touch the training state."""
+    views = trainer.dataset.test
+    picks = sorted({i * len(views) // _VIEWS for i in range(_VIEWS)})
+    total = 0.0
+    for i in picks:
+        pixels = views.pixels(i)
+        rendered = draw(trainer.model, views.view(i), trainer.renderer, trainer.dataset.background)
+        total += min(psnr(rendered, pixels.over(trainer.dataset.background), pixels.mask), _PSNR_MAX)
+    return total / len(picks)

@@ -1,0 +1,62 @@
+"""The end of a run: metrics, pictures, films and the report, from the same tensors that lie on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from neuprim.core.data import Clip, View
+from neuprim.core.io import images
+from neuprim.core.io.files import write_json
+from neuprim.report import error_map, write_report
+from neuprim.runs.fit import Fitted
+from neuprim.runs.measure import draw, measure, summary
+
+__all__ = ["finish"]
+
+_SHOWN_VIEWS = 8  # held-out views in renders/ and the report
+_ORBIT_FRAMES = 36
+
+
+def finish(fitted: Fitted, directory: Path) -> None:
+    """Writes ``metrics.json``, ``renders/`` and the report of a run whose model is on disk in ``directory``."""
+    config, dataset, channels, model = fitted.config, fitted.dataset, fitted.channels, fitted.model
+    fitted.unlock()
+    count = len(dataset.test)
+    shown = {round(i * (count - 1) / max(min(count, _SHOWN_VIEWS) - 1, 1)) for i in range(min(count, _SHOWN_VIEWS))}
+    folder = directory / "renders"
+    folder.mkdir(exist_ok=True)
+
+    clips = dataset.clips()
+    reels = {i: clip for clip in clips if clip.source is None for i in clip.views}
+    pictures: list[torch.Tensor] = []
+
+    def film(clip: Clip, index: int, rendered: torch.Tensor, truth: torch.Tensor) -> None:
+        pictures.append(images.to_uint8(torch.cat([channels.display(x) for x in (truth, rendered)], dim=1)))
+        if index == clip.views[-1]:
+            images.write_animation(folder / f"clip_{clip.name}.webp", pictures, clip.fps)
+            pictures.clear()
+
+    def keep(index: int, view: View, rendered: torch.Tensor, truth: torch.Tensor) -> None:
+        clip = reels.get(index)
+        if clip is not None:
+            film(clip, index, rendered, truth)
+        if index in shown:
+            stem = f"test_{index:03d}_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in view.name)
+            images.write_png(folder / f"{stem}.png", channels.display(rendered))
+            images.write_png(folder / f"{stem}_truth.png", channels.display(truth))
+            images.write_png(folder / f"{stem}_error.png", torch.from_numpy(error_map(rendered, truth)))
+
+    views = measure(model, dataset, config.renderer, channels, keep)
+    for clip in clips:
+        if clip.source is None:
+            continue  # drawn above
+        for i in clip.views:
+            truth = clip.source.pixels(i).over(dataset.background)
+            film(clip, i, draw(model, clip.source.view(i), config.renderer, dataset.background), truth)
+    size = (directory / "model.safetensors").stat().st_size
+    write_json(directory / "metrics.json", summary(config, model, dataset, channels, views, size, fitted.training))
+    frames = [channels.display(draw(model, v, config.renderer, dataset.background)) for v in dataset.orbit(_ORBIT_FRAMES)]
+    images.write_animation(folder / "orbit.webp", frames, fps=12.0)
+    write_report(directory, fitted.task.conditions)

@@ -1,0 +1,147 @@
+"""One run: fit, measure, draw and report, all in one directory that can be resumed."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from neuprim.config import RunConfig, suspects_of
+from neuprim.core import checkpoint
+from neuprim.core.errors import CheckpointError
+from neuprim.core.io.files import write_text
+from neuprim.core.render import choose_backend
+from neuprim.plugins.provenance import check_resumed
+from neuprim.runs.curve import open_curve
+from neuprim.runs.events import Events, Finishing, Note, Preparing, silent
+from neuprim.runs.finish import finish
+from neuprim.runs.fit import Fitted, one_torch_thread, start, steps, warm_up
+from neuprim.runs.open import LOGS
+from neuprim.runs.warm import compiled, compiling, mark_compiled
+
+__all__ = ["run"]
+
+_COMPILING = "compiling kernels, once per installation (about a minute)"
+
+
+def run(config: RunConfig, events: Events = silent) -> Path:
+    """Fit, measure and report; returns the run directory.
+
+    Ctrl-C finishes the step, writes a checkpoint and a report, and raises KeyboardInterrupt; a second one stops at once.
+
+    Args:
+        events: told what happens.
+
+    Raises:
+        NeuprimError: the input's fault, or numbers that left the finite; whatever was on disk before is intact.
+    """
+    directory = config.output_dir
+    suspects = suspects_of(config)
+    with compiling(config.renderer.backend != "reference") as kernels, suspects.watch(directory / LOGS):
+        fitted = start(config, events, suspects=suspects)
+        _resume(fitted, events)
+        directory.mkdir(parents=True, exist_ok=True)
+        write_text(directory / "config.yaml", fitted.config.to_yaml())
+        if kernels.running:
+            events(Preparing(_COMPILING))
+            kernels.wait()
+        interrupted = _train(fitted, events)
+        events(Finishing("measuring held-out views"))
+        finish(fitted, directory)
+    if interrupted:
+        raise KeyboardInterrupt
+    return directory
+
+
+def _resume(fitted: Fitted, events: Events) -> None:
+    config, saved = fitted.config, fitted.config.output_dir / "checkpoint.safetensors"
+    if not (config.resume and saved.exists()):
+        return
+    header, tensors = checkpoint.read(saved, "checkpoint")
+    if header.get("task") != config.task:
+        raise CheckpointError(f"{saved}: written for task {header.get('task')!r}; this run's task is {config.task!r}")
+    check_resumed(header.get("made_by"), config.made_by, saved)
+    fitted.trainer.load_state(tensors, header, str(saved))
+    events(Note(f"resumed at step {fitted.trainer.step}"))
+
+
+def _train(fitted: Fitted, events: Events) -> bool:
+    """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
+    trainer, config = fitted.trainer, fitted.config
+    view = fitted.dataset.train.view(0)
+    lowered = trainer.model.lower(view.camera, view.conditions, trainer.renderer)
+    form = type(lowered.colour).__name__
+    on_cpu = choose_backend(lowered, trainer.renderer, view.camera) == "cpu"
+    if on_cpu and not compiled(form):
+        events(Preparing(_COMPILING))
+    warm_up(trainer)
+    if on_cpu:
+        mark_compiled(form)
+    curve = open_curve(config.output_dir / "metrics.jsonl", trainer.step)
+    last_saved = time.monotonic()
+    interrupted = False
+    with _interruptible() as stop, curve, one_torch_thread():
+        for report, held_out in steps(trainer, events):
+            line: dict[str, Any] = {}
+            if held_out is not None:
+                line["eval_psnr"] = held_out
+            if report.change:
+                line["change"] = report.change
+            if line or report.step % config.train.log_every == 0 or trainer.finished:
+                line = {"step": report.step, "seconds": round(report.seconds, 4), "loss": report.loss, **report.parts, "psnr": report.psnr, "primitives": report.primitives, **line}  # fmt: skip
+                curve.write(json.dumps(line) + "\n")
+                curve.flush()
+            if time.monotonic() - last_saved > config.train.checkpoint_every_seconds:
+                _save(fitted)
+                last_saved = time.monotonic()
+            if stop.is_set():
+                interrupted = True
+                break
+    _save(fitted)
+    return interrupted
+
+
+def _save(fitted: Fitted) -> None:
+    trainer, config, dataset = fitted.trainer, fitted.config, fitted.dataset
+    tensors, header = trainer.state()
+    made_by = {} if config.made_by is None else {"made_by": config.made_by.to_dict()}
+    checkpoint.write(config.output_dir / "checkpoint.safetensors", "checkpoint", tensors, {"task": config.task, **made_by, **header})
+    extra: dict[str, Any] = {
+        "background": [float(x) for x in dataset.background],
+        "color_space": dataset.color_space,
+        "channels": list(fitted.channels.names),
+        "data_source": dataset.data_source,
+        "data": dataset.facts(),
+        **fitted.training,
+    }
+    placement = dataset.placement()
+    if placement is not None:
+        extra["world"] = placement.to_json()
+    checkpoint.save_model(config.output_dir / "model.safetensors", trainer.model, config.task, extra)
+
+
+@contextmanager
+def _interruptible() -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets; the second interrupts at once. Outside the main thread Ctrl-C is not ours."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    previous = signal.getsignal(signal.SIGINT)
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    signal.signal(signal.SIGINT, handler)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, previous)

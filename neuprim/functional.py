@@ -11,10 +11,10 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, check_viewmat
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, NonFiniteError, nearest
-from neuprim.core.model.checks import Sizes, misfit, tensor_fault
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.tensors import Sizes, tensor_fault
 from neuprim.core.render import RenderSettings, RenderStats, render_lowered
 
 __all__ = ["Rasterized", "rasterize"]
@@ -169,7 +169,7 @@ def _check_primitives(t: dict[str, Tensor], omega0: float) -> tuple[int, int]:
     sizes: Sizes = {}
     density = Cosine(t["W1"], t["b1"], t["w2"], t["b2"], omega0)
     for form in (Geometry(t["means"], t["log_scales"], t["quats"]), density):
-        fault = misfit(form, sizes)
+        fault = form.fault(sizes)
         if fault is not None:
             raise DataError(f"rasterize: {fault}")
     n, colors = sizes["N"][0], tuple(t["colors"].shape)

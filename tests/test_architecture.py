@@ -39,52 +39,121 @@ def within(name: str, package: str) -> bool:
     return name == package or name.startswith(package + ".")
 
 
-def offences(folder: str, forbidden: tuple[str, ...]) -> list[str]:
-    files = [f for f in FILES if f.is_relative_to(ROOT / folder)]
-    assert len(files) > 2, folder
-    return [f"{f.relative_to(ROOT)} imports {n}" for f in files for n in sorted(imported(f)) if any(within(n, bad) for bad in forbidden)]
+ROOMS: dict[str, set[str]] = {
+    "version": set(),
+    "moved": set(),
+    "conf": set(),
+    "core": {"version"},
+    "scenes": {"core"},
+    "tasks": {"core", "scenes"},
+    "plugins": {"core", "version"},
+    "functional": {"core"},
+    "report": {"core"},
+    "config": {"core", "plugins", "version"},
+    "conformance": {"config", "core", "plugins"},
+    "runs": {"config", "core", "plugins", "report", "version"},
+    "cli": {"config", "core", "plugins", "runs", "version"},
+}
+"""Room of the package -> those it may import from."""
+
+CORE: dict[str, set[str]] = {
+    "errors": set(),
+    "notices": set(),
+    "io": {"errors"},
+    "settings": {"errors"},
+    "choices": {"errors"},
+    "metrics": {"errors"},
+    "cameras": {"errors"},
+    "compute": {"io"},
+    "environment": {"errors", "io"},
+    "model": {"cameras", "compute", "errors", "settings"},
+    "volumes": {"compute", "errors", "model"},
+    "data": {"cameras", "compute", "errors", "io", "model", "volumes"},
+    "task": {"data", "environment", "model", "volumes"},
+    "conditions": {"errors", "model"},
+    "channels": {"data", "errors", "io", "task"},
+    "checkpoint": {"errors", "io", "model", "task"},
+    "extensions": {"channels", "conditions", "data", "errors", "model", "settings", "task", "volumes"},
+    "render": {"cameras", "compute", "errors", "metrics", "model", "settings"},
+    "train": {"compute", "data", "errors", "model", "render", "task"},
+    "uses": {"errors", "extensions", "task", "train"},
+}
+"""The same inside ``core``, folders and single files alike."""
+
+MOST_ROOMS = 14
 
 
-def test_core_knows_no_task_plugin_or_command() -> None:
-    allowed = ("neuprim.core", "neuprim.__version__")
-    files = [f for f in FILES if f.is_relative_to(ROOT / "core")]
-    wrong = [
-        f"{f.relative_to(ROOT)} imports {n}"
-        for f in files
-        for n in sorted(imported(f))
-        if within(n, "neuprim") and n != "neuprim" and not any(within(n, good) for good in allowed)
-    ]
-    assert wrong == []
+def parts(path: Path) -> tuple[str, ...]:
+    """Module name of a file, e.g. ("neuprim", "core", "errors")."""
+    relative = path.relative_to(ROOT.parent).with_suffix("").parts
+    return relative[:-1] if relative[-1] == "__init__" else relative
 
 
-def test_tasks_know_no_command_plugin_or_other_task() -> None:
-    above = (
-        "neuprim.cli",
-        "neuprim.runs.run",
-        "neuprim.runs.draw",
-        "neuprim.report",
-        "neuprim.config",
-        "neuprim.plugins",
-        "neuprim.cli.doctor",
-        "neuprim.cli.progress",
-    )
-    for task in sorted(p.name for p in (ROOT / "tasks").iterdir() if (p / "__init__.py").exists()):
-        others = tuple(f"neuprim.tasks.{p.name}" for p in (ROOT / "tasks").iterdir() if p.is_dir() and p.name != task)
-        assert offences(f"tasks/{task}", (*above, *others)) == []
+MODULES = {".".join(parts(f)): f for f in FILES}
 
 
-def test_formats_and_inspectors_know_no_command() -> None:
-    above = (
-        "neuprim.cli",
-        "neuprim.runs.run",
-        "neuprim.runs.draw",
-        "neuprim.report",
-        "neuprim.runs.export",
-        "neuprim.runs.inspect",
-        "neuprim.runs.open",
-    )
-    for folder in ("plugins/export", "plugins/inspect"):
-        assert offences(folder, above) == []
+def edges(path: Path) -> set[str]:
+    """The modules of the package that a file imports from, anywhere in it; of ``from package import module`` the module."""
+    names = {name for name in imported(path) if name in MODULES} - {".".join(parts(path)), ROOT.name}
+    return {name for name in names if not any(other.startswith(name + ".") for other in names)}
+
+
+def between(depth: int, allowed: dict[str, set[str]], inside: tuple[str, ...]) -> list[str]:
+    """Imports from one room to another that the list does not have, of the rooms ``depth`` names down from ``inside``."""
+    wrong = []
+    for file in FILES:
+        own = parts(file)
+        if own[: len(inside)] != inside or len(own) <= depth or own[-1] == "__main__":
+            continue
+        for name in sorted(edges(file)):
+            other = tuple(name.split("."))
+            if other[: len(inside)] != inside or len(other) <= depth or other[depth] == own[depth]:
+                continue
+            if other[depth] not in allowed[own[depth]]:
+                wrong.append(f"{file.relative_to(ROOT)} imports {name}")
+    return wrong
+
+
+def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Sets of nodes that reach each other."""
+    reach: dict[str, set[str]] = {}
+    for node in graph:
+        seen, todo = set(), [node]
+        while todo:
+            for other in graph.get(todo.pop(), ()):
+                if other not in seen:
+                    seen.add(other)
+                    todo.append(other)
+        reach[node] = seen
+    found = {tuple(sorted(n for n in graph if n in reach[node] and node in reach[n])) for node in graph if node in reach[node]}
+    return [list(circle) for circle in sorted(found)]
+
+
+def test_every_room_imports_only_what_the_list_allows() -> None:
+    assert between(1, ROOMS, (ROOT.name,)) == []
+    assert between(2, CORE, (ROOT.name, "core")) == []
+
+
+def test_the_lists_name_what_is_there_and_run_down() -> None:
+    there = {p.stem if p.suffix == ".py" else p.name for p in ROOT.iterdir() if p.suffix == ".py" or (p / "__init__.py").exists()}
+    assert set(ROOMS) == there - {"__init__", "__main__"} and len(ROOMS) <= MOST_ROOMS
+    core = {p.stem if p.suffix == ".py" else p.name for p in (ROOT / "core").iterdir() if p.suffix == ".py" or (p / "__init__.py").exists()}
+    assert set(CORE) == core - {"__init__"}
+    assert circles(ROOMS) == [] and circles(CORE) == []
+
+
+def test_no_module_imports_itself_by_a_detour() -> None:
+    """Imports for types only and imports inside functions count too; packages that only re-export are the door of their room."""
+    assert circles({name: edges(file) for name, file in MODULES.items()}) == []
+
+
+def test_tasks_do_not_know_each_other() -> None:
+    names = sorted(p.name for p in (ROOT / "tasks").iterdir() if (p / "__init__.py").exists())
+    assert between(2, {name: set() for name in names}, (ROOT.name, "tasks")) == []
+
+
+def test_a_circle_is_found() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == [["b", "c"]]
 
 
 def test_nothing_imports_a_built_in_task_by_name() -> None:
@@ -100,7 +169,8 @@ def test_nothing_imports_a_built_in_task_by_name() -> None:
 
 
 def test_nobody_imports_the_command_line() -> None:
-    wrong = [str(f.relative_to(ROOT)) for f in FILES if f.name != "__main__.py" and any(within(n, "neuprim.cli") for n in imported(f))]
+    outside = [f for f in FILES if f.name != "__main__.py" and not f.is_relative_to(ROOT / "cli")]
+    wrong = [str(f.relative_to(ROOT)) for f in outside if any(within(n, "neuprim.cli") for n in imported(f))]
     assert wrong == []
 
 

@@ -11,7 +11,7 @@ from neuprim.conformance.integrals import Alive, by_quadrature, chords, inside, 
 from neuprim.conformance.subject import EXACT, Frozen, Subject, watched
 from neuprim.core.cameras import Camera
 from neuprim.core.data import View
-from neuprim.core.model.fields import Constant, LoweredColour, LoweredDensity, Opaque
+from neuprim.core.model.fields import LoweredColour, LoweredDensity, Opaque
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render import render, render_lowered
 
@@ -45,7 +45,7 @@ def check_lowered_forms(t: Subject) -> None:
             lowered = model.lower(view.camera, view.conditions)  # which refuses what does not fit, by name
             _numbers(t, "density.lower", lowered.density, dtype)
             _numbers(t, "colour.lower", lowered.colour, dtype)
-            channels = lowered.colour.rgb.shape[1] if isinstance(lowered.colour, Constant) else lowered.colour.channels
+            channels = lowered.colour.channels
             t.require(channels == t.dataset.channels, "colour.lower: channels", channels, str(t.dataset.channels))
             declared = model.colour.channels
             t.require(declared == t.dataset.channels, "colour.channels", declared, str(t.dataset.channels))

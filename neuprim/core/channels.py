@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,15 +13,12 @@ from torch import Tensor
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.io.channel_names import default_names, names_fault
 from neuprim.core.io.images import linear_to_srgb
+from neuprim.core.task import Display, TaskSpec
 
 if TYPE_CHECKING:
     from neuprim.core.data import Dataset
-    from neuprim.core.task import TaskSpec
 
-__all__ = ["Channels", "Display", "channels_of", "stored_channels"]
-
-Display = Callable[[Tensor], Tensor]
-"""(H, W, C) colours in the data set's own colour space -> (H, W, 3) sRGB values 0..1, each pixel by itself."""
+__all__ = ["Channels", "channels_of", "stored_channels"]
 
 _LISTED = 8  # names that a line of text lists; of more, the first three and the last
 

@@ -8,7 +8,6 @@ from typing import Any
 
 from torch import Tensor
 
-from neuprim.core.channels import Display
 from neuprim.core.data import Dataset, View
 from neuprim.core.data.context import SceneContext
 from neuprim.core.environment import Environment, Illumination
@@ -40,6 +39,9 @@ class Supervision:
 
 Loss = Callable[[Tensor, Tensor, Supervision], tuple[Tensor, dict[str, float]]]
 """(rendered (H, W, C), ground truth (H, W, C), :class:`Supervision`) -> (scalar loss with gradient, named parts for the log)."""
+
+Display = Callable[[Tensor], Tensor]
+"""(H, W, C) colours in the data set's own colour space -> (H, W, 3) sRGB values 0..1, each pixel by itself."""
 
 Illuminate = Callable[[Environment, int, Mapping[str, Any]], Illumination]
 """(light from all around, number of lights that stand for it, what the data set said in :meth:`Dataset.facts`) -> frames to add up."""

@@ -13,9 +13,10 @@ from torch import Tensor
 from neuprim.conformance.integrals import chords, inside, line_integral
 from neuprim.core.errors import FormError
 from neuprim.core.model.densities.cosine import cosine_density
-from neuprim.core.model.fields import MOST_UNITS, Cosine, Opaque
+from neuprim.core.model.fields import Cosine, Opaque
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.tensors import MOST_UNITS
 from neuprim.core.render import RenderSettings, render_lowered
 from tests import scenes
 

@@ -16,8 +16,9 @@ from torch import Tensor
 from neuprim.core.errors import FormError
 from neuprim.core.model.colours import sh
 from neuprim.core.model.densities.cosine import CosineDensity
-from neuprim.core.model.fields import MOST_UNITS, Constant, Cosine, Opaque, OpaqueColour, Shading
+from neuprim.core.model.fields import Constant, Cosine, Opaque, OpaqueColour, Shading
 from neuprim.core.model.primitives import Lowered, Primitives
+from neuprim.core.model.tensors import MOST_UNITS
 from neuprim.core.render import RenderSettings, render, render_lowered
 from neuprim.core.render.joint import joint_volume
 from neuprim.core.volumes.grid import density_at, density_grid

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -13,64 +12,14 @@ from neuprim.config import RunConfig, compose
 from neuprim.core.errors import ConfigError
 from neuprim.core.notices import NeuprimWarning
 from neuprim.plugins import registry
-from neuprim.plugins.registry import ALL, EXPORTERS, INSPECTORS, LOSSES, SCENES, TASKS, Group, PluginError, find_scene, load_task
+from neuprim.plugins.registry import ALL, LOSSES, PluginError, find_scene, load_task
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset
 from neuprim.runs.run import run
-from tests.plugins.fakes import TOY, install, site, toy
+from tests.plugins.extras import KINDS, LOSS, SCENE, add
+from tests.plugins.fakes import install, site, toy
 
 __all__ = ["site", "toy"]
-
-SCENE = """
-from neuprim.core.extensions import SceneExtension
-from neuprim.core.task import SceneSpec
-
-def load(settings, context):
-    from tests.core.tiny import TwoPrimitives
-    assert settings == {"wobble": 2.0}
-    return TwoPrimitives()
-
-PLUGIN = SceneExtension(api=1, task="static", scene=SceneSpec("extra", "two ellipsoids", load), config_package="fake_extra.conf")
-"""
-LOSS = """
-from neuprim.core.extensions import LossExtension
-
-def make(settings):
-    weight = settings["options"]["weight"]
-    assert settings["ssim_weight"] >= 0 and isinstance(weight, float)
-    def loss(rendered, truth, frame):
-        value = weight * (rendered - truth).square().mean()
-        return value, {"mse": value.item()}
-    return loss
-
-PLUGIN = LossExtension(
-    api=1, name="extra", summary="mean squared error", make=make, options={"weight": (3.0, "of it")}, uses=("train.ssim_weight",)
-)
-"""
-EXPORTER = """
-from neuprim.core.extensions import Exporter, ExportReport
-PLUGIN = Exporter(api=1, name="extra", summary="nothing at all", write=lambda job: ExportReport((), False), options={"size": (1, "of it")})
-"""
-INSPECTOR = """
-from neuprim.core.extensions import Inspector
-PLUGIN = Inspector(api=1, name="extra", summary="nothing at all", add=lambda plotter, frame: None)
-"""
-KINDS: dict[str, tuple[Group[Any], str, str, str]] = {
-    "task": (TASKS, "extra", TOY.replace('name="toy"', 'name="extra"').replace("TASK", "PLUGIN"), "TaskSpec"),
-    "scene": (SCENES, "static.extra", SCENE, "SceneExtension"),
-    "loss": (LOSSES, "extra", LOSS, "LossExtension"),
-    "exporter": (EXPORTERS, "extra", EXPORTER, "Exporter"),
-    "inspector": (INSPECTORS, "extra", INSPECTOR, "Inspector"),
-}
-"""Kind -> group, entry point, source, class."""
-
-
-def add(site: Path, kind: str, source: str | None = None, package: str = "fake_extra", name: str = "") -> None:
-    group, entry, text, _ = KINDS[kind]
-    files = {f"{package}/__init__.py": source or text, f"{package}/conf/__init__.py": ""}
-    files[f"{package}/conf/scene/static/extra.yaml"] = "wobble: 2.0\n"
-    install(site, package.replace("_", "-"), {name or entry: f"{package}:PLUGIN"}, files, group=group.entry_points)
-
 
 # ---------------------------------------------------------------- what works
 

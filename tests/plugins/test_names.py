@@ -27,9 +27,9 @@ from neuprim.plugins.registry import (
     find_scene,
     load_task,
 )
+from tests.plugins.extras import EXPORTER, INSPECTOR, LOSS, SCENE, add
 from tests.plugins.fakes import TOY, TOY_FILES, install, install_groups, site, toy
 from tests.plugins.marked import static_model, write_run
-from tests.plugins.test_extensions import EXPORTER, INSPECTOR, LOSS, SCENE, add
 
 __all__ = ["site", "toy"]
 

@@ -23,9 +23,9 @@ from neuprim.plugins.provenance import MadeBy, Maker
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_run
 from neuprim.runs.run import run
+from tests.plugins.extras import LOSS, add
 from tests.plugins.fakes import install, install_groups, site, uninstall
 from tests.plugins.marked import static_run
-from tests.plugins.test_extensions import LOSS, add
 
 __all__ = ["site"]
 

@@ -26,8 +26,8 @@ from neuprim.plugins.registry import list_losses, load_loss, load_task
 from neuprim.runs.fit import make_loss
 from neuprim.runs.run import run
 from neuprim.tasks.static import TASK
+from tests.plugins.extras import LOSS, add
 from tests.plugins.fakes import install, site, toy
-from tests.plugins.test_extensions import LOSS, add
 
 __all__ = ["site", "toy"]
 

@@ -1,4 +1,4 @@
-"""The two interfaces of the design: a density field and a colour field, and the closed forms they lower to.
+"""The two interfaces of the design: a density field and a colour field; the closed forms they lower to are in :mod:`neuprim.core.model.forms`.
 
 A *field* owns some per-primitive parameters. Before a frame is drawn it *lowers*: conditions such as time or light are
 folded into one of a few closed forms that the renderer knows. The renderer never sees a task.
@@ -11,10 +11,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import torch
 from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.model.forms import Constant, Cosine, LoweredColour, LoweredDensity, Opaque, OpaqueColour, RayNet, Shade, Shading
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import ParameterSpec, Params
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from neuprim.core.settings import RenderSettings
 
 __all__ = [
-    "MOST_UNITS",
     "ColourField",
     "ConditionSpec",
     "Conditions",
@@ -65,169 +64,6 @@ class ConditionSpec:
     parse: Callable[[str], list[Tensor]]
     strict: bool = False
     sweep: str = ""
-
-
-# ---------------------------------------------------------------- closed forms of density
-
-
-MOST_UNITS = 256
-"""Most neurons of a density and units of a colour network: the fast kernels number a primitive's neurons in a byte."""
-
-
-@dataclass(frozen=True)
-class Cosine:
-    """f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2, world density f/m (method: equation 10 of the paper).
-
-    Attributes:
-        W1: (N, K, 3), b1: (N, K), w2: (N, K), b2: (N,) or (N, 1); K = 0 to :data:`MOST_UNITS`, and K = 0 is a constant density.
-        omega0: multiplies the whole phase.
-
-    ``first + second`` is the sum of two densities of the same primitives, see :meth:`__add__`.
-    """
-
-    W1: Tensor
-    b1: Tensor
-    w2: Tensor
-    b2: Tensor
-    omega0: float = 30.0
-
-    def __add__(self, other: Cosine) -> Cosine:
-        """f + g, exactly: the neurons of both side by side. Differentiable.
-
-        Both have the first one's omega0 (the second one's if that is 0); frequencies and phases of the other are scaled to it.
-
-        Raises:
-            FormError: they are not of the same primitives, or have more than :data:`MOST_UNITS` neurons together.
-        """
-        if not isinstance(other, Cosine):
-            return NotImplemented
-        from neuprim.core.model.checks import check_sum  # which knows the forms of this file
-
-        check_sum(self, other)
-        omega0 = self.omega0 or other.omega0
-        parts = [(f, f.omega0 / omega0 if f.omega0 != omega0 else 1.0) for f in (self, other)]
-        W1 = torch.cat([f.W1 * scale for f, scale in parts], 1)
-        b1 = torch.cat([f.b1 * scale for f, scale in parts], 1)
-        return Cosine(W1, b1, torch.cat([self.w2, other.w2], 1), self.b2 + other.b2.reshape(self.b2.shape), omega0)
-
-    def rows(self, index: Tensor) -> Cosine:
-        """Those of some primitives, (M,) int64, without gradient."""
-        W1, b1, w2, b2 = (x.detach()[index] for x in (self.W1, self.b1, self.w2, self.b2))
-        return Cosine(W1, b1, w2, b2, self.omega0)
-
-
-@dataclass(frozen=True)
-class Opaque:
-    """Any other density, as torch code per ray-primitive pair; the reference backend renders it.
-
-    ``line_integral(prim, origin, direction, t0, t1)`` takes (M,) primitive rows, (M, 3) ray origins and unit directions
-    in scene units and the (M,) chord ends in scene units, and returns the (M,) optical depths, the integral of sigma.
-    """
-
-    line_integral: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
-
-    def rows(self, index: Tensor) -> Opaque:
-        """That of some primitives, (M,) int64."""
-        return Opaque(lambda prim, *ray: self.line_integral(index[prim], *ray))
-
-
-LoweredDensity = Cosine | Opaque
-
-
-# ---------------------------------------------------------------- closed forms of colour
-
-
-@dataclass(frozen=True)
-class Constant:
-    """One colour per primitive and view: rgb (N, C), any channel count."""
-
-    rgb: Tensor
-
-    def scaled(self, factors: Tensor) -> Constant:
-        """The same times (N,) factors, at least 0."""
-        return Constant(self.rgb * factors.to(self.rgb)[:, None])
-
-
-@dataclass(frozen=True)
-class OpaqueColour:
-    """Any other colour, as torch code per ray-primitive pair; the reference backend renders it.
-
-    ``radiance(prim, x, d)`` takes (M,) primitive rows, (M, 3) chord middles in scene units and (M, 3) unit directions,
-    and returns (M, C).
-    """
-
-    radiance: Callable[[Tensor, Tensor, Tensor], Tensor]
-    channels: int
-
-    def scaled(self, factors: Tensor) -> OpaqueColour:
-        """The same times (N,) factors, at least 0."""
-
-        def radiance(prim: Tensor, x: Tensor, d: Tensor) -> Tensor:
-            found = self.radiance(prim, x, d)
-            return found * factors.to(found)[prim, None]
-
-        return OpaqueColour(radiance, self.channels)
-
-
-@dataclass(frozen=True)
-class RayNet:
-    """A colour network per primitive, evaluated where each pixel's ray passes through it.
-
-        c(pixel) = max(0, base + Wout cos(Wx . x~_m + bias)),   x~_m = (x_m - mu)/m
-
-    with x_m the middle of the ray's chord, after the cut by the near plane if there is one: the point that the closed form of the
-    density is anchored at. One hidden layer of H cosine units, H = 0 to :data:`MOST_UNITS`, phases in radians; H = 0 is the constant colour
-    max(0, base). Whatever does not change within a primitive (view direction at its centre, light) a field folds into ``bias``,
-    ``Wout`` and ``base``. A colour of exactly 0 still passes its gradient, as ``clamp_min`` does.
-
-    Attributes:
-        Wx: (N, H, 3) on scene axes, radians per m; bias: (N, H), radians.
-        Wout: (N, C, H), base: (N, C), any channel count C.
-    """
-
-    Wx: Tensor
-    bias: Tensor
-    Wout: Tensor
-    base: Tensor
-
-    @property
-    def channels(self) -> int:
-        return int(self.base.shape[1])
-
-    @property
-    def hidden(self) -> int:
-        return int(self.Wx.shape[1])
-
-    def scaled(self, factors: Tensor) -> RayNet:
-        """The same times (N,) factors, at least 0, which max(0, .) lets through."""
-        factors = factors.to(self.base)
-        return RayNet(self.Wx, self.bias, self.Wout * factors[:, None, None], self.base * factors[:, None])
-
-    def radiance(self, prim: Tensor, local: Tensor) -> Tensor:
-        """(M, C) float64 colours of primitives ``prim`` (M,) at local chord middles ``local`` = x~_m (M, 3) float64; differentiable."""
-        phase = (self.Wx.double()[prim] * local[:, None, :]).sum(-1) + self.bias.double()[prim]
-        mixed = (self.Wout.double()[prim] * phase.cos()[:, None, :]).sum(-1)
-        return (self.base.double()[prim] + mixed).clamp_min(0)
-
-
-LoweredColour = Constant | RayNet | OpaqueColour
-
-Shade = Callable[[Tensor], Tensor]
-"""(M, 3) float64 scene points that pixels show -> (M,) factors on the light that they send to the camera, without gradient."""
-
-
-@dataclass(frozen=True)
-class Shading:
-    """Factors on a frame's colours that follow from the primitives themselves, such as shadows; without gradient.
-
-    Attributes:
-        primitives: (M,) at least 0, one for each primitive of the frame; None: 1.
-        pixels: a factor that varies faster than primitives do, such as a shadow's edge: the renderer asks for it once per pixel, at the
-            mean depth of what the pixel shows (deferred shading). None: 1 everywhere, and no depth image is drawn for it.
-    """
-
-    primitives: Tensor | None = None
-    pixels: Shade | None = None
 
 
 # ---------------------------------------------------------------- fields

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from neuprim.core.model.schema import InitContext, ParameterSpec
+from neuprim.core.model.tensors import Shaped, Shapes
 
 __all__ = ["GEOMETRY_SPECS", "Geometry", "quaternion_to_matrix"]
 
@@ -27,7 +29,7 @@ def quaternion_to_matrix(quats: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Geometry:
+class Geometry(Shaped):
     """N ellipsoids of hard support (radius 1 in whitened space).
 
     Attributes:
@@ -35,6 +37,8 @@ class Geometry:
         log_scales: (N, 3) natural logarithm of the semi-axes, scene units.
         quats: (N, 4) wxyz, any non-zero norm.
     """
+
+    shapes: ClassVar[Shapes] = {"means": (("N", 3),), "log_scales": (("N", 3),), "quats": (("N", 4),)}
 
     means: Tensor
     log_scales: Tensor

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
-from neuprim.core.errors import NonFiniteError
+from neuprim.core.errors import FormError, NonFiniteError
 from neuprim.core.model.checks import (
     check_colour,
     check_density,
@@ -18,6 +18,7 @@ from neuprim.core.model.checks import (
     check_result,
     check_rows,
     check_shading,
+    check_shape,
     check_start,
     method,
     source,
@@ -25,6 +26,7 @@ from neuprim.core.model.checks import (
 from neuprim.core.model.fields import ColourField, Conditions, Constant, DensityField, LoweredColour, LoweredDensity, RayNet, Shade
 from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec
+from neuprim.core.model.tensors import function_fault
 from neuprim.core.settings import RenderSettings
 
 __all__ = ["Living", "Lowered", "Primitives"]
@@ -45,6 +47,26 @@ class Lowered:
     rows: Tensor | None = None
     shade: Shade | None = None
     fields: tuple[str, str] | None = None
+
+    def check(self, viewmat: Any = None, background: Any = None) -> None:
+        """Everything that a renderer takes, at its entrance.
+
+        Raises:
+            FormError: something does not fit; names field (where the model knows it), form, tensor, found and expected.
+        """
+        density, colour = self.fields or (None, None)
+        sizes = check_geometry(self.geometry, "geometry")
+        check_density(self.density, sizes, density)
+        check_colour(self.colour, sizes, colour)
+        if self.rows is not None:
+            check_rows(self.rows, None, "Lowered.rows holds", sizes["N"][0])
+        if self.shade is not None and (fault := function_fault(self.shade)) is not None:
+            raise FormError(f"{self.owner('colour')}: shade has {fault} or None")
+        if background is not None:
+            channels = sizes["C"][0]
+            check_shape("background", background, (channels,), f", as {self.source('colour')} has C={channels}")
+        if viewmat is not None:
+            check_shape("viewmat", viewmat, (4, 4))
 
     def owner(self, kind: Literal["density", "colour"]) -> str:
         """Whose form it is, for messages: ``"density field Waves"``."""

@@ -11,7 +11,6 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.rays import AnyCamera, RayCamera
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.core.model.checks import check_lowered
 from neuprim.core.model.fields import Constant, Cosine, RayNet
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render.output import RenderOutput, RenderStats
@@ -77,7 +76,7 @@ def render(
 
 def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None) -> RenderOutput:
     """Draw a model whose conditions are already folded in; refuses what does not fit or is not finite, see :func:`render`."""
-    check_lowered(lowered, camera.viewmat, background)
+    lowered.check(camera.viewmat, background)
     if choose_backend(lowered, settings, camera) == "cpu":  # which checks while it prepares
         from neuprim.core.render.cpu.backend import render as draw
     else:

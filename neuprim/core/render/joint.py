@@ -24,7 +24,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import ConfigError
 from neuprim.core.metrics import psnr
-from neuprim.core.model.checks import check_lowered, check_result
+from neuprim.core.model.checks import check_result
 from neuprim.core.model.fields import Constant, Cosine, RayNet
 from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.model.primitives import Lowered
@@ -110,7 +110,7 @@ def joint_volume(
     if keep not in ("opacity", "density"):
         raise ConfigError(f"keep={keep!r}: expected opacity or density")
 
-    check_lowered(lowered, camera.viewmat, background)
+    lowered.check(camera.viewmat, background)
 
     def draw(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
         return _draw(lowered, camera, background, settings, steps, keep)
@@ -123,7 +123,7 @@ def joint_volume(
 
 def _draw(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings, steps: int, keep: Keep) -> RenderOutput:
     colour, g = lowered.colour, lowered.geometry
-    channels = colour.rgb.shape[1] if isinstance(colour, Constant) else colour.channels
+    channels = colour.channels
     directions = pixel_directions(camera)
     boxes = screen_boxes(g, camera, settings.near)
     whiten = (quaternion_to_matrix(g.quats.double()) / g.log_scales.double().exp()[:, None, :]).transpose(1, 2)  # scene -> unit sphere

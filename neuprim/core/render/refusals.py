@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.model.fields import Constant, Cosine, RayNet
 from neuprim.core.model.primitives import Lowered
 
 __all__ = ["refuse_non_finite"]
@@ -19,14 +18,7 @@ def refuse_non_finite(lowered: Lowered) -> None:
     """
     g = lowered.geometry
     tensors = {"means": g.means, "log_scales": g.log_scales, "quats": g.quats}
-    if isinstance(lowered.density, Cosine):
-        f = lowered.density
-        tensors |= {"W1": f.W1, "b1": f.b1, "w2": f.w2, "b2": f.b2}
-    if isinstance(lowered.colour, Constant):
-        tensors["colors"] = lowered.colour.rgb
-    elif isinstance(lowered.colour, RayNet):
-        c = lowered.colour
-        tensors |= {"Wx": c.Wx, "bias": c.bias, "Wout": c.Wout, "base": c.base}
+    tensors |= lowered.density.tensors() | lowered.colour.tensors()
     with torch.no_grad():
         for name, value in tensors.items():
             if value.numel() and not bool(torch.isfinite(value).all()):

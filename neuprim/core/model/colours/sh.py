@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import FormError
-from neuprim.core.model.checks import Shape, Sizes, tensors_fault
 from neuprim.core.model.colours.sh_constants import C0, C1, C2, C3
+from neuprim.core.model.tensors import Shape, Sizes, tensors_fault
 
 __all__ = ["C0", "basis", "coefficient_count", "colors", "initial_dc"]
 

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.model.checks import number_fault
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
+from neuprim.core.model.tensors import number_fault
 
 __all__ = ["OMEGA0", "CosineDensity", "cosine_density", "split_cosine"]
 

@@ -95,7 +95,7 @@ def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, setti
     frame = _Frame(lowered, camera)
     count = lowered.geometry.count
     seen = view_of(camera, lowered.geometry, frame.center, settings.near)
-    channels = lowered.colour.rgb.shape[1] if isinstance(lowered.colour, Constant) else lowered.colour.channels
+    channels = lowered.colour.channels
     stats = RenderStats("reference", weight=torch.zeros(count), error_weight=torch.zeros(count))
     rows_of_blocks = []
     for y0 in range(0, camera.height, _BLOCK):

@@ -1,0 +1,139 @@
+"""What a tensor must be for a kernel to read it, in words: its shape in letters that tensors share, its dtype, layout and device.
+
+Compiled kernels index without looking: a tensor that is too short would be read and written beyond its end. Here faults are told, None
+where there is none; :mod:`neuprim.core.model.checks` raises them.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "MOST_UNITS",
+    "Shape",
+    "Shaped",
+    "Shapes",
+    "Sizes",
+    "function_fault",
+    "labelled",
+    "number_fault",
+    "tensor_fault",
+    "tensors_fault",
+]
+
+Shape = tuple[int | str, ...]
+"""A letter stands for a size that tensors share."""
+
+Sizes = dict[str, tuple[int, str]]
+"""Letter -> its size and the tensor that has it."""
+
+MOST_UNITS = 256
+"""Most neurons of a density and units of a colour network: the fast kernels number a primitive's neurons in a byte."""
+
+_RANGES = {"K": (0, MOST_UNITS), "H": (0, MOST_UNITS), "C": (1, sys.maxsize)}
+_DTYPES = (torch.float32, torch.float64)
+
+
+def tensor_fault(value: Any) -> str | None:
+    """``"dtype torch.int64; expected torch.float32 or torch.float64"`` and the like of what no kernel can read."""
+    if not isinstance(value, Tensor):
+        return f"type {type(value).__name__}; expected a torch tensor"
+    if value.device.type != "cpu":
+        return f"device {value.device}; expected cpu, where both backends compute"
+    if value.layout is not torch.strided or value.is_nested:
+        return f"layout {'nested' if value.is_nested else value.layout}; expected a dense tensor"
+    if value.dtype not in _DTYPES:
+        return f"dtype {value.dtype}; expected torch.float32 or torch.float64"
+    return None
+
+
+def number_fault(value: Any) -> str | None:
+    """The same of what should be a finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return f"type {type(value).__name__}; expected a finite number"
+    if abs(value) <= sys.float_info.max:
+        return None
+    return f"value {value if isinstance(value, float) else 'beyond the range of float64'}; expected a finite number"
+
+
+def function_fault(value: Any) -> str | None:
+    """The same of what should be a function."""
+    return None if callable(value) else f"type {type(value).__name__}; expected a function"
+
+
+def tensors_fault(tensors: Iterable[tuple[str, Any, tuple[Shape, ...]]], sizes: Sizes) -> str | None:
+    """The first of (name, tensor, shapes that it may have) that does not fit; ``sizes`` gets what the others add."""
+    for name, value, shapes in tensors:
+        fault = tensor_fault(value)
+        if fault is None and not any(_fits(value.shape, shape, name, sizes) for shape in shapes):
+            fault = f"shape {tuple(value.shape)}; expected {_expected(shapes, sizes)}"
+        if fault is not None:
+            return f"{name} has {fault}"
+    return None
+
+
+def labelled(name: str, fault: str | None) -> str | None:
+    """``"NAME has FAULT"``."""
+    return None if fault is None else f"{name} has {fault}"
+
+
+def _fits(found: torch.Size, shape: Shape, name: str, sizes: Sizes) -> bool:
+    if len(found) != len(shape):
+        return False
+    fresh: Sizes = {}
+    for size, want in zip(found, shape, strict=True):
+        if isinstance(want, str):
+            if want not in sizes:
+                low, high = _RANGES.get(want, (0, sys.maxsize))
+                if not low <= size <= high:
+                    return False
+                fresh[want] = (size, name)
+                continue
+            want = sizes[want][0]
+        if size != want:
+            return False
+    sizes.update(fresh)
+    return True
+
+
+def _expected(shapes: tuple[Shape, ...], sizes: Sizes) -> str:
+    """In numbers where all are known, else in letters with what is known of them."""
+    letters = list(dict.fromkeys(d for d in shapes[0] if isinstance(d, str)))
+    known, free = [x for x in letters if x in sizes], [x for x in letters if x not in sizes]
+    if not free:
+        numbers = [tuple(sizes[d][0] if isinstance(d, str) else d for d in shape) for shape in shapes]
+        tensors = dict.fromkeys(sizes[x][1] for x in known)
+        origins = " and ".join(f"{t} has " + " and ".join(f"{x}={sizes[x][0]}" for x in known if sizes[x][1] == t) for t in tensors)
+        return " or ".join(map(str, numbers)) + (f", as {origins}" if origins else "")
+    text = " or ".join(str(shape).replace("'", "") for shape in shapes)
+    origins = " and ".join(f"{x}={sizes[x][0]} as in {sizes[x][1]}" for x in known)
+    limits = [f", {x} {'at least' if low else 'at most'} {low or high}" for x, (low, high) in _RANGES.items() if x in free]
+    return text + (f" with {origins}" if origins else "") + "".join(limits)
+
+
+Shapes = Mapping[str, tuple[Shape, ...]]
+"""Name of a tensor -> the shapes it may have, in letters that the tensors of a frame share."""
+
+
+class Shaped:
+    """A bundle of tensors with a row per primitive, which knows what shapes they must have."""
+
+    shapes: ClassVar[Shapes] = {}
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Its tensors by the names that messages give them, each with a row per primitive."""
+        return {name: getattr(self, name) for name in self.shapes}
+
+    def fault(self, sizes: Sizes) -> str | None:
+        """The first part that does not fit, e.g. ``"w2 has shape (5,); expected (100, 3), as means has N=100 and W1 has K=3"``; None if
+        all do.
+
+        Args:
+            sizes: those known so far; gets the ones that this form adds.
+        """
+        return tensors_fault(((name, getattr(self, name), shapes) for name, shapes in self.shapes.items()), sizes)

@@ -86,7 +86,7 @@ def package(target: Path) -> Path:
         packed = {name.partition("/")[2] for name in archive.getnames()}
     with zipfile.ZipFile(wheel) as archive:
         installed = set(archive.namelist())
-    missing = [f"{sdist.name} lacks {name}" for name in sorted(wanted - packed - {".gitignore"})]
+    missing = [f"{sdist.name} lacks {name}" for name in sorted(wanted - packed)]
     own = {name for name in wanted if name.startswith(f"{PACKAGE}/")}
     missing += [f"{wheel.name} lacks {name}" for name in sorted(own - installed)]
     foreign = {name for name in installed if not name.startswith((f"{PACKAGE}/", f"{PACKAGE}-"))}

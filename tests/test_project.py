@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import itertools
 import os
 import re
@@ -15,9 +16,11 @@ from typing import Any
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 import neuprim
+from tests.systems import posix
 
 ROOT = Path(__file__).parents[1]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -54,6 +57,37 @@ def test_every_requirement_has_a_constraint() -> None:
     wanted = itertools.chain(PROJECT["project"]["dependencies"], *EXTRAS.values())
     names = {re.split(r"[\[<>=;, ]", requirement)[0].lower() for requirement in wanted} - {"neuprim", "setuptools"}
     assert sorted(names - constraints().keys()) == []
+
+
+def test_every_dependency_is_imported() -> None:
+    """What another package needs, that package asks for."""
+    modules = {"pillow": "PIL", "pyyaml": "yaml", "hydra-core": "hydra"}
+    wanted = [Requirement(text) for text in PROJECT["project"]["dependencies"]]
+    used: set[str] = set()
+    for file in (ROOT / "neuprim").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                used |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                used.add(node.module.partition(".")[0])
+    assert [r.name for r in wanted if modules.get(r.name, r.name) not in used] == []
+
+
+@pytest.mark.parametrize(
+    ("system", "machine", "has_wheel"),
+    [
+        ("linux", "x86_64", True),
+        ("win32", "AMD64", True),
+        ("darwin", "arm64", True),
+        ("darwin", "x86_64", True),
+        ("linux", "aarch64", False),
+        ("win32", "ARM64", False),
+    ],
+)
+def test_embree_is_asked_for_where_it_has_wheels(system: str, machine: str, has_wheel: bool) -> None:
+    (embree,) = [r for r in map(Requirement, PROJECT["project"]["dependencies"]) if r.name == "embreex"]
+    assert embree.marker is not None
+    assert embree.marker.evaluate({"sys_platform": system, "platform_machine": machine}) == has_wheel
 
 
 # ---------------------------------------------------------------- citation
@@ -106,8 +140,6 @@ def steps() -> list[tuple[str, list[str]]]:
 def test_the_workflow_s_commands_exist() -> None:
     commands = steps()
     assert ("everything", [".ci/run"]) in commands
-    script = ROOT / ".ci" / "run"
-    assert os.access(script, os.X_OK) and script.read_bytes().startswith(b"#!/usr/bin/env bash\n")
     for job, words in commands:
         if job == "everything":
             continue
@@ -148,6 +180,12 @@ def test_the_script_s_commands_are_in_the_readme() -> None:
     commands = [line for line in text("README.md").splitlines() if line.startswith("python3 -m venv")]
     assert all(any(words in line for line in commands) for words in asked)
     assert " constraints.txt . " in next(line for line in commands if "neuprim run" in line), "what it installs is replaced by the wheel"
+
+
+@posix
+def test_the_script_is_one() -> None:
+    script = ROOT / ".ci" / "run"
+    assert os.access(script, os.X_OK) and script.read_bytes().startswith(b"#!/usr/bin/env bash\n")
     if shutil.which("bash") is None:
         pytest.skip("needs bash")
-    subprocess.run(["bash", "-n", str(ROOT / ".ci" / "run")], check=True)
+    subprocess.run(["bash", "-n", str(script)], check=True)

@@ -32,6 +32,7 @@ from neuprim.runs.measure import evaluate_run, measure
 from neuprim.runs.open import read_metrics
 from tests.core import tiny
 from tests.short_runs import STEPS, fit, words
+from tests.systems import posix
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -222,6 +223,7 @@ def wait_for_step(process: subprocess.Popen[bytes], run_dir: Path, step: int) ->
     pytest.fail("no checkpoint appeared")
 
 
+@posix
 @pytest.mark.parametrize("strategy", ["relocate", pytest.param("gradient", marks=pytest.mark.slow)])
 def test_killed_and_resumed_is_the_uninterrupted_run(scene: Path, whole: Path, tmp_path: Path, strategy: str) -> None:
     more = (
@@ -247,6 +249,7 @@ def test_killed_and_resumed_is_the_uninterrupted_run(scene: Path, whole: Path, t
     assert_same_run(expected, out)
 
 
+@posix
 def test_ctrl_c_leaves_a_checkpoint_that_goes_on(scene: Path, whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "stopped"
     overrides = words(scene, out, STEPS, "train.checkpoint_every_seconds=0")

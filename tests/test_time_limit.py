@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.systems import posix
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -16,6 +18,7 @@ def test_every_test_has_a_limit(pytestconfig: pytest.Config) -> None:
     assert 60 <= float(pytestconfig.getini("timeout")) <= 600
 
 
+@posix  # elsewhere the whole process ends with the test
 def test_a_hanging_test_fails_and_a_slow_one_may_go_on(tmp_path: Path) -> None:
     shutil.copy(ROOT / "tests" / "conftest.py", tmp_path)
     (tmp_path / "test_waiting.py").write_text(

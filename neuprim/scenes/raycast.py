@@ -1,7 +1,7 @@
 """Rays against the solids: what a ray meets first, and whether anything lies between two points.
 
-Embree does the work where its package ``embreex`` has a wheel; elsewhere (ARM) the compiled search of :mod:`.bvh` gives the same answers,
-about ten times slower. :attr:`Scene.engine` says which one runs.
+Embree does the work where its package ``embreex`` has a wheel; elsewhere (Linux and Windows on ARM) the compiled search of :mod:`.bvh`
+gives the same answers, about ten times slower. :attr:`Scene.engine` says which one runs.
 """
 
 from __future__ import annotations

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 
 import pytest
 
-from neuprim.core.io.files import publish_folder
+from neuprim.core.io.files import publish_folder, write_text
+from tests.systems import posix
 
 
 def write(folder: Path) -> None:
@@ -20,7 +23,8 @@ def complete(folder: Path) -> bool:
 def test_a_folder_is_written_once(tmp_path: Path) -> None:
     final = tmp_path / "below" / "data"
     publish_folder(final, write, complete)
-    assert [p.name for p in final.parent.iterdir()] == ["data"] and final.stat().st_mode & 0o777 == 0o755
+    assert [p.name for p in final.parent.iterdir()] == ["data"]
+    assert sys.platform == "win32" or final.stat().st_mode & 0o777 == 0o755
     (final / "a").write_text("kept")
     publish_folder(final, write, complete)
     assert (final / "a").read_text() == "kept"
@@ -54,3 +58,19 @@ def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         publish_folder(tmp_path / "data", fail, complete)
     assert list(tmp_path.iterdir()) == []
+
+
+@posix
+def test_what_is_flushed_may_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows refuses to flush a file that was opened for reading; asked here, where systems tell how a file was opened."""
+    import fcntl
+
+    flushed = []
+
+    def fsync(descriptor: int) -> None:
+        flushed.append(fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_ACCMODE)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write_text(tmp_path / "a", "content")
+    assert (tmp_path / "a").read_text() == "content"
+    assert flushed == [os.O_RDWR]

@@ -10,10 +10,12 @@ import pytest
 from neuprim.core.io.vdb import Grid, Tiles, read_grids, scale_transform, write_vdb
 from tests.core.openvdb_oracle import VARIABLE, ask, chosen, compare, other_python, reason
 from tests.core.vdb_bytes import random_grid
+from tests.systems import posix
 
 # ---------------------------------------------------------------- without OpenVDB
 
 
+@posix
 def test_a_python_without_the_module_is_a_reason_to_skip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     absent = reason(str(tmp_path / "python"))
     assert absent is not None and "does not run (FileNotFoundError)" in absent and VARIABLE in absent

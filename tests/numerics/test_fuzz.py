@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 
 import pytest
@@ -70,4 +69,6 @@ def test_twenty_thousand_wild_primitives() -> None:
 def test_a_million_wild_primitives() -> None:
     assert max(render_block(seed) for seed in range(500)) > 0.5
     if sys.platform == "linux":
+        import resource
+
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 4 * 2**20, "KiB"

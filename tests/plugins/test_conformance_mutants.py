@@ -317,7 +317,7 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("fields", "TaskSpec.fields['CosineDensity']", replace(TASK, fields={"SphericalHarmonics": SphericalHarmonics})),
     ("parameter_specs", "'means': found a name used twice", using(specs(name="means"))),
     ("parameter_specs", "'b2': lr: found 0", using(specs(lr=0))),
-    ("parameter_specs", "'b2': lr_unit: found 'metre'", using(specs(lr_unit="metre"))),
+    ("parameter_specs", "'b2': lr_unit: found metre", using(specs(lr_unit="metre"))),
     ("parameter_specs", "'b2': shape", using(specs(shape=(-1,)))),
     ("parameter_specs", "'b 2'", using(specs(name="b 2"))),
     ("initialisers", "density.parameters: 'W1': init: two draws with one seed", using(Lazy)),

@@ -16,6 +16,7 @@ from neuprim.cli import main
 from neuprim.conformance import CHECKS
 from neuprim.core.errors import ConfigError
 from neuprim.plugins.new_task import new_task
+from tests.systems import posix
 
 ROOT = Path(neuprim.__file__).parents[1]
 EXAMPLE = ROOT / "examples" / "neuprim-gaussian"
@@ -92,7 +93,7 @@ def test_a_taken_name_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("kind", ["folder", "file", "link"])
+@pytest.mark.parametrize("kind", ["folder", "file", pytest.param("link", marks=posix)])
 def test_nothing_that_exists_is_touched(kind: str, tmp_path: Path) -> None:
     target = tmp_path / "there"
     if kind == "folder":

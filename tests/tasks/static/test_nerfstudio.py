@@ -194,6 +194,12 @@ def test_ply_points(capture: Any, context: Any) -> None:
     assert load({"path": path}, context).initial_points(2, torch.Generator().manual_seed(0)).colors.tolist() == [[0.5] * 3] * 2
 
 
+def test_points_of_another_format_are_not_guessed_at(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture(ply_file_path="points.xyz")
+    (path / "points.xyz").write_text("1 2 3\n4 5 6\n")
+    scenes.refused(load, {"path": path}, context, "points.xyz", "'1 2 3'; expected a PLY file")
+
+
 def test_same_stems_in_different_folders_get_different_names(capture: Any, context: Any) -> None:
     path = capture(count=3)
     (path / "more").mkdir()

@@ -13,16 +13,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-import trimesh
-
 from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.common import missing_files, posed_images
+from neuprim.core.data.points_file import read_points
 from neuprim.core.data.records import Record, read_json
 from neuprim.core.data.settings import count, data_folder, flag, read_settings
 from neuprim.core.data.transforms import read_frames, split_frames
-from neuprim.core.errors import DataError
 from neuprim.core.task import SceneContext
 
 __all__ = ["load"]
@@ -49,20 +45,8 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
 
 def _read_points(folder: Path, document: Record) -> PointCloud:
-    """Points of ``ply_file_path``, in the frame of the poses; colours sRGB 0..1, mid-grey where the file has none."""
+    """Points of ``ply_file_path``, in the frame of the poses."""
     path = folder / document.text("ply_file_path")
     if not path.is_file():
         raise missing_files(f"{document.where}: ply_file_path", [str(path)])
-    try:
-        cloud: Any = trimesh.load(path, process=False)
-        points = np.asarray(cloud.vertices, dtype=np.float64).reshape(-1, 3)
-        raw = cloud.colors if isinstance(cloud, trimesh.PointCloud) else getattr(cloud.visual, "vertex_colors", None)
-        colors = None if raw is None else np.asarray(raw)
-    except Exception as error:  # trimesh raises many types for damaged files
-        raise DataError(f"{path}: not a readable PLY point file ({type(error).__name__}: {error})") from None
-    if len(points) == 0 or not np.isfinite(points).all():
-        raise DataError(f"{path}: has {len(points)} points or coordinates that are not finite; expected at least one finite point")
-    rgb = np.full((len(points), 3), 0.5)
-    if colors is not None and colors.shape[:1] == (len(points),) and colors.ndim == 2 and colors.shape[1] >= 3:
-        rgb = colors[:, :3] / 255.0
-    return PointCloud(torch.from_numpy(points).float(), torch.from_numpy(rgb).float())
+    return read_points(path, 3, "srgb")

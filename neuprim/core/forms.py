@@ -58,6 +58,7 @@ _TABLE: dict[type, dict[str, tuple[Shape, ...]]] = {
     Constant: {"rgb": (("N", "C"),)},
     RayNet: {"Wx": (("N", "H", 3),), "bias": (("N", "H"),), "base": (("N", "C"),), "Wout": (("N", "C", "H"),)},
 }
+_ANY = (0, sys.maxsize)
 _RANGES = {"K": (0, MOST_UNITS), "H": (0, MOST_UNITS), "C": (1, sys.maxsize)}
 _DTYPES = (torch.float32, torch.float64)
 _DENSITIES, _COLOURS = (Cosine, Opaque), (Constant, RayNet, OpaqueColour)
@@ -70,7 +71,7 @@ def tensor_fault(value: Any) -> str | None:
     """``"dtype torch.int64; expected torch.float32 or torch.float64"`` and the like of what no kernel can read."""
     if not isinstance(value, Tensor):
         return f"type {type(value).__name__}; expected a torch tensor"
-    if value.device.type != "cpu":
+    if not value.is_cpu:
         return f"device {value.device}; expected cpu, where both backends compute"
     if value.layout is not torch.strided or value.is_nested:
         return f"layout {'nested' if value.is_nested else value.layout}; expected a dense tensor"
@@ -97,8 +98,12 @@ def tensors_fault(tensors: Iterable[tuple[str, Any, tuple[Shape, ...]]], sizes: 
     """The first of (name, tensor, shapes that it may have) that does not fit; ``sizes`` gets what the others add."""
     for name, value, shapes in tensors:
         fault = tensor_fault(value)
-        if fault is None and not any(_fits(value.shape, shape, name, sizes) for shape in shapes):
-            fault = f"shape {tuple(value.shape)}; expected {_expected(shapes, sizes)}"
+        if fault is None:
+            for shape in shapes:
+                if _fits(value.shape, shape, name, sizes):
+                    break
+            else:
+                fault = f"shape {tuple(value.shape)}; expected {_expected(shapes, sizes)}"
         if fault is not None:
             return f"{name} has {fault}"
     return None
@@ -111,8 +116,7 @@ def misfit(form: Any, sizes: Sizes) -> str | None:
         form: one of the closed forms, or the ellipsoids.
         sizes: those known so far; gets the ones that this form adds.
     """
-    table = next((table for kind, table in _TABLE.items() if isinstance(form, kind)), {})
-    fault = tensors_fault(((name, getattr(form, name), shapes) for name, shapes in table.items()), sizes)
+    fault = tensors_fault([(name, getattr(form, name), shapes) for name, shapes in _table(form).items()], sizes)
     if fault is not None:
         return fault
     if isinstance(form, Cosine):
@@ -127,6 +131,13 @@ def misfit(form: Any, sizes: Sizes) -> str | None:
     return None
 
 
+def _table(form: Any) -> dict[str, tuple[Shape, ...]]:
+    for kind, table in _TABLE.items():
+        if isinstance(form, kind):
+            return table
+    return {}
+
+
 def _of(name: str, fault: str | None) -> str | None:
     return None if fault is None else f"{name} has {fault}"
 
@@ -134,19 +145,22 @@ def _of(name: str, fault: str | None) -> str | None:
 def _fits(found: torch.Size, shape: Shape, name: str, sizes: Sizes) -> bool:
     if len(found) != len(shape):
         return False
-    fresh: Sizes = {}
-    for size, want in zip(found, shape, strict=True):
-        if isinstance(want, str):
-            if want not in sizes:
-                low, high = _RANGES.get(want, (0, sys.maxsize))
-                if not low <= size <= high:
-                    return False
-                fresh[want] = (size, name)
-                continue
-            want = sizes[want][0]
-        if size != want:
-            return False
-    sizes.update(fresh)
+    fresh: Sizes | None = None
+    for size, want in zip(found, shape):  # noqa: B905 - equally long, and this runs for every tensor of every frame
+        if want.__class__ is not str:
+            if size != want:
+                return False
+        elif (known := sizes.get(want)) is not None:
+            if size != known[0]:
+                return False
+        else:
+            low, high = _RANGES.get(want, _ANY)
+            if not low <= size <= high:
+                return False
+            fresh = fresh or {}
+            fresh[want] = (size, name)
+    if fresh is not None:
+        sizes.update(fresh)
     return True
 
 
@@ -260,15 +274,15 @@ def check_rows(rows: Any, model: int | None, who: str, length: int | None = None
     found = None
     if not isinstance(rows, Tensor):
         found = f"type {type(rows).__name__}"
-    elif rows.device.type != "cpu" or rows.layout is not torch.strided or rows.dtype != torch.int64 or rows.dim() != 1:
+    elif not rows.is_cpu or rows.layout is not torch.strided or rows.dtype != torch.int64 or rows.dim() != 1:
         found = f"{rows.dtype} {tuple(rows.shape)} on {rows.device}"
     elif length is not None and len(rows) != length:
         found = f"{len(rows)} rows for {length} primitives"
     elif len(rows):
-        first, last = int(rows[0]), int(rows[-1])
-        if first < 0 or (model is not None and last >= model):
-            found = f"rows {first} to {last}"
-        elif not bool((rows[1:] > rows[:-1]).all()):
+        numbers = rows.numpy()  # whose overhead is a fraction of torch's
+        if numbers[0] < 0 or (model is not None and numbers[-1] >= model):
+            found = f"rows {numbers[0]} to {numbers[-1]}"
+        elif not (numbers[1:] > numbers[:-1]).all():
             found = f"rows that do not ascend, {rows[:8].tolist()}{' ...' if len(rows) > 8 else ''}"
     if found is not None:
         limit = "" if model is None else f" from 0 to {model - 1}"

@@ -71,7 +71,7 @@ def test_a_new_task_installs_trains_and_passes_its_tests(tmp_path: Path) -> None
     small = ["scene.size=16", "scene.train_views=4", "scene.test_views=1", "model.primitives=30", "renderer.backend=reference"]
     neuprim_command(["run", "task=wave", *small, "train.iterations=5", "output_dir=r"], tmp_path, site)
     assert (tmp_path / "r" / "report.html").is_file()
-    assert passed(shell([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"], folder, site)) == 26
+    assert passed(shell([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"], folder, site)) == 27
 
 
 @pytest.mark.parametrize("name", ["", "Wave", "3d", "a-b", "a b", "../x", "class", "wäve", "a" * 41])

@@ -22,9 +22,9 @@ import torch
 from kornia.metrics import ssim
 
 from neuprim.core.io.ply import read_ply, write_ply
+from neuprim.core.train.ssim_cpu import photometric_fused
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shapes import build
-from neuprim.core.train.ssim_cpu import photometric_fused
 
 GAUSSIAN = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45)), "opacity"]
 GAUSSIAN += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]

@@ -101,15 +101,15 @@ def check_rows(rows: Any, model: int | None, who: str, length: int | None = None
     found = None
     if not isinstance(rows, Tensor):
         found = f"type {type(rows).__name__}"
-    elif rows.device.type != "cpu" or rows.layout is not torch.strided or rows.dtype != torch.int64 or rows.dim() != 1:
+    elif not rows.is_cpu or rows.layout is not torch.strided or rows.dtype != torch.int64 or rows.dim() != 1:
         found = f"{rows.dtype} {tuple(rows.shape)} on {rows.device}"
     elif length is not None and len(rows) != length:
         found = f"{len(rows)} rows for {length} primitives"
     elif len(rows):
-        first, last = int(rows[0]), int(rows[-1])
-        if first < 0 or (model is not None and last >= model):
-            found = f"rows {first} to {last}"
-        elif not bool((rows[1:] > rows[:-1]).all()):
+        numbers = rows.numpy()  # whose overhead is a fraction of torch's
+        if numbers[0] < 0 or (model is not None and numbers[-1] >= model):
+            found = f"rows {numbers[0]} to {numbers[-1]}"
+        elif not (numbers[1:] > numbers[:-1]).all():
             found = f"rows that do not ascend, {rows[:8].tolist()}{' ...' if len(rows) > 8 else ''}"
     if found is not None:
         limit = "" if model is None else f" from 0 to {model - 1}"

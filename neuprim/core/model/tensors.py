@@ -35,6 +35,7 @@ Sizes = dict[str, tuple[int, str]]
 MOST_UNITS = 256
 """Most neurons of a density and units of a colour network: the fast kernels number a primitive's neurons in a byte."""
 
+_ANY = (0, sys.maxsize)
 _RANGES = {"K": (0, MOST_UNITS), "H": (0, MOST_UNITS), "C": (1, sys.maxsize)}
 _DTYPES = (torch.float32, torch.float64)
 
@@ -43,7 +44,7 @@ def tensor_fault(value: Any) -> str | None:
     """``"dtype torch.int64; expected torch.float32 or torch.float64"`` and the like of what no kernel can read."""
     if not isinstance(value, Tensor):
         return f"type {type(value).__name__}; expected a torch tensor"
-    if value.device.type != "cpu":
+    if not value.is_cpu:
         return f"device {value.device}; expected cpu, where both backends compute"
     if value.layout is not torch.strided or value.is_nested:
         return f"layout {'nested' if value.is_nested else value.layout}; expected a dense tensor"
@@ -70,8 +71,12 @@ def tensors_fault(tensors: Iterable[tuple[str, Any, tuple[Shape, ...]]], sizes: 
     """The first of (name, tensor, shapes that it may have) that does not fit; ``sizes`` gets what the others add."""
     for name, value, shapes in tensors:
         fault = tensor_fault(value)
-        if fault is None and not any(_fits(value.shape, shape, name, sizes) for shape in shapes):
-            fault = f"shape {tuple(value.shape)}; expected {_expected(shapes, sizes)}"
+        if fault is None:
+            for shape in shapes:
+                if _fits(value.shape, shape, name, sizes):
+                    break
+            else:
+                fault = f"shape {tuple(value.shape)}; expected {_expected(shapes, sizes)}"
         if fault is not None:
             return f"{name} has {fault}"
     return None
@@ -85,19 +90,22 @@ def labelled(name: str, fault: str | None) -> str | None:
 def _fits(found: torch.Size, shape: Shape, name: str, sizes: Sizes) -> bool:
     if len(found) != len(shape):
         return False
-    fresh: Sizes = {}
-    for size, want in zip(found, shape, strict=True):
-        if isinstance(want, str):
-            if want not in sizes:
-                low, high = _RANGES.get(want, (0, sys.maxsize))
-                if not low <= size <= high:
-                    return False
-                fresh[want] = (size, name)
-                continue
-            want = sizes[want][0]
-        if size != want:
-            return False
-    sizes.update(fresh)
+    fresh: Sizes | None = None
+    for size, want in zip(found, shape):  # noqa: B905 - equally long, and this runs for every tensor of every frame
+        if not isinstance(want, str):
+            if size != want:
+                return False
+        elif (known := sizes.get(want)) is not None:
+            if size != known[0]:
+                return False
+        else:
+            low, high = _RANGES.get(want, _ANY)
+            if not low <= size <= high:
+                return False
+            fresh = fresh or {}
+            fresh[want] = (size, name)
+    if fresh is not None:
+        sizes.update(fresh)
     return True
 
 
@@ -136,4 +144,4 @@ class Shaped:
         Args:
             sizes: those known so far; gets the ones that this form adds.
         """
-        return tensors_fault(((name, getattr(self, name), shapes) for name, shapes in self.shapes.items()), sizes)
+        return tensors_fault([(name, getattr(self, name), shapes) for name, shapes in self.shapes.items()], sizes)

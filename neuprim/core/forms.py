@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import FormError
-from neuprim.core.fields import MOST_UNITS, Constant, Cosine, DensityField, Field, Opaque, OpaqueColour, RayNet, Shading
+from neuprim.core.fields import MOST_UNITS, ColourField, Constant, Cosine, DensityField, Field, Opaque, OpaqueColour, RayNet, Shading
 from neuprim.core.geometry import Geometry
 from neuprim.core.schema import InitContext, ParameterSpec
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Shape",
     "Sizes",
+    "check_channels",
     "check_colour",
     "check_density",
     "check_geometry",
@@ -245,6 +246,12 @@ def check_lowered(lowered: Lowered, viewmat: Any = None, background: Any = None)
         check_shape("background", background, (channels,), f", as {lowered.source('colour')} has C={channels}")
     if viewmat is not None:
         check_shape("viewmat", viewmat, (4, 4))
+
+
+def check_channels(found: int, colour: ColourField) -> None:
+    """Raise :class:`FormError` unless a lowered colour has as many channels as its field says, which are the data set's."""
+    if found != colour.channels:
+        raise FormError(f"{method(colour, 'lower')} returned {found} channels; expected {colour.channels}, as its member channels says")
 
 
 def check_shape(name: str, value: Any, shape: tuple[int, ...], why: str = "") -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -74,8 +75,13 @@ def check_loss(t: Subject) -> None:
     value.backward()
     fine = off.grad is not None and bool(torch.isfinite(off.grad).all()) and float(off.grad.abs().max()) > 0
     t.require(fine, "gradient of the loss", "none, zero, NaN or infinity", "a finite one")
-    for name, part in parts.items():
-        t.require(isinstance(part, float) and math.isfinite(part), f"loss part {name!r}", repr(part), "a finite float")
+    for name, number in parts.items():
+        t.require(isinstance(number, float) and math.isfinite(number), f"loss part {name!r}", repr(number), "a finite float")
+    mask = torch.zeros(truth.shape[:2], dtype=torch.bool)
+    mask[: max(1, len(mask) // 2)] = True
+    masked = torch.where(mask[..., None], off.detach(), truth).requires_grad_()
+    part = loss(masked, truth, replace(frame, mask=mask))[0].item()
+    t.require(math.isfinite(part), "loss of a frame with a mask", part, "a finite number")
     least = loss(truth.clone().requires_grad_(), truth, frame)[0].item()
     t.require(least < value.item(), "loss of the truth itself", f"{least:g}", f"less than {value.item():g}, that of a wrong image")
 

@@ -175,13 +175,14 @@ def export_frames(specs: Sequence[ConditionSpec], texts: Mapping[str, str], seve
     """
     for spec in specs:
         if spec.name not in texts:
-            raise ConfigError(f"{spec.name}=: required, as the model depends on it ({spec.unit}); for example {spec.name}={_example(spec)}")
+            what = f"{flag(spec.name)}: required, as the model depends on it ({spec.unit})"
+            raise ConfigError(f"{what}; for example {flag(spec.name)} {_example(spec)}")
     found = read_conditions(specs, texts)
     counts = {name: len(values) for name, values in found.items() if len(values) > 1}
     if counts and (not several or len(set(counts.values())) > 1):
         name = next(iter(counts))
         expected = "one value" if not several else "as many values for each"
-        raise ConfigError(f"{name}={texts[name]}: {counts[name]} values; expected {expected}")
+        raise ConfigError(f"{flag(name)} {texts[name]}: {counts[name]} values; expected {expected}")
     frames = max(counts.values(), default=1)
     return [{name: values[i if len(values) > 1 else 0] for name, values in found.items()} for i in range(frames)]
 

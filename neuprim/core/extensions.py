@@ -92,19 +92,21 @@ class ExportJob:
         Raises:
             ConfigError: it is something else.
         """
-        value = self.options[name]
-        if value is None:
-            return None
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not (math.isfinite(value) and low <= value <= high):
-            raise ConfigError(f"{name}={value}: expected a number from {low:g} to {high:g}")
-        return float(value)
+        return self._number(name, low, high, f"a number from {low:g} to {high:g}")
 
     def count(self, name: str, low: int, high: int) -> int | None:
         """As :meth:`number`, a whole one."""
-        value = self.number(name, low, high)
-        if value is not None and not value.is_integer():
-            raise ConfigError(f"{name}={value}: expected a whole number from {low} to {high}")
+        value = self._number(name, low, high, f"a whole number from {low} to {high}", whole=True)
         return None if value is None else int(value)
+
+    def _number(self, name: str, low: float, high: float, expected: str, whole: bool = False) -> float | None:
+        value = self.options[name]
+        if value is None:
+            return None
+        number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        if not number or not low <= value <= high or (whole and not float(value).is_integer()):
+            raise ConfigError(f"{name}={value}: expected {expected}")
+        return float(value)
 
     def choice(self, name: str, *offered: str) -> str:
         """An option that is one of those offered; raises as :meth:`number`."""

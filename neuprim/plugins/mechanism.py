@@ -196,7 +196,7 @@ class Group(Generic[T]):
         return f"{self.typed.format(word)}: no such {self.kind}{of}{hint}{not_installed_yet(self.entry_points, name, package)}"
 
     def _note(self, info: PluginInfo, same: Sequence[PluginInfo]) -> str | None:
-        others = [other for other in same if other is not info]
+        others = [other for other in same if other != info]
         if info.built_in or not others:
             return None
         if any(other.built_in for other in others):

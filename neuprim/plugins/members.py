@@ -78,6 +78,8 @@ def _exporter(spec: Exporter) -> str | None:
     suffixes = spec.suffixes
     if not isinstance(suffixes, tuple | list) or not all(isinstance(s, str) and s.startswith(".") and s == s.lower() for s in suffixes):
         return f"suffixes is {suffixes!r}; expected a tuple of such as '.json', in lower case"
+    if spec.default and suffixes and not spec.default.lower().endswith(tuple(suffixes)):
+        return f"default is {spec.default!r}; expected a name that ends in {' or '.join(suffixes)}, its suffixes"
     return None
 
 

@@ -71,7 +71,7 @@ def _destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
         return run_dir / "export" / (exporter.default or exporter.name + "".join(exporter.suffixes[:1]))
     fits = any(out.name.lower().endswith(suffix) and len(out.name) > len(suffix) for suffix in exporter.suffixes)
     if exporter.suffixes and (not fits or out.is_dir()):
-        raise ConfigError(f"--out {out}: expected a file name with {' or '.join(exporter.suffixes)}")
+        raise ConfigError(f"--out {out}: expected a file name that ends in {' or '.join(exporter.suffixes)}")
     return out
 
 

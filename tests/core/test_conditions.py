@@ -178,15 +178,15 @@ def test_an_export_has_every_condition_in_each_frame() -> None:
     assert [(float(f["wavelength_shift"]), f["sun"].tolist()) for f in frames] == [(0.0, [1, 2, 0]), (1.0, [1, 2, 0])]
     assert export_frames((), {}) == [{}]
     for texts, several, expected in (
-        ({"wavelength_shift": "0,1", "sun": "0,0,0"}, False, "wavelength_shift=0,1: 2 values; expected one value"),
+        ({"wavelength_shift": "0,1", "sun": "0,0,0"}, False, "--wavelength-shift 0,1: 2 values; expected one value"),
         ({"wavelength_shift": "0:1:3", "sun": "1,2,0;0,0,0"}, True, "3 values; expected as many values for each"),
-        ({"wavelength_shift": "0"}, True, r"sun=: required, as the model depends on it \(m\); for example sun=1,1,1"),
+        ({"wavelength_shift": "0"}, True, r"--sun: required, as the model depends on it \(m\); for example --sun 1,1,1"),
     ):
         with pytest.raises(ConfigError, match=expected):
             export_frames(SPECS, texts, several)
 
 
 def test_the_example_is_within_the_range() -> None:
-    for ends, expected in (((0.0, 1.0), "x=0.5"), ((400.0, 700.0), "x=550")):
+    for ends, expected in (((0.0, 1.0), "--x 0.5"), ((400.0, 700.0), "--x 550")):
         with pytest.raises(ConfigError, match=f"for example {expected}$"):
             export_frames([ConditionSpec("x", (), "nm", ends, number)], {})

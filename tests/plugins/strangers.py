@@ -11,53 +11,12 @@ import torch
 
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
-from neuprim.plugins.new_task import new_task
 from neuprim.plugins.registry import EXPORTERS, INSPECTORS, TASKS, Group
 from tests.plugins import marked
 from tests.plugins.fakes import install, site
+from tests.plugins.spectral import install_spectral
 
 __all__ = ["add", "run_dir", "site"]
-
-TASK = """
-from dataclasses import replace
-
-import torch
-
-from neuprim.core.errors import ConfigError
-from neuprim.core.model.fields import ColourField, ConditionSpec, Constant
-from neuprim.core.model.schema import ParameterSpec
-from neuprim_spectral import TASK as PLAIN
-from neuprim_spectral.fields import WaveDensity
-
-
-class Shifted(ColourField):
-    channels = 3
-
-    def settings(self):
-        return {}
-
-    def parameters(self):
-        return [ParameterSpec("logit", (3,), 5e-2, lambda c: c.colors.logit(eps=0.02), group="colour")]
-
-    def lower(self, params, geometry, camera, conditions):
-        return Constant(conditions["wavelength_shift"].to(params["logit"]) * params["logit"].sigmoid())
-
-
-def parse(text):
-    try:
-        return [torch.tensor(float(text))]
-    except ValueError:
-        raise ConfigError(f"--wavelength-shift {text}: expected a number from 0 to 1") from None
-
-
-SHIFT = ConditionSpec("wavelength_shift", (), "of the spectrum", (0.0, 1.0), parse, strict=STRICT)
-TASK = replace(
-    PLAIN,
-    conditions=(SHIFT,),
-    build=lambda model, dataset: (WaveDensity(), Shifted()),
-    fields={"WaveDensity": WaveDensity, "Shifted": Shifted},
-)
-"""
 
 EXPORTER = '''
 import json
@@ -92,25 +51,15 @@ def add(site: Path, kind: str, source: str) -> None:
 
 
 def spectral(site: Path, strict: bool = False) -> Path:
-    """The task ``spectral``, which depends on a ``wavelength_shift``, made of what ``neuprim new-task`` writes, and a run of it."""
-    made = site.parent / "neuprim-spectral"
-    new_task("spectral", made)
-    (made / "neuprim_spectral").rename(site / "neuprim_spectral")
-    install(
-        site,
-        "neuprim-spectral",
-        {"spectral": "shifted:TASK"},
-        {"shifted.py": TASK.replace("STRICT", str(strict))},
-        group=TASKS.entry_points,
-    )
-    importlib.invalidate_caches()
+    """The task ``spectral``, which depends on a ``wavelength_shift``, and a run of it; ``strict`` as its condition is."""
+    install_spectral(site, {"bands": ("strict=True", f"strict={strict}")})
     fields = TASKS.load("spectral").fields
     assert fields is not None
-    generator = torch.Generator().manual_seed(3)
-    context = InitContext(marked.PLACES, marked.RADII, marked.COLOURS, generator)
-    model = Primitives.initialise(fields["WaveDensity"](), fields["Shifted"](), context)  # type: ignore[arg-type]
+    colours = torch.cat([marked.COLOURS, marked.COLOURS[:, :2]], 1)
+    context = InitContext(marked.PLACES, marked.RADII, colours, torch.Generator().manual_seed(3))
+    model = Primitives.initialise(fields["TwoScales"](), fields["ShiftedSpectrum"](), context)  # type: ignore[arg-type]
     words = ["task=spectral", "scene.size=16", "scene.train_views=4", "scene.test_views=2"]
-    return marked.write_run(site.parent / "run", model, words)
+    return marked.write_run(site.parent / "run", model, words, background=[0.0] * 5, color_space="linear")
 
 
 @pytest.fixture

@@ -150,7 +150,7 @@ def test_nearer_gaussians_hide_farther_ones() -> None:
 
 def test_a_dynamic_model_needs_a_time_and_colours_follow_it(tmp_path: Path) -> None:
     run = marked.dynamic_run(tmp_path / "run", marked.write_sequence(tmp_path / "files"))
-    with pytest.raises(ConfigError, match=r"time=: required.*time=0.5"):
+    with pytest.raises(ConfigError, match=r"--time: required.*--time 0.5"):
         export_run(run, "gaussian-ply", tmp_path / "g.ply")
     with pytest.raises(ConfigError, match="expected one value"):
         export_run(run, "gaussian-ply", tmp_path / "g.ply", ["time=0:1:3"])
@@ -172,7 +172,7 @@ def test_a_relit_model_takes_a_light_and_fits_its_colours(tmp_path: Path) -> Non
     model = Primitives.initialise(CosineDensity(2), colour, context)  # type: ignore[arg-type]
     model.params["net_out"] *= 2
     run = marked.write_run(tmp_path / "run", model, ["task=relight", "scene=lit_solids"])
-    with pytest.raises(ConfigError, match="light=: required"):
+    with pytest.raises(ConfigError, match="--light: required"):
         export_run(run, "gaussian-ply", tmp_path / "g.ply")
     report = export_run(run, "gaussian-ply", tmp_path / "g.ply", ["light=1,2,3", "light_intensity=1,1,1"])
     assert any("no harmonics" in note for note in report.notes) and report.errors["psnr"] > 20

@@ -89,7 +89,7 @@ def test_a_dynamic_model_is_cut_at_a_time(tmp_path: Path) -> None:
     import trimesh
 
     run = marked.dynamic_run(tmp_path / "run", marked.write_sequence(tmp_path / "files"))
-    with pytest.raises(ConfigError, match="time=: required"):
+    with pytest.raises(ConfigError, match="--time: required"):
         export_run(run, "mesh", tmp_path / "m.ply")
     early, late = (
         trimesh.load(export_run(run, "mesh", tmp_path / f"{t}.ply", [f"time={t}", "grid=48", "level=1.5"]).files[0], process=False)

@@ -131,7 +131,7 @@ def test_without_the_files_the_header_still_places_it(tmp_path: Path) -> None:
         one, two = read_grid(a, "density"), read_grid(b, "density")
         assert np.array_equal(one.transform, two.transform) and np.array_equal(one.to_dense(), two.to_dense())
     bare = marked.dynamic_run(tmp_path / "c", files)
-    with pytest.raises(ConfigError, match="time=: required"):
+    with pytest.raises(ConfigError, match="--time: required"):
         export_run(bare, "vdb", tmp_path / "bare")
     assert export_run(bare, "vdb", tmp_path / "bare", ["time=0.5"]).errors == {}
 

@@ -375,5 +375,5 @@ def test_an_entry_point_that_an_editable_installation_lacks(site: Path, tmp_path
 def test_a_damaged_source_is_no_hint(text: str, site: Path, tmp_path: Path) -> None:
     editable(site, tmp_path / "source", text)
     (install_groups(site, "odd", {}, {}) / "direct_url.json").write_text("[]")
-    with pytest.raises(ConfigError, match=r"train.loss=glow: no such loss; valid: photometric$"):
+    with pytest.raises(ConfigError, match=r"train.loss=glow: no such loss; valid: compressed, l1, photometric, relative$"):
         LOSSES.load("glow")

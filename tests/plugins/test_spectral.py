@@ -6,7 +6,6 @@ import base64
 import io
 import json
 import re
-import sys
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,17 +30,16 @@ from neuprim.core.model.colours import sh
 from neuprim.core.render import render
 from neuprim.plugins.export import appearance, mesh
 from neuprim.plugins.registry import load_task
-from neuprim.runs.draw import FORMATS, render_run
+from neuprim.runs.draw import FORMATS, evaluate_run, load_dataset, load_run, read_metrics, render_run
 from neuprim.runs.export import export_run, import_run
 from neuprim.runs.inspect import Request, inspect_run
-from neuprim.runs.measure import evaluate_run
-from neuprim.runs.open import load_dataset, load_run, read_metrics
 from tests.plugins.fakes import site
-from tests.plugins.spectral import NAMES, fit, install_spectral
+from tests.plugins.spectral import NAMES, fit, forget, install_spectral
 
 __all__ = ["site"]
 
-SHOWN = "450nm, 550 nm, 650nm of 5 channels as red, green, blue"
+SHOWN = "450nm, 550nm, 650nm of 5 channels as red, green, blue"
+SHIFT = {"wavelength_shift": "0"}
 THROUGH = ", ".join(NAMES) + " through the display of task 'spectral'"
 
 
@@ -64,15 +62,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         forget()
 
 
-def forget() -> None:
-    """The package that was imported, so that another one of its name can be."""
-    for name in [n for n in sys.modules if n.partition(".")[0] == "spectraltask"]:
-        del sys.modules[name]
-
-
 def changed(site: Path, tmp_path: Path, *words: str, **changes: str) -> tuple[Path, str]:
     """A run of a task with other lines in its TaskSpec, and what the console said."""
-    forget()
     install_spectral(site, **changes)
     console = Console(file=io.StringIO(), width=200)
     with RunProgress(console, "spectral") as events:
@@ -120,7 +111,7 @@ def test_metrics_and_report_name_the_channels(trained: Path) -> None:
     assert found["ssim_display"] > 0.3
     page = (trained / "report.html").read_text()
     assert page.count(f"hown: {THROUGH.replace(chr(39), '&#x27;')}") == 2, "at the orbit and at the held-out views"
-    assert "<dt>channels</dt><dd>450nm, 550 nm, 650nm, NIR, SWIR.1</dd>" in page
+    assert "<dt>channels</dt><dd>450nm, 550nm, 650nm, 750nm, 850nm</dd>" in page
     assert "mean absolute difference over all channels" in page
     again = evaluate_run(trained)
     assert {k: again[k] for k in ("psnr", "ssim", "psnr_display", "channels", "shown")} == {k: found[k] for k in ("psnr", "ssim", "psnr_display", "channels", "shown")}  # fmt: skip
@@ -144,11 +135,10 @@ def test_rendering_needs_no_data_for_the_names(trained: Path, tmp_path: Path, mo
         raise DataError("the data are gone")
 
     monkeypatch.setattr("neuprim.runs.draw.load_dataset", gone)
-    monkeypatch.setattr("neuprim.config.stored.find_scene", gone)
     pose = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0.5], [0, 0, 0, 1]]
     (tmp_path / "cameras.json").write_text(json.dumps({"w": 20, "h": 16, "camera_angle_x": 0.7, "frames": [{"transform_matrix": pose}]}))
-    (exr,) = render_run(trained, str(tmp_path / "cameras.json"), None, "exr", tmp_path / "exr", 1, {})
-    (png,) = render_run(trained, str(tmp_path / "cameras.json"), None, "png", tmp_path / "png", 1, {})
+    (exr,) = render_run(trained, str(tmp_path / "cameras.json"), None, "exr", tmp_path / "exr", 1, SHIFT)
+    (png,) = render_run(trained, str(tmp_path / "cameras.json"), None, "png", tmp_path / "png", 1, SHIFT)
     display = load_task("spectral").display
     assert display is not None
     shown = display(images.read_image(exr, (20, 16), NAMES))
@@ -171,7 +161,8 @@ def test_the_inspectors_page_has_the_displays_colours(trained: Path, tmp_path: P
     found = np.frombuffer(zlib.decompress(base64.b64decode(data["frames"][0]["prims"])), "<f4").reshape(-1, 15)[:, 12:]
     _, task, model, _ = load_run(trained)
     assert task.display is not None
-    raw = (0.5 + 0.28209479177387814 * model.params["sh_dc"]).clamp_min(0)
+    values = model.params["logit"].sigmoid()
+    raw = (values[:, :-1] + values[:, 1:]) / 2  # as a shift of 0.5 has it
     wanted = task.display(raw[None])[0].detach().numpy()
     assert len(found) and all(np.abs(wanted - row).max(1).min() < 1e-5 for row in found)
     assert not any(line.startswith("shown") for line in said)
@@ -185,10 +176,10 @@ def test_a_meshs_colours_go_through_the_display(trained: Path, tmp_path: Path, s
     colour = torch.tensor([0.1, 0.2, 0.3, 0.6, 0.8])
     header, tensors = checkpoint.read(trained / "model.safetensors", "model")
     (tmp_path / "config.yaml").write_text((trained / "config.yaml").read_text())
-    painted = {**tensors, "sh_dc": sh.initial_dc(colour.expand(len(tensors["sh_dc"]), 5))}
+    painted = {**tensors, "logit": torch.cat([colour, colour[:1]]).logit().expand(len(tensors["logit"]), 6).contiguous()}
     rest = {k: v for k, v in header.items() if k not in ("format", "kind")}
     checkpoint.write(tmp_path / "model.safetensors", "model", painted, rest)
-    report = export_run(tmp_path, "mesh", tmp_path / f"m.{suffix}", ["grid=32"])
+    report = export_run(tmp_path, "mesh", tmp_path / f"m.{suffix}", ["grid=32", "wavelength_shift=0"])
     assert f"colours: {THROUGH}" in report.notes
     ball = trimesh.load(report.files[0], force="mesh", process=False)
     display = load_task("spectral").display
@@ -210,7 +201,7 @@ def test_whole_models_keep_every_channel(trained: Path, tmp_path: Path) -> None:
 def test_gaussians_of_five_channels_are_refused_before_any_is_fitted(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("neuprim.plugins.export.gaussian_ply.harmonics_of", lambda *a: pytest.fail("too late"))
     with pytest.raises(ConfigError, match=r"5 channels, 450nm, .*; this format has red, green and blue; --format ply and npz hold all"):
-        export_run(trained, "gaussian-ply")
+        export_run(trained, "gaussian-ply", words=["wavelength_shift=0"])
 
 
 def test_a_damaged_header_is_the_files_fault(trained: Path, tmp_path: Path) -> None:
@@ -242,13 +233,13 @@ def test_without_a_display_it_is_said_what_is_shown(site: Path, tmp_path: Path, 
     assert f"shown: {SHOWN}" in lines
     monkeypatch.setattr(mesh, "_sample", lambda *a: pytest.fail("too late"))
     with pytest.raises(ConfigError, match=r"5 channels, .* and task 'spectral' has no display that makes these"):
-        export_run(out, "mesh")
+        export_run(out, "mesh", words=["wavelength_shift=0"])
 
 
 @pytest.mark.parametrize("count", [1, 2, 31])
 @pytest.mark.parametrize("space", ["linear", "srgb"])
 def test_any_number_of_channels_runs_and_is_written(site: Path, tmp_path: Path, count: int, space: str) -> None:
-    words = (f"scene.channels={count}", f"scene.space={space}", "train.iterations=5")
+    words = (f"scene.bands={count}", f"scene.space={space}", "train.iterations=5")
     out, said = changed(site, tmp_path, *words, display="None", channels="()")
     names = ("Y",) if count == 1 else tuple(f"c{i}" for i in range(count))
     found = read_metrics(out)
@@ -265,26 +256,26 @@ def test_a_grey_model_is_exported_as_grey(site: Path, tmp_path: Path) -> None:
     pytest.importorskip("pyvista", exc_type=ImportError)
     import trimesh
 
-    out, _ = changed(site, tmp_path, "scene.channels=1", display="None", channels="()")
-    report = export_run(out, "gaussian-ply", tmp_path / "g.ply", ["views=orbit"])
+    out, _ = changed(site, tmp_path, "scene.bands=1", display="None", channels="()")
+    report = export_run(out, "gaussian-ply", tmp_path / "g.ply", ["views=orbit", "wavelength_shift=0"])
     assert report.errors["psnr"] > 15
     rows = trimesh.load(tmp_path / "g.ply").metadata["_ply_raw"]["vertex"]["data"]
     assert np.array_equal(rows["f_dc_0"], rows["f_dc_2"]) and np.array_equal(rows["f_rest_0"], rows["f_rest_15"])
     assert rows["f_dc_0"].std() > 0
-    ball = trimesh.load(export_run(out, "mesh", tmp_path / "m.ply", ["grid=32"]).files[0], process=False)
+    ball = trimesh.load(export_run(out, "mesh", tmp_path / "m.ply", ["grid=32", "wavelength_shift=0"]).files[0], process=False)
     colours = np.asarray(ball.visual.vertex_colors)[:, :3]
     assert (colours == colours[:, :1]).all() and colours.std() > 0
 
 
 def test_red_green_and_blue_among_others_are_exported_by_name(site: Path, tmp_path: Path) -> None:
-    out, _ = changed(site, tmp_path, "scene.channels=4", display="None", channels="('NIR', 'B', 'G', 'R')")
-    report = export_run(out, "gaussian-ply", tmp_path / "g.ply", ["views=orbit"])
+    out, _ = changed(site, tmp_path, "scene.bands=4", display="None", channels="('NIR', 'B', 'G', 'R')")
+    report = export_run(out, "gaussian-ply", tmp_path / "g.ply", ["views=orbit", "wavelength_shift=0"])
     assert "colours: R, G, B of 4 channels as red, green, blue" in report.notes and report.errors["psnr"] > 15
     _, tensors = checkpoint.read(out / "model.safetensors", "model")
     data = (tmp_path / "g.ply").read_bytes()
     body = np.frombuffer(data[data.index(b"end_header\n") + 11 :], "<f4").reshape(-1, 62)
-    sets = {tuple(row) for row in tensors["sh_dc"][:, [3, 2, 1]].tolist()}
-    assert {tuple(row) for row in body[:, 6:9].tolist()} <= sets
+    own = sh.initial_dc(torch.from_numpy(np.array(tensors["logit"])).sigmoid()[:, [3, 2, 1]]).numpy()
+    assert len(body) and all(np.abs(own - row).max(1).min() < 1e-4 for row in body[:, 6:9])
 
 
 # ---------------------------------------------------------------- refused before training
@@ -293,11 +284,11 @@ def test_red_green_and_blue_among_others_are_exported_by_name(site: Path, tmp_pa
 @pytest.mark.parametrize(
     ("words", "changes", "text"),
     [
-        (("scene.channels=4",), {}, "spectral ball: 4 channels; expected 5, which task 'spectral' names: 450nm, 550 nm"),
+        (("scene.bands=4",), {}, "ball: 4 channels; expected 5, which task 'spectral' names: 450nm, 550nm"),
         (
             (),
-            {"build": "lambda m, d: (CosineDensity(2), SphericalHarmonics(0))"},
-            "task 'spectral' built a colour of 3 channels; expected 5, as in spectral ball",
+            {"build": "lambda m, d: (TwoScales(), ShiftedSpectrum(3))"},
+            "build of task 'spectral' of neuprim-spectral 0.1: the colour has channels=3; expected 5, as data set 'ball' has",
         ),
     ],
 )
@@ -318,7 +309,6 @@ def test_contradictions_end_before_training(site: Path, tmp_path: Path, words: t
     ],
 )
 def test_a_task_that_says_nonsense_is_refused(site: Path, changes: dict[str, str], text: str) -> None:
-    forget()
     install_spectral(site, **changes)
     with pytest.raises(NeuprimError, match=re.escape(text)):
         load_task("spectral")

@@ -138,6 +138,12 @@ def _view(view: View, where: str, conditions: Sequence[ConditionSpec]) -> None:
         if not isinstance(value, Tensor) or tuple(value.shape) != shape:
             _refuse(f"{where}: condition {spec.name!r}", value, torch.float32, shape)
         _finite(value, f"{where}: condition {spec.name!r}")
+        low, high = torch.tensor(spec.range, dtype=value.dtype if value.is_floating_point() else torch.float64)
+        outside = (value < low) | (value > high)
+        if spec.strict and bool(outside.any()):
+            raise DatasetFault(
+                f"{where}: condition {spec.name!r} holds {float(value[outside].flatten()[0]):g}; expected {low:g} to {high:g}, its range"
+            )
 
 
 def _camera(camera: AnyCamera, where: str) -> None:

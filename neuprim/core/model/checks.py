@@ -17,12 +17,13 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import FormError
-from neuprim.core.model.fields import Constant, Cosine, DensityField, Field, Opaque, OpaqueColour, RayNet, Shading
+from neuprim.core.model.fields import ColourField, Constant, Cosine, DensityField, Field, Opaque, OpaqueColour, RayNet, Shading
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec
 from neuprim.core.model.tensors import Shaped, Sizes, tensor_fault
 
 __all__ = [
+    "check_channels",
     "check_colour",
     "check_density",
     "check_geometry",
@@ -85,6 +86,12 @@ def _check_form(kind: str, form: Any, kinds: tuple[type[Shaped], ...], sizes: Si
     fault = form.fault(sizes)
     if fault is not None:
         raise FormError(f"{source(kind, field)} lowered to {type(form).__name__}: {fault}")
+
+
+def check_channels(found: int, colour: ColourField) -> None:
+    """Raise :class:`FormError` unless a lowered colour has as many channels as its field says, which are the data set's."""
+    if found != colour.channels:
+        raise FormError(f"{method(colour, 'lower')} returned {found} channels; expected {colour.channels}, as its member channels says")
 
 
 def check_shape(name: str, value: Any, shape: tuple[int, ...], why: str = "") -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.errors import FormError, NonFiniteError
 from neuprim.core.model.checks import (
+    check_channels,
     check_colour,
     check_density,
     check_geometry,
@@ -178,11 +179,12 @@ class Primitives:
         geometry = living.geometry
         names = (type(self.density).__name__, type(self.colour).__name__)
         sizes = check_geometry(geometry, "geometry")
-        density = self.density.lower(living.own, geometry, conditions)
+        density = self._lower_density(living, conditions)
         check_density(density, sizes, names[0])  # before the colour looks at it, which may draw it
         tint = {s.name: living.params[s.name] for s in self.colour.parameters()}
         colour = self.colour.lower(tint, geometry, camera, conditions)
         check_colour(colour, sizes, names[1])
+        check_channels(sizes["C"][0], self.colour)
         found = self.colour.shade(geometry, density, conditions, settings or RenderSettings())
         shading = check_shading(found, geometry.count, method(self.colour, "shade"))
         if shading.primitives is not None:
@@ -192,9 +194,15 @@ class Primitives:
     def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:
         """Where the primitives that live in a frame are, and their density; no camera needed."""
         living = self.living(conditions)
-        density = self.density.lower(living.own, living.geometry, conditions)
+        density = self._lower_density(living, conditions)
         check_density(density, check_geometry(living.geometry, "geometry"), type(self.density).__name__)
         return living.geometry, density
+
+    def _lower_density(self, living: Living, conditions: Conditions) -> LoweredDensity:
+        try:
+            return self.density.lower(living.own, living.geometry, conditions)
+        except FormError as error:  # of a sum of forms, which knows no field
+            raise FormError(f"{method(self.density, 'lower')}: {error}") from error
 
     def living(self, conditions: Conditions, dtype: torch.dtype | None = None) -> Living:
         """Which primitives live in a frame, and where; differentiable. With ``dtype``, everything is detached and of that type."""

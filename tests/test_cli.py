@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import neuprim
+from neuprim import runs
 from neuprim.cli import _print_metrics, main
 from neuprim.config import RunConfig
 from neuprim.core.environment import EnvironmentFile
@@ -38,12 +39,13 @@ def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         made.append(args if environment is None else (*args, environment))
         return [Path("a.png"), Path("b.png")]
 
-    for name, functions in (("run", {"run": run}), ("evaluate", {"evaluate_run": evaluate_run, "render_run": render_run})):
-        module = types.ModuleType(f"neuprim.{name}")
+    homes = (("run", {"run": run}), ("measure", {"evaluate_run": evaluate_run}), ("draw", {"render_run": render_run}))
+    for name, functions in homes:
+        module = types.ModuleType(f"neuprim.runs.{name}")
         for key, function in functions.items():
             setattr(module, key, function)
-        monkeypatch.setitem(sys.modules, f"neuprim.{name}", module)
-        monkeypatch.setattr(neuprim, name, module, raising=False)
+        monkeypatch.setitem(sys.modules, f"neuprim.runs.{name}", module)
+        monkeypatch.setattr(runs, name, module, raising=False)
     return made
 
 

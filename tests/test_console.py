@@ -14,6 +14,7 @@ import neuprim
 from neuprim.cli.console import plain_console
 from neuprim.cli.progress import DrawProgress, RunProgress
 from neuprim.core.train.trainer import StepReport
+from neuprim.runs.events import Finishing, Note, Preparing, Step
 
 ODD = "pip install 'neuprim[video]' [bold]loud[/bold] [/] :smile: C:dir:x"
 """Markup that would vanish, a closing tag that would raise, an emoji's name."""
@@ -29,9 +30,10 @@ def written(console: Console) -> str:
 
 def while_running(console: Console) -> None:
     with RunProgress(console, ODD) as progress:
-        progress.preparing(ODD, 0.5)
-        progress.step(StepReport(1, 0.1, 0.5, {}, 20.0, 10, "view", None), 0.5)
-        progress.finishing(ODD)
+        progress(Preparing(ODD, 0.5))
+        progress(Step(StepReport(1, 0.1, 0.5, {}, 20.0, 10, "view", None), 0.5))
+        progress(Finishing(ODD))
+        progress(Note(ODD))
 
 
 def while_drawing(console: Console) -> None:
@@ -67,4 +69,4 @@ def test_every_console_is_a_plain_one() -> None:
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
         if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] == "Console"
     ]
-    assert [place.partition(":")[0] for place in made] == ["console.py"], made
+    assert [place.partition(":")[0] for place in made] == ["cli/console.py"], made

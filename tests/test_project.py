@@ -43,7 +43,7 @@ def constraints() -> dict[str, str]:
 
 def test_the_version_is_written_once() -> None:
     assert "version" not in PROJECT["project"] and PROJECT["project"]["dynamic"] == ["version"]
-    assert PROJECT["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "neuprim.__version__"}
+    assert PROJECT["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "neuprim.version.__version__"}
     assert metadata.version("neuprim") == neuprim.__version__
     assert re.search(r"^## (\S+)", text("CHANGELOG.md"), re.MULTILINE)[1] == neuprim.__version__  # type: ignore[index]
 

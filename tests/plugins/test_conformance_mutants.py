@@ -191,7 +191,7 @@ def at_most_three(model: Mapping[str, Any], dataset: Any) -> Any:
 def three_only(settings: Mapping[str, Any]) -> Any:
     """A weight per colour of RGB."""
     weights = torch.tensor([0.2, 0.7, 0.1])
-    return lambda rendered, truth: (((rendered - truth).abs() * weights).mean(), {})
+    return lambda rendered, truth, frame: (((rendered - truth).abs() * weights).mean(), {})
 
 
 class Uphill(SphericalHarmonics):
@@ -343,8 +343,8 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
         "density.lower: W1: found torch.float32; expected torch.float64",
         using(lowers(lambda f, g: replace(f, W1=f.W1.float()))),
     ),
-    ("lowered_forms", "colour.lower: channels: found 1; expected 3", using(colour=Grey)),
-    ("channels", "colour.lower with data of 5 channels: channels: found 3; expected 5", using(colour=FirstThree)),
+    ("lowered_forms", "colour field Grey: lower returned 1 channels; expected 3", using(colour=Grey)),
+    ("channels", "colour field FirstThree: lower returned 3 channels; expected 5", using(colour=FirstThree)),
     ("channels", "colour.channels with data of 5 channels: found 3; expected 5", replace(using(), build=at_most_three)),
     ("channels", "stopped by RuntimeError", replace(using(), loss=three_only)),
     ("alive", "density.alive: density of a primitive that it leaves out", using(LeavesOut)),

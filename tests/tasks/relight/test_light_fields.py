@@ -150,13 +150,13 @@ def test_what_lies_behind_something_is_in_its_shadow() -> None:
 
 @pytest.mark.parametrize("size", [1.0, 50.0])
 def test_light_fades_over_parts_of_the_scene_s_diameter(size: float) -> None:
-    """Behind a disc, at the depths that BIAS and SOFTNESS name."""
+    """Behind a disc of the greatest opacity, 0.99, at the depths that BIAS and SOFTNESS name: all, half and none of the rest is kept."""
     geometry = Geometry(torch.zeros(1, 3), (size * torch.tensor([[1.0, 1.0, 1e-4]])).log(), torch.tensor([[1.0, 0, 0, 0]]))
     density = Cosine(torch.zeros(1, 0, 3), torch.zeros(1, 0), torch.zeros(1, 0), torch.full((1, 1), 1e6))
     behind = torch.tensor([0.0, BIAS, BIAS + SOFTNESS, 3 * BIAS]) * 2 * size
     points = torch.stack([torch.zeros(4), torch.zeros(4), -behind], -1)
-    found = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 4.0 * size]))(points)
-    assert torch.allclose(found, torch.tensor([0.924, 0.5, 0.269, 0.007]), atol=0.01)
+    found = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 4.0 * size]), SETTINGS)(points)
+    assert torch.allclose(found, torch.tensor([1.0, 0.505, 0.01, 0.01]), atol=0.005)
 
 
 def test_shadows_carry_no_gradient_and_are_bounded() -> None:

@@ -19,9 +19,9 @@ from PIL import Image
 from torch import Tensor
 
 import neuprim.runs.fit as fitting
-import neuprim.runs.run as running
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint
+from neuprim.core.channels import Channels
 from neuprim.core.data import Clip
 from neuprim.core.data.common import PosedImages
 from neuprim.core.errors import CheckpointError, DataError, NonFiniteError
@@ -130,7 +130,7 @@ def test_masked_pixels_do_not_count_on_the_curve() -> None:
         for p in dataset.test.images  # type: ignore[attr-defined]
     ]
     trainer = tiny.trainer(dataset, 3)
-    views = measure(trainer.model, dataset, trainer.renderer)
+    views = measure(trainer.model, dataset, trainer.renderer, Channels())
     assert curve_psnr(trainer) == pytest.approx(sum(v.psnr for v in views) / len(views), abs=1e-9)
 
 
@@ -326,7 +326,7 @@ def test_a_non_finite_gradient_stops_the_run(scene: Path, tmp_path: Path, monkey
                 self.model.params["b1"].register_hook(lambda g: g.index_fill(0, torch.tensor([7]), float("nan")))
             return super().train_step()
 
-    monkeypatch.setattr(running, "Trainer", Poisoned)
+    monkeypatch.setattr("neuprim.runs.fit.Trainer", Poisoned)
     out = tmp_path / "run"
     with pytest.raises(NonFiniteError, match=r"gradient of b1 of primitive 7\b"):
         fit(words(scene, out, 10, "train.checkpoint_every_seconds=0"))

@@ -15,7 +15,7 @@ from tests import kernels
 
 def test_what_is_compiled_is_what_training_needs() -> None:
     """A run that waited for it finds on disk every kernel that training calls, for the types that training calls it with."""
-    ahead = kernels.compiled_by("from neuprim import warm; warm.main()")
+    ahead = kernels.compiled_by("from neuprim.runs import warm; warm.main()")
     training = "t = tiny.trainer(tiny.TwoPrimitives(True), 4, population={'strategy': 'relocate', 'every': 2})"
     needed = kernels.compiled_by(f"from tests.core import tiny; {training}; assert len(list(t.run())) == 4")
     assert len(needed) > 8

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import torch
 
-import neuprim.runs.run as running
 from neuprim.core import checkpoint
 from neuprim.core.cameras import Camera
 from neuprim.core.data import Pixels, PointCloud
@@ -131,7 +130,7 @@ def test_a_run_forced_out_of_the_finite_keeps_the_checkpoint_before(tmp_path: Pa
                 self.dataset.train.pixels = lambda i: replace(inner(i), rgb=inner(i).rgb * float("inf"))  # type: ignore[method-assign]
             return super().train_step()
 
-    monkeypatch.setattr(running, "Trainer", Forced)
+    monkeypatch.setattr("neuprim.runs.fit.Trainer", Forced)
     out = tmp_path / "run"
     with pytest.raises(NonFiniteError, match=r"loss is (nan|inf) at step 6 on view r_\d"):
         fit(words(scene, out, 10, "train.checkpoint_every_seconds=0"))
@@ -139,7 +138,7 @@ def test_a_run_forced_out_of_the_finite_keeps_the_checkpoint_before(tmp_path: Pa
     assert header["step"] == 6
     assert all(bool(torch.isfinite(v).all()) for v in saved.values() if v.is_floating_point())
     monkeypatch.undo()
-    monkeypatch.setattr(running, "_ORBIT_FRAMES", 2)
+    monkeypatch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 2)
     fit([*words(scene, out, 10), "resume=true"])
     header, _ = checkpoint.read(out / "checkpoint.safetensors", "checkpoint")
     assert header["step"] == 10

@@ -90,7 +90,7 @@ def test_counts_out_of_range_are_named(value: int) -> None:
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_one_sample_is_the_backend_itself(backend: str) -> None:
-    draw = import_module(f"neuprim.core.render.{'cpu.backend' if backend == 'cpu' else 'reference'}").render
+    draw = import_module(f"neuprim.core.render.{backend}.backend").render
     t = scenes.tensors(40, 4, seed=6)
     settings = replace(SETTINGS, backend=backend, samples=1)  # type: ignore[arg-type]
     out, direct = frame(t, settings), draw(scenes.lowered(t), CAMERA, SKY, settings)

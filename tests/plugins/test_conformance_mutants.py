@@ -243,7 +243,7 @@ def lenient(text: str) -> list[Tensor]:
 
 
 def timed(colour: type = Timed, parse: Callable[[str], list[Tensor]] = number, sweep: str = "", **more: Any) -> TaskSpec:
-    return using(colour=colour, conditions=(ConditionSpec("time", (), "s", (0.0, 1.0), parse, sweep),), **more)
+    return using(colour=colour, conditions=(ConditionSpec("time", (), "s", (0.0, 1.0), parse, sweep=sweep),), **more)
 
 
 class WithoutTime(Example):

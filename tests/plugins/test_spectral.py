@@ -30,9 +30,11 @@ from neuprim.core.model.colours import sh
 from neuprim.core.render import render
 from neuprim.plugins.export import appearance, mesh
 from neuprim.plugins.registry import load_task
-from neuprim.runs.draw import FORMATS, evaluate_run, load_dataset, load_run, read_metrics, render_run
+from neuprim.runs.draw import FORMATS, render_run
 from neuprim.runs.export import export_run, import_run
 from neuprim.runs.inspect import Request, inspect_run
+from neuprim.runs.measure import evaluate_run
+from neuprim.runs.open import load_dataset, load_run, read_metrics
 from tests.plugins.fakes import site
 from tests.plugins.spectral import NAMES, fit, forget, install_spectral
 

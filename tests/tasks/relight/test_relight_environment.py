@@ -122,9 +122,9 @@ def test_a_view_keeps_its_other_conditions() -> None:
     seen: list[dict[str, Tensor]] = []
 
     class Listening(Primitives):
-        def lower(self, camera: Any, conditions: Any) -> Any:
+        def lower(self, camera: Any, conditions: Any, settings: Any = None) -> Any:
             seen.append(dict(conditions))
-            return super().lower(camera, conditions)
+            return super().lower(camera, conditions, settings)
 
     model = some_model()
     view = View("v", scenes.camera(4, 4), {"wavelength": torch.tensor(0.5), "light": torch.zeros(3)})

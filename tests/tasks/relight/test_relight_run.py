@@ -127,4 +127,4 @@ def test_a_wrong_loss() -> None:
     with pytest.raises(ConfigError, match=r"train\.loss=l2: no such loss; did you mean 'l1'\?"):
         compose(["task=relight", "train.loss=l2"], False)
     with pytest.raises(ConfigError, match=r"task\.options\.loss: task 'relight' has no such option; did you mean 'train\.loss'\?"):
-        compose(["task=relight", "train.loss=compressed"], False)
+        compose(["task=relight", "+task.options.loss=compressed"], False)

@@ -232,7 +232,7 @@ def variants_table(recorded: dict[str, Any]) -> str:
     """One row per way of varying in time."""
     runs = recorded.get("variants", [])
     lines = [
-        "| model.density.time | numbers per primitive | PSNR | inside the mask | pooled, inside | σ correlation, late | dead | ms a step |",
+        "| model.density.time | numbers per primitive | PSNR | inside the mask | pooled, inside | σ correlation, late | invisible | ms a step |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for time in dict.fromkeys(r["time"] for r in runs):

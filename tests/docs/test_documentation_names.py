@@ -69,7 +69,9 @@ def test_names_in_docstrings_exist() -> None:
     assert [(file, name) for file, name in found if not exists(name)] == []
 
 
-@pytest.mark.parametrize("name", ["neuprim.core.fields", "neuprim.core.model.fields.RayNets", "neuprim.cores", "neuprim.core.geometry.Geometry"])
+@pytest.mark.parametrize(
+    "name", ["neuprim.core.fields", "neuprim.core.model.fields.RayNets", "neuprim.cores", "neuprim.core.geometry.Geometry"]
+)
 def test_a_wrong_name_is_noticed(name: str) -> None:
     assert not exists(name)
 

@@ -11,8 +11,8 @@ DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free 
     between    every second frame is learned; the others are compared with the real ones, and steps between frames are measured
 
 Images are 96 x 96, 40 cameras (two held out), linear RGB over the exposure's peak, black background; means over seeds +- half the
-spread, of the last checkpoint. Results go to benchmarks/results/dynamic_quality.json, part by part; --readme and --docs put the
-recorded tables between the markers of README.md and docs/dynamic.md.
+spread, of the last checkpoint. Results go to benchmarks/results/dynamic_quality.json, part by part. --docs puts the recorded tables
+between the markers of docs/dynamic.md, --readme a short one into README.md; without DIR nothing is run.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from typing import Any
 
 import torch
 from static_quality import cpu_name, spread
-from tables import ROOT, between_markers
+from tables import README, ROOT, between_markers
 
 from neuprim.config import compose
 from neuprim.core.compute.threads import core_count
@@ -37,6 +37,7 @@ from neuprim.runs.fit import complete, start
 from neuprim.runs.measure import draw
 
 RESULTS = Path(__file__).parent / "results" / "dynamic_quality.json"
+SIZE = 96
 COLOUR = ("model.colour.powers=4", "model.colour.waves=4")
 VARIANTS = {
     **{time: (f"model.density.time={time}",) for time in ("phase", "offset", "window", "phase+offset", "phase+motion", "window+motion")},
@@ -119,7 +120,7 @@ def main() -> None:
     if args.folder:
         recorded |= {"cpu": cpu_name(), "cores": core_count()}
         data = [
-            "scene=vdb", f"scene.vdb='{args.folder.resolve()}'", f"scene.frames='{args.frames}'", "scene.look=embergen_fire", "scene.size=96",
+            "scene=vdb", f"scene.vdb='{args.folder.resolve()}'", f"scene.frames='{args.frames}'", "scene.look=embergen_fire", f"scene.size={SIZE}",
             "train.eval_every=0",
         ]  # fmt: skip
         short = ["model.primitives=2000", "train.max_seconds=null", f"train.iterations={args.iterations}"]
@@ -162,9 +163,9 @@ def main() -> None:
         text = make(recorded) + "\n" + note
         if args.docs:
             between_markers(ROOT / "docs" / "dynamic.md", name, text)
-        if args.readme and name == "dynamic-quality":
-            between_markers(ROOT / "README.md", name, text)
         print(f"\n{text}")
+    if args.readme:
+        between_markers(README, "dynamic-quality", short_table(recorded))
 
 
 def _spread(runs: list[dict[str, Any]], key: str, digits: int = 2) -> str:
@@ -205,11 +206,33 @@ def main_table(recorded: dict[str, Any]) -> str:
     ])  # fmt: skip
 
 
+def short_table(recorded: dict[str, Any]) -> str:
+    """Means over frames, and the hardest frame, beside what a black image scores."""
+    runs = recorded.get("main", [])
+    if not runs:
+        return "not measured"
+    frames = len(runs[0]["per_frame"])
+    lines = [
+        f"| EmberGen fire, {SIZE}×{SIZE} | primitives | training | PSNR | PSNR inside the mask | SSIM | hardest of {frames} frames, inside the mask |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+        f"| black image |  |  | {runs[0]['psnr_black_image']:.1f} dB | {runs[0]['psnr_black_image_mask']:.1f} dB |  |  |",
+    ]
+    for row in sorted({_row(r) for r in runs}):
+        own = [r for r in runs if _row(r) == row]
+        hardest = min(range(frames), key=lambda t: statistics.mean(r["per_frame"][t] for r in own))
+        worst = spread([r["per_frame"][hardest] for r in own], 1)
+        lines.append(
+            f"| preset `quick` | {row[0]:,} | {row[1]} s | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB "
+            f"| {_spread(own, 'ssim', 4)} | frame {hardest + 1}: {worst} dB |"
+        )
+    return "\n".join(lines)
+
+
 def variants_table(recorded: dict[str, Any]) -> str:
     """One row per way of varying in time."""
     runs = recorded.get("variants", [])
     lines = [
-        "| model.density.time | numbers per primitive | PSNR | inside the mask | pooled, inside | σ correlation, late | dead | ms a step |",
+        "| model.density.time | numbers per primitive | PSNR | inside the mask | pooled, inside | σ correlation, late | invisible | ms a step |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for time in dict.fromkeys(r["time"] for r in runs):

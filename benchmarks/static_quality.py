@@ -1,10 +1,11 @@
 """Quality of the static task on a NeRF-synthetic scene: PSNR by primitives and seconds, beside the K = 0 baseline.
 
-    python benchmarks/static_quality.py DIR [--seeds 3] [--rows 2000x60 5000x120 ...] [--keep] [--readme]
+    python benchmarks/static_quality.py DIR [--seeds 3] [--rows 2000x60 5000x120 ...] [--keep] [--readme] [--docs]
 
 DIR holds the scene (transforms_train.json, ...). Every run is `neuprim run task=static scene=blender` with the preset
 `quick`; numbers are means over seeds +- half the spread, on the test views, of the last checkpoint. Results go to
-benchmarks/results/static_quality.json; --readme puts the table between the markers in README.md.
+benchmarks/results/static_quality.json. --docs puts the table between the markers in docs/static.md, --readme a short one in README.md;
+without DIR nothing is run, and both are made of the recorded results.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from tables import ROOT, between_markers
+from PIL import Image
+from tables import README, ROOT, between_markers
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "static_quality.json"
@@ -46,6 +48,13 @@ def cpu_name() -> str:
     return platform.processor() or platform.machine()
 
 
+def image_size(scene: Path) -> int:
+    """Width of the test images in pixels."""
+    frame = json.loads((scene / "transforms_test.json").read_text())["frames"][0]
+    with Image.open(scene / f"{frame['file_path']}.png") as image:
+        return image.width
+
+
 def spread(values: list[float], digits: int) -> str:
     half = (max(values) - min(values)) / 2
     return f"{statistics.mean(values):.{digits}f}" + (f" ± {half:.{digits}f}" if len(values) > 1 else "")
@@ -67,13 +76,32 @@ def table(results: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n" + note
 
 
+def short_table(results: dict[str, Any]) -> str:
+    """The fewest and the most primitive-seconds with neurons, and the fewest without."""
+    rows = sorted(results["rows"], key=lambda row: row["primitives"] * row["seconds"])
+    with_neurons = [row for row in rows if row["neurons"]]
+    chosen = [with_neurons[0], with_neurons[-1], *[row for row in rows if not row["neurons"]][:1]]
+    lines = [
+        f"| {results['name']}, {results['size']}×{results['size']} | primitives | training | PSNR | SSIM | hardest of {results['views']} views |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for row in chosen:
+        runs, what = row["runs"], f"K = {row['neurons']} neurons" if row["neurons"] else "K = 0, constant density"
+        lines.append(
+            f"| {what} | {row['primitives']:,} | {row['seconds']} s | {spread([r['psnr'] for r in runs], 2)} dB "
+            f"| {spread([r['ssim'] for r in runs], 4)} | {spread([r['psnr_worst'] for r in runs], 1)} dB |"
+        )
+    return "\n".join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("scene", type=Path, nargs="?")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--rows", nargs="*", default=list(ROWS), help="PRIMITIVESxSECONDS[xKNEURONS]")
     parser.add_argument("--keep", action="store_true", help="keep the recorded rows that are not measured now")
-    parser.add_argument("--readme", action="store_true", help="write the recorded table into README.md")
+    parser.add_argument("--readme", action="store_true", help="write the recorded results into README.md, in short")
+    parser.add_argument("--docs", action="store_true", help="write the recorded table into docs/static.md")
     args = parser.parse_args()
     if args.scene:
         from neuprim.core.compute.threads import core_count
@@ -93,14 +121,17 @@ def main() -> None:
             results["rows"].append(
                 {"primitives": primitives, "seconds": seconds, "neurons": neurons, "runs": [{k: r[k] for k in keys} for r in runs]}
             )
+            results["name"], results["size"] = "NeRF-synthetic " + args.scene.resolve().name.partition("_")[0], image_size(args.scene)
             results["scene"], results["views"], results["versions"] = runs[0]["dataset"], len(runs[0]["per_view"]), runs[0]["versions"]
             RESULTS.parent.mkdir(exist_ok=True)
             RESULTS.write_text(json.dumps(results, indent=1) + "\n")  # after every row: a long benchmark may be cut short
             print(table(results), flush=True)
     results = json.loads(RESULTS.read_text())
     if args.readme:
-        between_markers(ROOT / "README.md", "static-quality", table(results))
-    elif not args.scene:
+        between_markers(README, "static-quality", short_table(results))
+    if args.docs:
+        between_markers(ROOT / "docs" / "static.md", "static-quality", table(results))
+    if not args.scene:
         print(table(results))
 
 

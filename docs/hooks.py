@@ -31,6 +31,8 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
     """Links that leave ``docs/``."""
     if page.file.src_uri in INCLUDES:
         markdown = (ROOT / INCLUDES[page.file.src_uri]).read_text(encoding="utf-8")
+        for name, source in INCLUDES.items():
+            markdown = markdown.replace(f"]({source}", f"]({name}")
         return re.sub(r"\]\(docs/", "](", markdown)
 
     def inside(match: re.Match[str]) -> str:

@@ -1,8 +1,11 @@
-"""The README's pictures from finished runs: held-out views, truth above, render below.
+"""Pictures of README and site from finished runs: held-out views, truth above, render below.
 
-python docs/make_pictures.py RUN_DIR docs/pictures/solids.png [VIEWS] [SIDE]
-python docs/make_pictures.py RUN_DIR docs/pictures/smoke_fire.png 6 192
+    neuprim run task=static scene=solids scene.size=256 train.iterations=3500 train.max_seconds=null output_dir=RUN_DIR
+    python docs/make_pictures.py RUN_DIR docs/pictures/solids.png
+    python docs/make_pictures.py RUN_DIR docs/pictures/smoke_fire.png 6 192
+    python docs/make_pictures.py RUN_DIR docs/pictures/lit_solids.png 6 160
 
+Arguments: RUN_DIR TARGET [VIEWS] [SIDE].
 VIEWS pictures of the run (4), each SIDE pixels wide (as rendered). A run with films shows its first held-out camera over time.
 """
 

@@ -30,7 +30,7 @@ class Rasterized:
         depth: (C, H, W) weighted mean camera-z of the chord middles, scene units, 0 where nothing is hit; None unless
             ``depth=True`` was asked for.
         stats: one per camera; set ``stats[c].pixel_error`` to an (H, W) map before ``backward()`` and read
-            ``stats[c].weight`` and ``.error_weight`` (N,) after it, see :class:`neuprim.core.render.RenderStats`.
+            ``stats[c].weight`` and ``.error_weight`` (N,) after it, see :class:`neuprim.core.render.output.RenderStats`.
     """
 
     rgb: Tensor
@@ -88,7 +88,7 @@ def rasterize(
         width, height: size of every image in pixels.
         omega0: factor on the whole phase.
         backgrounds: (channels,) or (C, channels); None is black.
-        **settings: fields of :class:`neuprim.core.render.RenderSettings`: ``backend``, ``near``, ``depth``, ``alpha_min``, …
+        **settings: fields of :class:`neuprim.core.settings.RenderSettings`: ``backend``, ``near``, ``depth``, ``alpha_min``, …
 
     The eight primitive tensors share one dtype, float32 or float64; images have that dtype too. The cpu backend computes
     pixels in float32 even so, the reference everything in float64. All tensors live on the CPU.

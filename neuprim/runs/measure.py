@@ -43,7 +43,7 @@ class ViewMetrics:
         seconds: of the forward pass alone.
         more: further numbers by name: ``psnr_srgb``, ``ssim_srgb`` of linear images, or ``psnr_display``, ``ssim_display`` of what the
             task's own display shows; ``psnr_mask`` and ``mse_mask`` inside the data set's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without anything on it; what
-            :meth:`~neuprim.core.data.Dataset.judge` adds.
+            :meth:`~neuprim.core.data.dataset.Dataset.judge` adds.
     """
 
     name: str

@@ -22,7 +22,7 @@ __all__ = ["DatasetFault", "check_dataset", "check_mask", "check_pixels", "check
 
 
 class DatasetFault(DataError):
-    """A loader broke a promise of :class:`~neuprim.core.data.Dataset`; whoever knows the loader's package adds its name."""
+    """A loader broke a promise of :class:`~neuprim.core.data.dataset.Dataset`; whoever knows the loader's package adds its name."""
 
 
 def check_dataset(dataset: Dataset, conditions: Sequence[ConditionSpec]) -> None:

@@ -54,7 +54,7 @@ def density_grid(
 ) -> Tensor:
     """(X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``.
 
-    What lowers to a :class:`~neuprim.core.model.fields.Cosine` runs in compiled code on all cores; any other density is asked point by
+    What lowers to a :class:`~neuprim.core.model.forms.Cosine` runs in compiled code on all cores; any other density is asked point by
     point, in blocks. Beside the grid it takes a few MB.
 
     Args:

@@ -8,7 +8,7 @@
 E is the light's intensity, divided by the squared distance where the data set says so, over that of a typical training light, so that
 learning rates do not depend on the data's unit of light; V the visibility of the light from the
 primitive (:mod:`neuprim.tasks.relight.visibility`) or 1. Everything but W_x x~ is constant over a primitive, so it folds into the
-closed form :class:`~neuprim.core.model.fields.RayNet`, which the renderer evaluates per pixel.
+closed form :class:`~neuprim.core.model.forms.RayNet`, which the renderer evaluates per pixel.
 """
 
 from __future__ import annotations

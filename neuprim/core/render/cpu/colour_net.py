@@ -1,4 +1,4 @@
-"""The per-primitive stage of a :class:`~neuprim.core.model.fields.RayNet`, in float64, and its hand-written backward.
+"""The per-primitive stage of a :class:`~neuprim.core.model.forms.RayNet`, in float64, and its hand-written backward.
 
 The network sees the chord's middle, x~_m = local (axes q) with q the middle in whitened space, which the density's pixel stage leaves
 in the lanes anyway. So its first layer goes to whitened axes and turns once per primitive, exactly as the density's neurons do, and

@@ -113,7 +113,7 @@ _slopes_slow, _slopes_medium, _slopes_fast = _slopes(slopes_slow), _slopes(slope
 
 @inline
 def field_values(S, D, n, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, with_mid, backward):  # type: ignore[no-untyped-def]
-    """Chords and FIELD of ``n`` lanes of primitive ``i``, in float64 where the primitive is delicate; see :func:`~tiles.chords`."""
+    """Chords and FIELD of ``n`` lanes of primitive ``i``, in float64 where float32 is too coarse; see :func:`~tiles.chords`."""
     if slots[i] >= 0:
         delicate_chords(S, D, bounds, y0, y1, tx, ty, n, wide[slots[i]], floor, with_mid, backward)
         delicate_neurons(S, D, n, wide[slots[i]], neurons)

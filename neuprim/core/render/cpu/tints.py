@@ -1,4 +1,4 @@
-"""Colours per lane, for :class:`~neuprim.core.model.fields.RayNet`: the pixel stage of ``colour_net``, forward and backward.
+"""Colours per lane, for :class:`~neuprim.core.model.forms.RayNet`: the pixel stage of ``colour_net``, forward and backward.
 
 Every function works on the lanes of one (tile, primitive) pair, after the density's chord stage. TINT holds the colours before
 max(0, .), so that forward and backward clamp alike. Three channels have fused loops over constant offsets; other counts, and

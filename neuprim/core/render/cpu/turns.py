@@ -1,4 +1,4 @@
-"""cos and sinc of a phase in turns, and the exponential, as polynomials (coefficients: benchmarks/fit_polynomials.py).
+"""Trigonometry: cos and sinc of a phase in turns, and the exponential, as polynomials (coefficients: benchmarks/fit_polynomials.py).
 
 With W1 and b1 divided by 2 pi beforehand, reducing a phase to |r| <= 1/2 turn is ``r = u - rint(u)``, which is exact.
 float32 Horner errors: cos 4.3e-7, sinc 2.6e-7, dsinc/dz 9.3e-7; up to 1.5 turns sinc 4.4e-7, dsinc/dv 1.9e-6.

@@ -1,4 +1,4 @@
-"""Looks by name. Up is z; :meth:`Look.turned` makes them y."""
+"""Presets of the optics by name (``scene.look``). Up is z; :meth:`Look.turned` makes it y."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ LOOKS = {
 
 
 def named_look(name: str, up: str = "z") -> Look:
-    """One of :data:`LOOKS` for sequences with this up axis."""
+    """The preset of that name, for sequences with this up axis."""
     if name not in LOOKS:
         raise ConfigError(f"scene.look={name}: no such look{nearest(name, LOOKS)}")
     return LOOKS[name].turned(up)

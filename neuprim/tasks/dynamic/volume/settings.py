@@ -27,7 +27,7 @@ class VolumeSettings:
         timesteps: of the simulation; None: as many as the scene has.
         frames: "all", "FIRST:LAST" or "FIRST:LAST:STEP" by number, LAST included.
         grids: meaning -> name in the files.
-        look: name of the look, or "auto"; optics: changes to its settings.
+        look: name of a preset of the optics, or "auto"; optics: changes to its settings.
         size: width and height of the images in pixels.
         cameras: on the upper hemisphere; two are held out.
         field_of_view: of the cameras, degrees.

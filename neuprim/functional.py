@@ -15,7 +15,7 @@ from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.model.tensors import Sizes, tensor_fault
-from neuprim.core.render import RenderSettings, RenderStats, render_lowered
+from neuprim.core.render import RenderSettings, RenderStats, backends, render_lowered
 
 __all__ = ["Rasterized", "rasterize"]
 
@@ -69,7 +69,7 @@ def rasterize(
         alpha_i = min(alpha_max, 1 - exp(-max(I_i, 0))),   T_i = prod_{j<i} (1 - alpha_j),
         rgb = sum_i colors_i alpha_i T_i + T background.
 
-    Gradients reach every primitive tensor, ``viewmats`` (poses) and ``backgrounds`` on either backend, and ``Ks`` with
+    Gradients reach every primitive tensor, ``viewmats`` (poses) and ``backgrounds`` on every backend, and ``Ks`` with
     ``backend="reference"``. A pose is best optimised through a parametrisation of rigid transforms: the gradient is that of
     all twelve matrix entries.
 
@@ -101,7 +101,7 @@ def rasterize(
             The message names the argument, what was found and what was expected.
         ConfigError: an unknown setting, or an impossible value.
         NonFiniteError: a primitive tensor or background holds NaN or infinity, or a quaternion is zero.
-        BackendUnavailable: ``Ks`` requires a gradient and the backend is not the reference.
+        BackendUnavailable: ``Ks`` requires a gradient, and the backend, or any that "auto" may choose, does not compute it.
     """
     primitives = {"means": means, "log_scales": log_scales, "quats": quats, "W1": W1, "b1": b1, "w2": w2, "b2": b2, "colors": colors}
     knobs = _settings(settings)
@@ -111,9 +111,10 @@ def rasterize(
     if colors.dim() == 3 and len(colors) != views:
         raise _wrong("colors", f"shape {tuple(colors.shape)}", f"({views}, {count}, channels), one set per camera of viewmats")
     backdrop = _check_backgrounds(backgrounds, views, channels)
-    if Ks.requires_grad and knobs.backend != "reference":
+    if Ks.requires_grad and not all(backend.differentiates_intrinsics for backend in backends.candidates(knobs)):
+        able = " or ".join(f'backend="{b.name}"' for b in backends.available() if b.differentiates_intrinsics)
         raise BackendUnavailable(
-            f'rasterize: Ks requires a gradient, which backend="{knobs.backend}" does not compute; pass backend="reference" or Ks.detach()'
+            f'rasterize: Ks requires a gradient, which backend="{knobs.backend}" does not compute; pass {able} or Ks.detach()'
         )
     geometry, density = Geometry(means, log_scales, quats), Cosine(W1, b1, w2, b2, float(omega0))
     palettes = list(colors.unbind()) if colors.dim() == 3 else [colors] * views
@@ -148,9 +149,11 @@ def _settings(settings: dict[str, Any]) -> RenderSettings:
         if name not in names:
             raise ConfigError(f"rasterize: unknown setting {name!r}{nearest(name, names)}")
     try:
-        return RenderSettings(**settings)
+        knobs = RenderSettings(**settings)
     except TypeError as error:
         raise ConfigError(f"rasterize: settings {settings}: {error}") from error
+    backends.check_name(knobs.backend)
+    return knobs
 
 
 def _check_tensor(name: str, value: Any) -> None:

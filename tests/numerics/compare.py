@@ -11,6 +11,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.model.fields import OpaqueColour
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
+from neuprim.core.render.backends import ORACLE
 from neuprim.core.render.reference.backend import pixel_directions
 from tests import scenes
 
@@ -105,7 +106,7 @@ def draw(
     leaves = {k: v.detach().to(dtype).requires_grad_() for k, v in t.items()}
     view = camera.viewmat.detach().clone().requires_grad_(with_view)
     background = torch.linspace(0.2, 0.9, scenes.channels(t)).to(dtype).requires_grad_()
-    output = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(settings, backend=backend), background)  # type: ignore[arg-type]
+    output = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(settings, backend=backend), background)
     h, w, C = output.rgb.shape
     keep = torch.ones(h, w, dtype=torch.float64) if skip is None else (~skip).double()
     output.stats.pixel_error = (weights((h, w), 3).abs() * keep).float()
@@ -135,12 +136,17 @@ def row_errors(found: Tensor, expected: Tensor) -> Tensor:
 
 
 def assert_same_frame(
-    t: dict[str, Tensor], camera: Camera, settings: RenderSettings, image_bound: float = 1e-5, grad_bound: float = 1e-3
+    t: dict[str, Tensor],
+    camera: Camera,
+    settings: RenderSettings,
+    image_bound: float = 1e-5,
+    grad_bound: float = 1e-3,
+    backend: str = "cpu",
 ) -> tuple[Frame, Frame]:
-    """cpu within ``image_bound`` of the reference, gradients within ``grad_bound`` of each row's norm; returns (cpu, reference)."""
+    """``backend`` within ``image_bound`` of the reference, gradients within ``grad_bound`` of each row's norm; returns both."""
     skip = undecided(t, camera, settings)
     assert skip.float().mean() < 0.05, f"{int(skip.sum())} pixels are undecided: too many for the comparison to mean much"
-    fast, slow = (draw(b, t, camera, settings, skip) for b in ("cpu", "reference"))
+    fast, slow = (draw(b, t, camera, settings, skip) for b in (backend, ORACLE))
     keep = ~skip
     report: dict[str, Any] = {}
     report["rgb"] = (fast.output.rgb.double() - slow.output.rgb).abs().amax(-1)[keep].max().item()

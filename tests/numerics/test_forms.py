@@ -24,14 +24,14 @@ from neuprim.core.render.joint import joint_volume
 from neuprim.core.volumes.grid import density_at, density_grid
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
+from tests.backends import BACKENDS
 
-BACKENDS = ["cpu", "reference"]
 CAMERA = scenes.camera(20, 16)
 N, K = 20, 8
 
 
 def settings(backend: str, **more: Any) -> RenderSettings:
-    return RenderSettings(backend=backend, **more)  # type: ignore[arg-type]
+    return RenderSettings(backend=backend, **more)
 
 
 def model(density: type[CosineDensity] = CosineDensity, colour: type[SphericalHarmonics] = SphericalHarmonics) -> Primitives:

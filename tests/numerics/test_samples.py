@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import import_module
 
 import pytest
 import torch
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
+from neuprim.core.render import RenderOutput, RenderSettings, find, render_lowered
 from tests import scenes
+from tests.backends import BACKENDS
 
 SETTINGS = RenderSettings(depth=True)
 SKY = torch.tensor([0.3, 0.6, 0.1])
@@ -32,7 +32,7 @@ def blocks(image: Tensor, n: int) -> Tensor:
 
 
 @pytest.mark.parametrize("sort", ["center", "entry"])
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("n", [2, 3])
 def test_means_of_a_finer_image(backend: str, sort: str, n: int) -> None:
     settings = replace(SETTINGS, backend=backend, sort=sort)  # type: ignore[arg-type]
@@ -88,11 +88,11 @@ def test_counts_out_of_range_are_named(value: int) -> None:
         RenderSettings(samples=value)
 
 
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_one_sample_is_the_backend_itself(backend: str) -> None:
-    draw = import_module(f"neuprim.core.render.{'cpu.backend' if backend == 'cpu' else 'reference'}").render
+    draw = find(backend).load()
     t = scenes.tensors(40, 4, seed=6)
-    settings = replace(SETTINGS, backend=backend, samples=1)  # type: ignore[arg-type]
+    settings = replace(SETTINGS, backend=backend, samples=1)
     out, direct = frame(t, settings), draw(scenes.lowered(t), CAMERA, SKY, settings)
     assert torch.equal(out.rgb, direct.rgb) and torch.equal(out.alpha, direct.alpha) and torch.equal(out.depth, direct.depth)
     assert type(out.stats) is type(direct.stats)

@@ -22,6 +22,7 @@ from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.dead import dead_fraction
 from neuprim.tasks.dynamic.density import PARTS, TimeDensity
 from tests import scenes
+from tests.backends import BACKENDS
 
 VARIANTS = ["none", *("+".join(c) for n in range(1, len(PARTS) + 1) for c in itertools.combinations(PARTS, n))]
 COUNT = 30
@@ -133,10 +134,10 @@ def test_primitives_outside_their_window_are_left_out_and_nothing_changes() -> N
     assert torch.allclose(culled, render(m, camera, at(0.5), settings).rgb, atol=1e-6)
 
 
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_gradients_reach_living_primitives_and_no_others(backend: str) -> None:
     m = model("phase+offset+window+motion", dtype=torch.float32)
-    output = render(m, scenes.camera(), at(0.5), RenderSettings(backend=backend))  # type: ignore[arg-type]
+    output = render(m, scenes.camera(), at(0.5), RenderSettings(backend=backend))
     output.stats.pixel_error = torch.ones(output.rgb.shape[:2])
     (output.rgb * torch.rand(output.rgb.shape, generator=torch.Generator().manual_seed(1))).sum().backward()
     rows = m.density.alive(m.of(m.density), at(0.5))

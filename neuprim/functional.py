@@ -15,7 +15,7 @@ from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.model.tensors import Sizes, tensor_fault
-from neuprim.core.render import RenderSettings, RenderStats, backends, render_lowered
+from neuprim.core.render import RenderSettings, RenderStats, Tally, backends, render_lowered
 
 __all__ = ["Rasterized", "rasterize"]
 
@@ -29,14 +29,31 @@ class Rasterized:
         alpha: (C, H, W) accumulated opacity 1 - T.
         depth: (C, H, W) weighted mean camera-z of the chord middles, scene units, 0 where nothing is hit; None unless
             ``depth=True`` was asked for.
-        stats: one per camera; set ``stats[c].pixel_error`` to an (H, W) map before ``backward()`` and read
-            ``stats[c].weight`` and ``.error_weight`` (N,) after it, see :class:`neuprim.core.render.RenderStats`.
+        stats: one per camera, see :class:`neuprim.core.render.RenderStats`.
     """
 
     rgb: Tensor
     alpha: Tensor
     depth: Tensor | None
     stats: tuple[RenderStats, ...]
+
+    def watch(self, error: Tensor) -> tuple[Tally, ...]:
+        """Let the backward pass tell which primitives each camera saw, and which had a part in an error; call it before ``backward()``.
+
+        Args:
+            error: (C, H, W) any measure of what is wrong at each pixel; no gradient reaches it.
+
+        Returns:
+            for each camera the (N,) sums ``weight`` and ``error_weight``, which the backward pass fills: see
+            :class:`neuprim.core.render.Tally`.
+
+        Raises:
+            DataError: ``error`` is not of the frames' size.
+        """
+        _check_tensor("watch: error", error)
+        if error.shape != self.alpha.shape:
+            raise _wrong("watch: error", f"shape {tuple(error.shape)}", f"{tuple(self.alpha.shape)}, that of alpha")
+        return tuple(stats.watch(part) for stats, part in zip(self.stats, error, strict=True))
 
 
 def rasterize(

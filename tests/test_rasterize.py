@@ -149,13 +149,15 @@ def test_population_statistics_come_back_per_camera() -> None:
     a = arguments()
     a["means"].requires_grad_()
     out = neuprim.rasterize(**a)
-    for stats in out.stats:
-        stats.pixel_error = torch.ones(HEIGHT, WIDTH)
+    error = torch.ones(3, HEIGHT, WIDTH)
+    error[1] = 0.5
+    tallies = out.watch(error)
     out.rgb.sum().backward()
-    for c, stats in enumerate(out.stats):
-        assert stats.weight is not None and stats.error_weight is not None
-        assert stats.weight.sum().item() == pytest.approx(out.alpha[c].sum().item(), rel=1e-4)
-        assert torch.allclose(stats.weight, stats.error_weight)
+    for c, tally in enumerate(tallies):
+        assert tally.weight.sum().item() == pytest.approx(out.alpha[c].sum().item(), rel=1e-4)
+        assert torch.allclose(tally.error_weight, tally.weight * (0.5 if c == 1 else 1.0))
+    with pytest.raises(DataError, match=rf"^rasterize: watch: error has shape \(2, 3\); expected \(3, {HEIGHT}, {WIDTH}\), that of alpha$"):
+        out.watch(torch.ones(2, 3))
 
 
 # ---------------------------------------------------------------- bad input

@@ -106,7 +106,7 @@ def main(backend: str) -> None:
     geometry = Geometry(params["means"], params["log_scales"], params["quats"])
     colour = Constant(fused_colors(params["means"], params["dc"], params["rest"], camera.position, 3) + 0.5)
     output = render_lowered(Lowered(geometry, density.lower(params, geometry, {}), colour), camera, RenderSettings(backend=backend))
-    output.stats.pixel_error = torch.ones(output.rgb.shape[:2])
+    output.watch(torch.ones(output.rgb.shape[:2]))
     loss, _ = photometric({"ssim_weight": 0.2})(output.rgb, torch.zeros_like(output.rgb), Supervision(View("warm", camera)))
     loss.backward()
     RowAdam(specs, params).step(params, {spec.name: 1e-3 for spec in specs})

@@ -12,6 +12,7 @@ from neuprim.core.cameras import Camera
 from neuprim.core.model.fields import OpaqueColour
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from neuprim.core.render.backends import ORACLE
+from neuprim.core.render.output import Tally
 from neuprim.core.render.reference.backend import pixel_directions
 from tests import scenes
 
@@ -22,6 +23,7 @@ class Frame:
 
     output: RenderOutput
     grads: dict[str, Tensor]
+    tally: Tally
 
 
 def weights(shape: tuple[int, ...], seed: int) -> Tensor:
@@ -109,7 +111,7 @@ def draw(
     output = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(settings, backend=backend), background)
     h, w, C = output.rgb.shape
     keep = torch.ones(h, w, dtype=torch.float64) if skip is None else (~skip).double()
-    output.stats.pixel_error = (weights((h, w), 3).abs() * keep).float()
+    tally = output.watch((weights((h, w), 3).abs() * keep).float())
     total = (output.rgb * (weights((h, w, C), 0) * keep[..., None]).to(dtype)).sum() + (
         output.alpha * (weights((h, w), 1) * keep).to(dtype)
     ).sum()
@@ -122,7 +124,7 @@ def draw(
     grads["background"] = background.grad if background.grad is not None else torch.zeros_like(background)
     if with_view and view.grad is not None:
         grads["viewmat"] = view.grad
-    return Frame(output, {k: v.detach() for k, v in grads.items()})
+    return Frame(output, {k: v.detach() for k, v in grads.items()}, tally)
 
 
 def row_errors(found: Tensor, expected: Tensor) -> Tensor:

@@ -24,9 +24,8 @@ def test_equals_reference(name: str, backend: str) -> None:
     fast, slow = assert_same_frame(t, camera, settings, backend=backend)
     assert slow.output.alpha.max() > 0.1, "the view must show something"
     assert fast.output.rgb.dtype == torch.float32 and slow.output.rgb.dtype == torch.float64
-    seen = slow.output.stats
-    other = fast.output.stats
-    assert seen.weight is not None and seen.error_weight is not None and other.weight is not None and other.error_weight is not None
+    seen = slow.tally
+    other = fast.tally
     # the sums run over all pixels, so a single pair on the other side of a cut shows: alpha_min x T at most
     assert (other.weight - seen.weight).abs().max() <= 2e-5 * seen.weight.max() + 2 / 255
     assert (other.error_weight - seen.error_weight).abs().max() <= 2e-5 * seen.error_weight.max() + 1e-4
@@ -71,7 +70,7 @@ def test_no_primitives_at_all(backend: str) -> None:
     assert torch.equal(out.rgb, torch.tensor([0.5, 0.25, 1.0]).expand(17, 20, 3))
     assert out.alpha.abs().max() == 0
     if out.rgb.requires_grad:
-        out.stats.pixel_error = torch.ones(17, 20)
+        out.watch(torch.ones(17, 20))
         out.rgb.sum().backward()
 
 
@@ -85,7 +84,7 @@ def test_any_number_of_threads_gives_the_same_bits(backend: str) -> None:
         for name, grad in frames[0].grads.items():
             assert torch.equal(grad, other.grads[name]), name
         for sums in ("weight", "error_weight"):
-            assert torch.equal(getattr(frames[0].output.stats, sums), getattr(other.output.stats, sums)), sums
+            assert torch.equal(getattr(frames[0].tally, sums), getattr(other.tally, sums)), sums
     assert frames[0].output.alpha.max() > 0.5
 
 

@@ -14,7 +14,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render.backends import Backend, available, choose, find
-from neuprim.core.render.output import RenderOutput, RenderStats
+from neuprim.core.render.output import RenderOutput, RenderStats, Tally
 from neuprim.core.render.refusals import refuse_non_finite
 from neuprim.core.render.samples import render_samples
 from neuprim.core.render.shading import Draw, with_shade
@@ -25,6 +25,7 @@ __all__ = [
     "RenderOutput",
     "RenderSettings",
     "RenderStats",
+    "Tally",
     "available",
     "choose",
     "find",

@@ -128,7 +128,7 @@ def _draw(lowered: Lowered, camera: Camera, background: Tensor | None, settings:
     boxes = screen_boxes(g, camera, settings.near)
     whiten = (quaternion_to_matrix(g.quats.double()) / g.log_scales.double().exp()[:, None, :]).transpose(1, 2)  # scene -> unit sphere
     image = torch.zeros(camera.height, camera.width, channels + 2, dtype=torch.float64)
-    stats = RenderStats("joint")
+    stats = RenderStats("joint", g.count)
     for y in range(0, camera.height, _BLOCK):
         for x in range(0, camera.width, _BLOCK):
             window = directions[y : y + _BLOCK, x : x + _BLOCK]

@@ -54,10 +54,9 @@ class _Tally(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[override]
         weights, rows, pixels = ctx.saved_tensors
         stats: RenderStats = ctx.stats
-        if stats.pixel_error is not None and stats.weight is not None and stats.error_weight is not None:
-            error = stats.pixel_error.reshape(-1)[pixels].to(weights)
-            stats.weight.index_add_(0, rows, weights.sum(1).to(stats.weight))
-            stats.error_weight.index_add_(0, rows, (weights @ error).to(stats.error_weight))
+        if stats.watched is not None:
+            error = stats.watched.error.reshape(-1)[pixels].to(weights)
+            stats.watched.add(rows, weights.sum(1), weights @ error)
         return grad, None, None, None
 
 
@@ -96,7 +95,7 @@ def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, setti
     count = lowered.geometry.count
     seen = view_of(camera, lowered.geometry, frame.center, settings.near)
     channels = lowered.colour.channels
-    stats = RenderStats("reference", weight=torch.zeros(count), error_weight=torch.zeros(count))
+    stats = RenderStats("reference", count)
     rows_of_blocks = []
     for y0 in range(0, camera.height, _BLOCK):
         line = []

@@ -15,7 +15,7 @@ from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.model.tensors import Sizes, tensor_fault
-from neuprim.core.render import RenderSettings, RenderStats, render_lowered
+from neuprim.core.render import RenderSettings, RenderStats, Tally, backends, render_lowered
 
 __all__ = ["Rasterized", "rasterize"]
 
@@ -29,14 +29,31 @@ class Rasterized:
         alpha: (C, H, W) accumulated opacity 1 - T.
         depth: (C, H, W) weighted mean camera-z of the chord middles, scene units, 0 where nothing is hit; None unless
             ``depth=True`` was asked for.
-        stats: one per camera; set ``stats[c].pixel_error`` to an (H, W) map before ``backward()`` and read
-            ``stats[c].weight`` and ``.error_weight`` (N,) after it, see :class:`neuprim.core.render.output.RenderStats`.
+        stats: one per camera, see :class:`neuprim.core.render.output.RenderStats`.
     """
 
     rgb: Tensor
     alpha: Tensor
     depth: Tensor | None
     stats: tuple[RenderStats, ...]
+
+    def watch(self, error: Tensor) -> tuple[Tally, ...]:
+        """Let the backward pass tell which primitives each camera saw, and which had a part in an error; call it before ``backward()``.
+
+        Args:
+            error: (C, H, W) any measure of what is wrong at each pixel; no gradient reaches it.
+
+        Returns:
+            for each camera the (N,) sums ``weight`` and ``error_weight``, which the backward pass fills: see
+            :class:`neuprim.core.render.Tally`.
+
+        Raises:
+            DataError: ``error`` is not of the frames' size.
+        """
+        _check_tensor("watch: error", error)
+        if error.shape != self.alpha.shape:
+            raise _wrong("watch: error", f"shape {tuple(error.shape)}", f"{tuple(self.alpha.shape)}, that of alpha")
+        return tuple(stats.watch(part) for stats, part in zip(self.stats, error, strict=True))
 
 
 def rasterize(
@@ -69,7 +86,7 @@ def rasterize(
         alpha_i = min(alpha_max, 1 - exp(-max(I_i, 0))),   T_i = prod_{j<i} (1 - alpha_j),
         rgb = sum_i colors_i alpha_i T_i + T background.
 
-    Gradients reach every primitive tensor, ``viewmats`` (poses) and ``backgrounds`` on either backend, and ``Ks`` with
+    Gradients reach every primitive tensor, ``viewmats`` (poses) and ``backgrounds`` on every backend, and ``Ks`` with
     ``backend="reference"``. A pose is best optimised through a parametrisation of rigid transforms: the gradient is that of
     all twelve matrix entries.
 
@@ -101,7 +118,7 @@ def rasterize(
             The message names the argument, what was found and what was expected.
         ConfigError: an unknown setting, or an impossible value.
         NonFiniteError: a primitive tensor or background holds NaN or infinity, or a quaternion is zero.
-        BackendUnavailable: ``Ks`` requires a gradient and the backend is not the reference.
+        BackendUnavailable: ``Ks`` requires a gradient, and the backend, or any that "auto" may choose, does not compute it.
     """
     primitives = {"means": means, "log_scales": log_scales, "quats": quats, "W1": W1, "b1": b1, "w2": w2, "b2": b2, "colors": colors}
     knobs = _settings(settings)
@@ -111,9 +128,10 @@ def rasterize(
     if colors.dim() == 3 and len(colors) != views:
         raise _wrong("colors", f"shape {tuple(colors.shape)}", f"({views}, {count}, channels), one set per camera of viewmats")
     backdrop = _check_backgrounds(backgrounds, views, channels)
-    if Ks.requires_grad and knobs.backend != "reference":
+    if Ks.requires_grad and not all(backend.differentiates_intrinsics for backend in backends.candidates(knobs)):
+        able = " or ".join(f'backend="{b.name}"' for b in backends.available() if b.differentiates_intrinsics)
         raise BackendUnavailable(
-            f'rasterize: Ks requires a gradient, which backend="{knobs.backend}" does not compute; pass backend="reference" or Ks.detach()'
+            f'rasterize: Ks requires a gradient, which backend="{knobs.backend}" does not compute; pass {able} or Ks.detach()'
         )
     geometry, density = Geometry(means, log_scales, quats), Cosine(W1, b1, w2, b2, float(omega0))
     palettes = list(colors.unbind()) if colors.dim() == 3 else [colors] * views
@@ -148,9 +166,11 @@ def _settings(settings: dict[str, Any]) -> RenderSettings:
         if name not in names:
             raise ConfigError(f"rasterize: unknown setting {name!r}{nearest(name, names)}")
     try:
-        return RenderSettings(**settings)
+        knobs = RenderSettings(**settings)
     except TypeError as error:
         raise ConfigError(f"rasterize: settings {settings}: {error}") from error
+    backends.check_name(knobs.backend)
+    return knobs
 
 
 def _check_tensor(name: str, value: Any) -> None:

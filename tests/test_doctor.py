@@ -8,7 +8,7 @@ from rich.console import Console
 
 import neuprim.core.render as rendering
 from neuprim.cli import doctor
-from neuprim.core.render import BACKENDS
+from tests.backends import BACKENDS
 
 
 def report() -> tuple[int, str]:

@@ -19,6 +19,7 @@ from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, Neup
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.functional import Rasterized
 from tests import scenes
+from tests.backends import BACKENDS
 
 WIDTH, HEIGHT = 40, 30
 CAMERAS = [
@@ -26,7 +27,6 @@ CAMERAS = [
     scenes.camera(WIDTH, HEIGHT, distance=2.0, fov=60, shift=(7.5, -3.25)),
     scenes.camera(WIDTH, HEIGHT, distance=0.4, fov=90),
 ]
-BACKENDS = ["cpu", "reference"]
 
 
 def arguments(count: int = 30, seed: int = 7, cameras: list[Camera] | None = None, **kw: Any) -> dict[str, Any]:
@@ -46,7 +46,7 @@ def test_equals_the_renderer_camera_by_camera(backend: str, channels: int) -> No
     assert isinstance(out, Rasterized) and out.depth is not None
     assert out.rgb.shape == (3, HEIGHT, WIDTH, channels) and out.alpha.shape == out.depth.shape == (3, HEIGHT, WIDTH)
     assert out.rgb.dtype == torch.float32 and [s.backend for s in out.stats] == [backend] * 3
-    settings = RenderSettings(backend=backend, depth=True, near=0.05)  # type: ignore[arg-type]
+    settings = RenderSettings(backend=backend, depth=True, near=0.05)
     for c, camera in enumerate(CAMERAS):
         one = render_lowered(scenes.lowered(a), camera, settings, backgrounds[c])
         assert one.alpha.max() > 0.3
@@ -149,13 +149,15 @@ def test_population_statistics_come_back_per_camera() -> None:
     a = arguments()
     a["means"].requires_grad_()
     out = neuprim.rasterize(**a)
-    for stats in out.stats:
-        stats.pixel_error = torch.ones(HEIGHT, WIDTH)
+    error = torch.ones(3, HEIGHT, WIDTH)
+    error[1] = 0.5
+    tallies = out.watch(error)
     out.rgb.sum().backward()
-    for c, stats in enumerate(out.stats):
-        assert stats.weight is not None and stats.error_weight is not None
-        assert stats.weight.sum().item() == pytest.approx(out.alpha[c].sum().item(), rel=1e-4)
-        assert torch.allclose(stats.weight, stats.error_weight)
+    for c, tally in enumerate(tallies):
+        assert tally.weight.sum().item() == pytest.approx(out.alpha[c].sum().item(), rel=1e-4)
+        assert torch.allclose(tally.error_weight, tally.weight * (0.5 if c == 1 else 1.0))
+    with pytest.raises(DataError, match=rf"^rasterize: watch: error has shape \(2, 3\); expected \(3, {HEIGHT}, {WIDTH}\), that of alpha$"):
+        out.watch(torch.ones(2, 3))
 
 
 # ---------------------------------------------------------------- bad input

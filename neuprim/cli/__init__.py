@@ -35,8 +35,8 @@ commonest keys:
   train.iterations=N train.max_seconds=S
   model.primitives=N model.neurons=K model.sh_degree=D
   train.rates.NAME=R                   learning rate of one parameter
-  renderer.backend=auto|reference|cpu  renderer.threads=N
-  renderer.sort=center|entry           renderer.samples=N (rays per pixel side)
+  renderer.backend=auto|NAME           `neuprim doctor` lists them
+  renderer.sort=center|entry           renderer.samples=N (rays per pixel side) renderer.threads=N
   seed=N
 `neuprim run task=NAME scene=NAME --cfg` shows every key with its value. A value that contains , = or brackets is quoted
 twice, for the shell and for the grammar: "scene.path='a=b, c'"."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import typing
 from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
@@ -156,13 +155,11 @@ def _cuda() -> Rows:
 
 def _backends() -> tuple[Rows, bool]:
     """A row per backend, and whether any of them works."""
-    from neuprim.core.settings import BackendName
+    from neuprim.core.render import backends
 
     rows: Rows = []
     working = False
-    for name in typing.get_args(BackendName):
-        if name == "auto":
-            continue
+    for name in backends.names():
         reason = _probe(name)
         working = working or reason is None
         rows.append((name, "works" if reason is None else f"does not work: {reason}"))

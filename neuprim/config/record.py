@@ -12,6 +12,7 @@ import yaml
 
 from neuprim.config.schema import build
 from neuprim.core.errors import CheckpointError, ConfigError, nearest
+from neuprim.core.render.backends import check_name
 from neuprim.core.settings import RenderSettings
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.uses import OPTIONAL
@@ -39,6 +40,7 @@ class RunSettings:
         """Raises ConfigError for a value out of range."""
         if not 0 <= self.seed < 2**63:
             raise ConfigError(f"seed={self.seed}: expected a whole number from 0 to 2^63 - 1")
+        check_name(self.renderer.backend)
 
 
 @dataclass

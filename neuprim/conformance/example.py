@@ -13,6 +13,7 @@ from neuprim.core.model.fields import ConditionSpec, Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
+from neuprim.core.render.backends import ORACLE
 
 __all__ = ["Example", "between", "ring_camera", "sample"]
 
@@ -45,7 +46,7 @@ class _Views(ViewSet):
         self, split: str, cameras: list[Camera], conditions: tuple[ConditionSpec, ...], generator: torch.Generator, channels: int
     ) -> None:
         self.views = [View(f"{split}{i}", c, {s.name: sample(s, generator) for s in conditions}) for i, c in enumerate(cameras)]
-        settings = RenderSettings(backend="reference")
+        settings = RenderSettings(backend=ORACLE)
         frames = [render_lowered(_truth(channels), c, settings) for c in cameras]
         self.images = [Pixels(f.rgb, f.alpha) for f in frames]
 

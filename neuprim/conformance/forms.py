@@ -7,11 +7,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from neuprim.conformance.integrals import Alive, by_quadrature, chords, inside, line_integral, opaque_colour
+from neuprim.conformance.integrals import Alive, by_quadrature, chords, inside, opaque_colour
 from neuprim.conformance.subject import EXACT, Frozen, Subject, watched
 from neuprim.core.cameras import Camera
 from neuprim.core.data import View
 from neuprim.core.model.fields import LoweredColour, LoweredDensity, Opaque
+from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render import render, render_lowered
 
@@ -89,14 +90,14 @@ def check_line_integral(t: Subject) -> None:
             tested += len(prim)
             o, d, t0, t1 = chords(alive.moved, prim, generator)
             middle = t0 + 0.4 * (t1 - t0)
-            whole = line_integral(alive.form, alive.moved, prim, o, d, t0, t1)
+            whole = alive.form.optical_depth(Pairs.of(alive.moved, prim, o, d, t0, t1))
             t.require(
                 tuple(whole.shape) == tuple(prim.shape),
                 "density.lower: line integral",
                 f"shape {tuple(whole.shape)}",
                 str(tuple(prim.shape)),
             )
-            parts = [line_integral(alive.form, alive.moved, prim, o, d, a, b) for a, b in ((t0, middle), (middle, t1))]
+            parts = [alive.form.optical_depth(Pairs.of(alive.moved, prim, o, d, a, b)) for a, b in ((t0, middle), (middle, t1))]
             expected, peak = by_quadrature(model, alive, view.conditions, prim, o, d, t0, t1)
             piece, _ = by_quadrature(model, alive, view.conditions, prim, o, d, middle, t1)
             size = (t1 - t0) * peak + 1e-30

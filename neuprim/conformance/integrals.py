@@ -8,11 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.core.model.fields import Conditions, Constant, LoweredColour, LoweredDensity, Opaque, OpaqueColour, RayNet
+from neuprim.core.model.fields import Conditions, LoweredColour, LoweredDensity, OpaqueColour
 from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Primitives
 
-__all__ = ["Alive", "by_quadrature", "chords", "inside", "line_integral", "opaque_colour"]
+__all__ = ["Alive", "by_quadrature", "chords", "inside", "opaque_colour"]
 
 _PANELS, _NODES = 8, 16
 
@@ -64,20 +65,6 @@ def chords(geometry: Geometry, rows: Tensor, generator: torch.Generator) -> tupl
     return point - far[:, None] * d, d, far + (-b - root) / a, far + (-b + root) / a
 
 
-def line_integral(form: LoweredDensity, geometry: Geometry, prim: Tensor, o: Tensor, d: Tensor, t0: Tensor, t1: Tensor) -> Tensor:
-    """(M,) float64 integrals of sigma over chord pieces; the closed form of the method for ``Cosine``."""
-    if isinstance(form, Opaque):
-        return form.line_integral(prim, o, d, t0, t1)
-    m = geometry.length_scale.double()[prim]
-    half, middle = (t1 - t0) / 2, o + ((t0 + t1) / 2)[:, None] * d
-    local = (middle - geometry.means.double()[prim]) / m[:, None]
-    W1 = form.W1.double()[prim]
-    rate = form.omega0 * (W1 * d[:, None]).sum(-1) / m[:, None]
-    phase = form.omega0 * ((W1 * local[:, None]).sum(-1) + form.b1.double()[prim])
-    waves = (form.w2.double()[prim] * phase.cos() * torch.sinc(rate * half[:, None] / torch.pi)).sum(-1)
-    return 2 * half / m * (form.b2.double().reshape(len(form.b2), -1)[prim].sum(-1) + waves)
-
-
 def by_quadrature(
     model: Primitives, alive: Alive, conditions: Conditions, prim: Tensor, o: Tensor, d: Tensor, t0: Tensor, t1: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -94,15 +81,9 @@ def by_quadrature(
 
 def opaque_colour(colour: LoweredColour, geometry: Geometry) -> OpaqueColour:
     """The same colour as torch code per ray-primitive pair."""
-    if isinstance(colour, OpaqueColour):
-        return colour
-    if isinstance(colour, Constant):
-        rgb = colour.rgb
-        return OpaqueColour(lambda prim, x, d: rgb[prim], int(rgb.shape[1]))
-    assert isinstance(colour, RayNet)
-    net = colour
 
     def radiance(prim: Tensor, x: Tensor, d: Tensor) -> Tensor:
-        return net.radiance(prim, (x - geometry.means.double()[prim]) / geometry.length_scale.double()[prim][:, None])
+        nothing = x.new_zeros(len(x))
+        return colour.seen(Pairs.of(geometry, prim, x, d, nothing, nothing))
 
-    return OpaqueColour(radiance, net.channels)
+    return OpaqueColour(radiance, colour.channels)

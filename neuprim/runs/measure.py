@@ -27,7 +27,7 @@ from neuprim.core.io import images
 from neuprim.core.metrics import means, psnr, ssim, to_json
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render import RenderSettings, choose_backend, render
+from neuprim.core.render import RenderSettings, choose, render
 from neuprim.runs.open import LOGS, load_dataset, load_run
 from neuprim.version import __version__
 
@@ -161,6 +161,7 @@ def summary(
     """The content of ``metrics.json``. ``training`` holds iterations and train_seconds as the run recorded them."""
     worst = min(views, key=lambda v: v.psnr)
     lowered = model.lower(dataset.test.view(0).camera, dataset.test.view(0).conditions, config.renderer)
+    backend = choose(lowered, config.renderer)
     seconds = sorted(v.seconds for v in views)
     return {
         "task": config.task,
@@ -181,8 +182,8 @@ def summary(
         "model_bytes": model_bytes,
         **training,
         "render_fps": 1.0 / max(seconds[len(seconds) // 2], 1e-9),
-        "backend": choose_backend(lowered, config.renderer),
-        "device": f"cpu ({platform.processor() or platform.machine()})",
+        "backend": backend.name,
+        "device": backend.device(),
         "checkpoint": "last",
         "downsampling": dataset.downsampling,
         "background": [round(float(x), 6) for x in dataset.background],

@@ -16,7 +16,7 @@ from neuprim.config import RunConfig, suspects_of
 from neuprim.core import checkpoint
 from neuprim.core.errors import CheckpointError
 from neuprim.core.io.files import write_text
-from neuprim.core.render import choose_backend
+from neuprim.core.render.backends import choose, compiled_ahead
 from neuprim.plugins.provenance import check_resumed
 from neuprim.runs.curve import open_curve
 from neuprim.runs.events import Events, Finishing, Note, Preparing, silent
@@ -43,7 +43,8 @@ def run(config: RunConfig, events: Events = silent) -> Path:
     """
     directory = config.output_dir
     suspects = suspects_of(config)
-    with compiling(config.renderer.backend != "reference") as kernels, suspects.watch(directory / LOGS):
+    ahead = compiled_ahead(config.renderer)
+    with compiling(None if ahead is None else ahead.name) as kernels, suspects.watch(directory / LOGS):
         fitted = start(config, events, suspects=suspects)
         _resume(fitted, events)
         directory.mkdir(parents=True, exist_ok=True)
@@ -77,12 +78,12 @@ def _train(fitted: Fitted, events: Events) -> bool:
     view = fitted.dataset.train.view(0)
     lowered = trainer.model.lower(view.camera, view.conditions, trainer.renderer)
     form = type(lowered.colour).__name__
-    on_cpu = choose_backend(lowered, trainer.renderer, view.camera) == "cpu"
-    if on_cpu and not compiled(form):
+    backend = choose(lowered, trainer.renderer, view.camera)
+    if backend.compiles and not compiled(backend.name, form):
         events(Preparing(_COMPILING))
     warm_up(trainer)
-    if on_cpu:
-        mark_compiled(form)
+    if backend.compiles:
+        mark_compiled(backend.name, form)
     curve = open_curve(config.output_dir / "metrics.jsonl", trainer.step)
     last_saved = time.monotonic()
     interrupted = False

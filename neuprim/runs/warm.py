@@ -21,22 +21,22 @@ __all__ = ["Compiling", "compiled", "compiling", "main", "mark_compiled"]
 _LIMIT = 600.0  # seconds after which the run goes on alone
 
 
-def compiled(form: str = "Constant") -> bool:
-    """Whether the kernels that draw this form of colour (the name of its class) are on disk."""
-    return _marker(form).exists()
+def compiled(backend: str, form: str = "Constant") -> bool:
+    """Whether the kernels with which a backend draws this form of colour (the name of its class) are on disk."""
+    return _marker(backend, form).exists()
 
 
-def mark_compiled(form: str) -> None:
+def mark_compiled(backend: str, form: str) -> None:
     """Say so for the next run; a folder that cannot be written only costs that run a message."""
     try:
-        _marker(form).parent.mkdir(parents=True, exist_ok=True)
-        _marker(form).touch()
+        _marker(backend, form).parent.mkdir(parents=True, exist_ok=True)
+        _marker(backend, form).touch()
     except OSError:
         pass
 
 
-def _marker(form: str) -> Path:
-    return cache_directory() / f"{form}.compiled"
+def _marker(backend: str, form: str) -> Path:
+    return cache_directory() / f"{backend}-{form}.compiled"
 
 
 class Compiling:
@@ -65,12 +65,12 @@ class Compiling:
 
 
 @contextmanager
-def compiling(wanted: bool = True) -> Iterator[Compiling]:
-    """Start compiling unless that has been done or is not ``wanted``; the process never outlives the block."""
+def compiling(backend: str | None) -> Iterator[Compiling]:
+    """Start compiling this backend, None for none, unless that has been done; the process never outlives the block."""
     process = None
-    if wanted and not compiled() and sys.executable:
+    if backend is not None and not compiled(backend) and sys.executable:
         quiet = subprocess.DEVNULL
-        process = subprocess.Popen([sys.executable, "-m", "neuprim.runs.warm"], stdin=quiet, stdout=quiet, stderr=quiet)
+        process = subprocess.Popen([sys.executable, "-m", "neuprim.runs.warm", backend], stdin=quiet, stdout=quiet, stderr=quiet)
     started = Compiling(process)
     try:
         yield started
@@ -78,8 +78,8 @@ def compiling(wanted: bool = True) -> Iterator[Compiling]:
         started.stop()
 
 
-def main() -> None:
-    """A training step on a few primitives: forward, backward, colours, loss, optimiser."""
+def main(backend: str) -> None:
+    """A training step on a few primitives drawn by this backend: forward, backward, colours, loss, optimiser."""
     from neuprim.core.cameras import Camera, look_at
     from neuprim.core.data import View
     from neuprim.core.model.colours.sh_cpu import fused_colors
@@ -105,13 +105,13 @@ def main() -> None:
     camera = Camera(look_at(eye, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0])), 30.0, 30.0, 16.0, 16.0, 32, 32)
     geometry = Geometry(params["means"], params["log_scales"], params["quats"])
     colour = Constant(fused_colors(params["means"], params["dc"], params["rest"], camera.position, 3) + 0.5)
-    output = render_lowered(Lowered(geometry, density.lower(params, geometry, {}), colour), camera, RenderSettings(backend="cpu"))
-    output.stats.pixel_error = torch.ones(output.rgb.shape[:2])
+    output = render_lowered(Lowered(geometry, density.lower(params, geometry, {}), colour), camera, RenderSettings(backend=backend))
+    output.watch(torch.ones(output.rgb.shape[:2]))
     loss, _ = photometric({"ssim_weight": 0.2})(output.rgb, torch.zeros_like(output.rgb), Supervision(View("warm", camera)))
     loss.backward()
     RowAdam(specs, params).step(params, {spec.name: 1e-3 for spec in specs})
-    mark_compiled("Constant")
+    mark_compiled(backend, "Constant")
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1])

@@ -12,6 +12,7 @@ from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.shading import points_seen
 from tests import scenes
+from tests.backends import BACKENDS
 
 BACKGROUND = torch.tensor([0.3, 0.6, 0.9])
 
@@ -20,10 +21,10 @@ def lowered() -> Lowered:
     return scenes.lowered(scenes.tensors(12, 3, seed=4))
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_points_are_where_the_depth_image_says(backend: str) -> None:
     camera, found = scenes.camera(), []
-    settings = RenderSettings(backend=backend, depth=True)  # type: ignore[arg-type]
+    settings = RenderSettings(backend=backend, depth=True)
     plain = render_lowered(lowered(), camera, settings)
     assert plain.depth is not None
 
@@ -43,9 +44,9 @@ def test_points_are_where_the_depth_image_says(backend: str) -> None:
     assert torch.allclose(shaded.rgb, plain.rgb, atol=1e-6)
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_matter_is_shaded_and_the_background_is_not(backend: str) -> None:
-    camera, settings = scenes.camera(), RenderSettings(backend=backend)  # type: ignore[arg-type]
+    camera, settings = scenes.camera(), RenderSettings(backend=backend)
     black = render_lowered(lowered(), camera, settings)
     half = render_lowered(replace(lowered(), shade=lambda p: torch.full((len(p),), 0.5)), camera, settings, BACKGROUND)
     expected = 0.5 * black.rgb + (1 - black.alpha)[..., None] * BACKGROUND
@@ -53,10 +54,10 @@ def test_matter_is_shaded_and_the_background_is_not(backend: str) -> None:
     assert torch.allclose(half.rgb, expected.to(half.rgb), atol=1e-5)
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_gradients_are_those_of_the_product(backend: str) -> None:
     """Against a factor put on by hand to the picture over black; a depth image that nothing is asked of adds nothing."""
-    camera, settings = scenes.camera(), RenderSettings(backend=backend)  # type: ignore[arg-type]
+    camera, settings = scenes.camera(), RenderSettings(backend=backend)
     weights = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
     grads = []
     for shaded in (True, False):

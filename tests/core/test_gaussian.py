@@ -210,9 +210,9 @@ def test_every_strategy_of_population() -> None:
     camera = scenes.camera(32, 24)
     for strategy in (Relocate(PopulationSettings(fraction=0.2)), Gradient(PopulationSettings(grow_threshold=0.0, clone_scale=0.1))):
         output = render(m, camera, {}, RenderSettings())
-        output.stats.pixel_error = torch.ones(24, 32)
+        tally = output.watch(torch.ones(24, 32))
         output.rgb.square().mean().backward()
-        strategy.observe(m, output.stats)
+        strategy.observe(m, tally)
         change = strategy.intervene(m, 1.0)
         assert change is not None
         assert all(bool(torch.isfinite(v).all()) for v in change.params.values())

@@ -70,7 +70,7 @@ def test_names_in_docstrings_exist() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["neuprim.core.model.fields", "neuprim.core.model.fields.RayNets", "neuprim.cores", "neuprim.core.model.geometry.Geometry"]
+    "name", ["neuprim.core.fields", "neuprim.core.model.fields.RayNets", "neuprim.cores", "neuprim.core.geometry.Geometry"]
 )
 def test_a_wrong_name_is_noticed(name: str) -> None:
     assert not exists(name)

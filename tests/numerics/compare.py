@@ -11,6 +11,8 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.model.fields import OpaqueColour
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
+from neuprim.core.render.backends import ORACLE
+from neuprim.core.render.output import Tally
 from neuprim.core.render.reference.backend import pixel_directions
 from tests import scenes
 
@@ -21,6 +23,7 @@ class Frame:
 
     output: RenderOutput
     grads: dict[str, Tensor]
+    tally: Tally
 
 
 def weights(shape: tuple[int, ...], seed: int) -> Tensor:
@@ -105,10 +108,10 @@ def draw(
     leaves = {k: v.detach().to(dtype).requires_grad_() for k, v in t.items()}
     view = camera.viewmat.detach().clone().requires_grad_(with_view)
     background = torch.linspace(0.2, 0.9, scenes.channels(t)).to(dtype).requires_grad_()
-    output = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(settings, backend=backend), background)  # type: ignore[arg-type]
+    output = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(settings, backend=backend), background)
     h, w, C = output.rgb.shape
     keep = torch.ones(h, w, dtype=torch.float64) if skip is None else (~skip).double()
-    output.stats.pixel_error = (weights((h, w), 3).abs() * keep).float()
+    tally = output.watch((weights((h, w), 3).abs() * keep).float())
     total = (output.rgb * (weights((h, w, C), 0) * keep[..., None]).to(dtype)).sum() + (
         output.alpha * (weights((h, w), 1) * keep).to(dtype)
     ).sum()
@@ -121,7 +124,7 @@ def draw(
     grads["background"] = background.grad if background.grad is not None else torch.zeros_like(background)
     if with_view and view.grad is not None:
         grads["viewmat"] = view.grad
-    return Frame(output, {k: v.detach() for k, v in grads.items()})
+    return Frame(output, {k: v.detach() for k, v in grads.items()}, tally)
 
 
 def row_errors(found: Tensor, expected: Tensor) -> Tensor:
@@ -135,12 +138,17 @@ def row_errors(found: Tensor, expected: Tensor) -> Tensor:
 
 
 def assert_same_frame(
-    t: dict[str, Tensor], camera: Camera, settings: RenderSettings, image_bound: float = 1e-5, grad_bound: float = 1e-3
+    t: dict[str, Tensor],
+    camera: Camera,
+    settings: RenderSettings,
+    image_bound: float = 1e-5,
+    grad_bound: float = 1e-3,
+    backend: str = "cpu",
 ) -> tuple[Frame, Frame]:
-    """cpu within ``image_bound`` of the reference, gradients within ``grad_bound`` of each row's norm; returns (cpu, reference)."""
+    """``backend`` within ``image_bound`` of the reference, gradients within ``grad_bound`` of each row's norm; returns both."""
     skip = undecided(t, camera, settings)
     assert skip.float().mean() < 0.05, f"{int(skip.sum())} pixels are undecided: too many for the comparison to mean much"
-    fast, slow = (draw(b, t, camera, settings, skip) for b in ("cpu", "reference"))
+    fast, slow = (draw(b, t, camera, settings, skip) for b in (backend, ORACLE))
     keep = ~skip
     report: dict[str, Any] = {}
     report["rgb"] = (fast.output.rgb.double() - slow.output.rgb).abs().amax(-1)[keep].max().item()

@@ -132,7 +132,7 @@ def draw(lowered: Lowered, backend: str) -> tuple[Tensor, dict[str, Tensor | Non
 
 def refuse(lowered: Lowered, backend: str, name: str, background: Any = None) -> None:
     try:
-        image = render_lowered(lowered, CAMERA, RenderSettings(backend=backend), background).rgb  # type: ignore[arg-type]
+        image = render_lowered(lowered, CAMERA, RenderSettings(backend=backend), background).rgb
     except FormError as error:
         text = str(error)
         if name not in text or "expected" not in text or "\n" in text:

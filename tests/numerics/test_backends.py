@@ -1,4 +1,4 @@
-"""The cpu backend against the float64 reference, and the reference against finite differences."""
+"""The fast backends against the float64 reference, and the reference against finite differences."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ from torch import Tensor
 
 from neuprim.core.errors import BackendUnavailable, NonFiniteError
 from neuprim.core.model.fields import Constant, Opaque, OpaqueColour
-from neuprim.core.render import RenderSettings, choose_backend, render_lowered
+from neuprim.core.render import RenderSettings, choose, render_lowered
 from tests import scenes
+from tests.backends import BACKENDS, FAST
 from tests.numerics.cases import CASES, DEFAULT, case
 from tests.numerics.compare import assert_same_frame, draw, row_errors
 
 
+@pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize("name", CASES)
-def test_cpu_equals_reference(name: str) -> None:
+def test_equals_reference(name: str, backend: str) -> None:
     t, camera, settings = case(name)
-    fast, slow = assert_same_frame(t, camera, settings)
+    fast, slow = assert_same_frame(t, camera, settings, backend=backend)
     assert slow.output.alpha.max() > 0.1, "the view must show something"
     assert fast.output.rgb.dtype == torch.float32 and slow.output.rgb.dtype == torch.float64
-    seen = slow.output.stats
-    other = fast.output.stats
-    assert seen.weight is not None and seen.error_weight is not None and other.weight is not None and other.error_weight is not None
+    seen = slow.tally
+    other = fast.tally
     # the sums run over all pixels, so a single pair on the other side of a cut shows: alpha_min x T at most
     assert (other.weight - seen.weight).abs().max() <= 2e-5 * seen.weight.max() + 2 / 255
     assert (other.error_weight - seen.error_weight).abs().max() <= 2e-5 * seen.error_weight.max() + 1e-4
@@ -51,10 +52,10 @@ def test_a_view_that_shows_nothing() -> None:
     view[2] *= -1
     view[0] *= -1  # turned round
     background = torch.tensor([0.1, 0.6, 0.3], requires_grad=True)
-    for backend in ("cpu", "reference"):
+    for backend in BACKENDS:
         leaves = {k: v.clone().requires_grad_() for k, v in t.items()}
         background.grad = None
-        out = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(DEFAULT, backend=backend), background)  # type: ignore[arg-type]
+        out = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(DEFAULT, backend=backend), background)
         assert torch.equal(out.rgb, background.detach().expand(20, 33, 3)) and out.depth is not None
         assert out.alpha.abs().max() == 0 and out.depth.abs().max() == 0
         (out.rgb.sum() + out.alpha.sum() + out.depth.sum()).backward()
@@ -62,27 +63,28 @@ def test_a_view_that_shows_nothing() -> None:
         assert background.grad is not None and torch.allclose(background.grad, torch.full((3,), 660.0))
 
 
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_no_primitives_at_all(backend: str) -> None:
     leaves = {k: v[:0].clone().requires_grad_() for k, v in scenes.tensors(2).items()}
-    out = render_lowered(scenes.lowered(leaves), scenes.camera(20, 17), RenderSettings(backend=backend), torch.tensor([0.5, 0.25, 1.0]))  # type: ignore[arg-type]
+    out = render_lowered(scenes.lowered(leaves), scenes.camera(20, 17), RenderSettings(backend=backend), torch.tensor([0.5, 0.25, 1.0]))
     assert torch.equal(out.rgb, torch.tensor([0.5, 0.25, 1.0]).expand(17, 20, 3))
     assert out.alpha.abs().max() == 0
     if out.rgb.requires_grad:
-        out.stats.pixel_error = torch.ones(17, 20)
+        out.watch(torch.ones(17, 20))
         out.rgb.sum().backward()
 
 
-def test_any_number_of_threads_gives_the_same_bits() -> None:
+@pytest.mark.parametrize("backend", FAST)
+def test_any_number_of_threads_gives_the_same_bits(backend: str) -> None:
     t, camera = scenes.tensors(1500, 5, seed=3, radius=0.06), scenes.camera(100, 70)
-    frames = [draw("cpu", t, camera, replace(DEFAULT, threads=n)) for n in (1, 2, 3)]
+    frames = [draw(backend, t, camera, replace(DEFAULT, threads=n)) for n in (1, 2, 3)]
     for other in frames[1:]:
         for image in ("rgb", "alpha", "depth"):
             assert torch.equal(getattr(frames[0].output, image), getattr(other.output, image)), image
         for name, grad in frames[0].grads.items():
             assert torch.equal(grad, other.grads[name]), name
         for sums in ("weight", "error_weight"):
-            assert torch.equal(getattr(frames[0].output.stats, sums), getattr(other.output.stats, sums)), sums
+            assert torch.equal(getattr(frames[0].tally, sums), getattr(other.tally, sums)), sums
     assert frames[0].output.alpha.max() > 0.5
 
 
@@ -183,11 +185,11 @@ def test_scales_beyond_the_range_are_named(value: float) -> None:
 
 def test_forms_without_a_kernel_go_to_the_reference() -> None:
     low = scenes.lowered(scenes.tensors(3))
-    assert choose_backend(low, RenderSettings()) == "cpu"
+    assert choose(low, RenderSettings()).name == "cpu"
     opaque = Opaque(lambda prim, o, d, t0, t1: t1 - t0)
-    assert choose_backend(replace(low, density=opaque), RenderSettings()) == "reference"
+    assert choose(replace(low, density=opaque), RenderSettings()).name == "reference"
     colour = OpaqueColour(lambda prim, x, d: x, 3)
-    assert choose_backend(replace(low, colour=colour), RenderSettings()) == "reference"
+    assert choose(replace(low, colour=colour), RenderSettings()).name == "reference"
     with pytest.raises(BackendUnavailable, match="Opaque density"):
         render_lowered(replace(low, density=opaque), scenes.camera(8, 8), RenderSettings(backend="cpu"))
 

@@ -15,29 +15,29 @@ from neuprim.core.cameras import Camera
 from neuprim.core.errors import ConfigError
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from tests import scenes
+from tests.backends import BACKENDS, FAST
 from tests.numerics.cases import CASES, along_z, case, needle_and_sphere, spheres
 from tests.numerics.compare import assert_same_frame, draw, entries
 
 ENTRY = RenderSettings(sort="entry", depth=True)
-BACKENDS = ("reference", "cpu")
 
 
 def render(t: dict[str, Tensor], camera: Camera, settings: RenderSettings, backend: str, **knobs: Any) -> RenderOutput:
     dtype = torch.float64 if backend == "reference" else torch.float32
     model = scenes.lowered({k: v.to(dtype) for k, v in t.items()})
-    return render_lowered(model, camera, replace(settings, backend=backend, **knobs))  # type: ignore[arg-type]
+    return render_lowered(model, camera, replace(settings, backend=backend, **knobs))
 
 
-# ---------------------------------------------------------------- cpu against reference
+# ---------------------------------------------------------------- fast against reference
 
 
+@pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize("name", CASES)
-def test_cpu_equals_reference(name: str) -> None:
+def test_equals_reference(name: str, backend: str) -> None:
     t, camera, settings = case(name)
-    fast, slow = assert_same_frame(t, camera, replace(settings, sort="entry"))
+    fast, slow = assert_same_frame(t, camera, replace(settings, sort="entry"), backend=backend)
     assert slow.output.alpha.max() > 0.1, "the view must show something"
-    seen, other = slow.output.stats, fast.output.stats
-    assert seen.weight is not None and seen.error_weight is not None and other.weight is not None and other.error_weight is not None
+    seen, other = slow.tally, fast.tally
     # the sums run over all pixels, undecided ones too: a pair on the other side of a cut, or a pair of near ties
     assert (other.weight - seen.weight).abs().max() <= 2e-5 * seen.weight.max() + 4 / 255
     assert (other.error_weight - seen.error_weight).abs().max() <= 2e-5 * seen.error_weight.max() + 1e-4
@@ -69,7 +69,7 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
         for name, grad in frames[0].grads.items():
             assert torch.equal(grad, other.grads[name]), name
         for sums in ("weight", "error_weight"):
-            assert torch.equal(getattr(frames[0].output.stats, sums), getattr(other.output.stats, sums)), sums
+            assert torch.equal(getattr(frames[0].tally, sums), getattr(other.tally, sums)), sums
     assert frames[0].output.alpha.max() > 0.5
 
 

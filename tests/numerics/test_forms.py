@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -24,14 +25,14 @@ from neuprim.core.render.joint import joint_volume
 from neuprim.core.volumes.grid import density_at, density_grid
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
+from tests.backends import BACKENDS
 
-BACKENDS = ["cpu", "reference"]
 CAMERA = scenes.camera(20, 16)
 N, K = 20, 8
 
 
 def settings(backend: str, **more: Any) -> RenderSettings:
-    return RenderSettings(backend=backend, **more)  # type: ignore[arg-type]
+    return RenderSettings(backend=backend, **more)
 
 
 def model(density: type[CosineDensity] = CosineDensity, colour: type[SphericalHarmonics] = SphericalHarmonics) -> Primitives:
@@ -224,12 +225,17 @@ def test_backgrounds_rows_and_cameras(backend: str, samples: int) -> None:
         joint_volume(lowered, CAMERA, background=torch.ones(2))
 
 
-def test_an_error_map_of_another_size() -> None:
+@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_an_error_map_of_another_size(backend: str, samples: int) -> None:
+    """Where it is given, not in the backward pass."""
     t = {k: v.requires_grad_() for k, v in scenes.tensors(N).items()}
-    out = render_lowered(scenes.lowered(t), CAMERA, settings("cpu"))
-    out.stats.pixel_error = torch.ones(3, 4)
-    with pytest.raises(FormError, match=r"^stats\.pixel_error has shape \(3, 4\); expected \(16, 20\)"):
-        out.rgb.sum().backward()
+    out = render_lowered(scenes.lowered(t), CAMERA, settings(backend, samples=samples))
+    with pytest.raises(FormError, match=r"^watch: error has shape \(3, 4\); expected \(16, 20\), that of the frame$"):
+        out.watch(torch.ones(3, 4))
+    with pytest.raises(FormError, match=r"^watch: error has type ndarray; expected a torch tensor$"):
+        out.watch(np.ones((16, 20)))  # type: ignore[arg-type]
+    assert out.stats.watched is None
 
 
 @pytest.mark.parametrize(

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import import_module
 
 import pytest
 import torch
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
+from neuprim.core.render import RenderOutput, RenderSettings, find, render_lowered
 from tests import scenes
+from tests.backends import BACKENDS
 
 SETTINGS = RenderSettings(depth=True)
 SKY = torch.tensor([0.3, 0.6, 0.1])
@@ -32,7 +32,7 @@ def blocks(image: Tensor, n: int) -> Tensor:
 
 
 @pytest.mark.parametrize("sort", ["center", "entry"])
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("n", [2, 3])
 def test_means_of_a_finer_image(backend: str, sort: str, n: int) -> None:
     settings = replace(SETTINGS, backend=backend, sort=sort)  # type: ignore[arg-type]
@@ -47,39 +47,37 @@ def test_means_of_a_finer_image(backend: str, sort: str, n: int) -> None:
     assert (plain.rgb - out.rgb).abs().max() > 0.02, "edges must be smoother than with one ray"
     weight = torch.randn(15, 20, 3, generator=torch.Generator().manual_seed(0))
     error = torch.rand(15, 20, generator=torch.Generator().manual_seed(1))
-    out.stats.pixel_error = error
-    fine.stats.pixel_error = error.repeat_interleave(n, 0).repeat_interleave(n, 1)
-    assert torch.equal(out.stats.pixel_error, error)
+    a, b = out.watch(error), fine.watch(error.repeat_interleave(n, 0).repeat_interleave(n, 1))
     (out.rgb * weight).sum().backward()
     (rgb * weight).sum().backward()
     for k in first:
         assert torch.allclose(first[k].grad, second[k].grad, rtol=1e-4, atol=1e-6), k  # type: ignore[arg-type]
-    a, b = out.stats, fine.stats
-    assert a.weight is not None and b.weight is not None and a.error_weight is not None and b.error_weight is not None
+    assert a.weight.max() > 1
     assert torch.allclose(a.weight, b.weight / n**2) and torch.allclose(a.error_weight, b.error_weight / n**2)
-    assert a.backend == backend and a.pairs == b.pairs
+    assert out.stats.backend == backend and out.stats.pairs == fine.stats.pairs
 
 
 def test_statistics_compare_with_one_ray_per_pixel() -> None:
     sums = []
     for n in (1, 3):
         out = frame(leaves(), replace(SETTINGS, samples=n))
-        out.stats.pixel_error = torch.full((15, 20), 0.5)
+        tally = out.watch(torch.full((15, 20), 0.5))
         out.rgb.sum().backward()
-        assert out.stats.weight is not None and out.stats.error_weight is not None
-        assert torch.allclose(out.stats.error_weight, 0.5 * out.stats.weight, rtol=1e-5)
-        sums.append(out.stats.weight)
+        assert torch.allclose(tally.error_weight, 0.5 * tally.weight, rtol=1e-5)
+        sums.append(tally.weight)
     assert sums[0].sum() == pytest.approx(sums[1].sum().item(), rel=0.03)
     assert (sums[0] - sums[1]).abs().max() < 0.1 * sums[0].max()
 
 
-def test_statistics_may_be_written() -> None:
-    """As any frame's: what is set is what is read."""
-    stats = frame(leaves(), replace(SETTINGS, samples=2)).stats
-    stats.weight, stats.error_weight = torch.full((40,), 3.0), torch.full((40,), 2.0)
-    assert torch.equal(stats.weight, torch.full((40,), 3.0)) and torch.equal(stats.error_weight, torch.full((40,), 2.0))
-    stats.pixel_error = None
-    assert stats.pixel_error is None
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_only_what_is_watched_is_summed(backend: str) -> None:
+    """A tally is zeros until the backward pass; a second one takes the place of the first."""
+    out = frame(leaves(), replace(SETTINGS, backend=backend, samples=2))
+    first, second = out.watch(torch.ones(15, 20)), out.watch(torch.full((15, 20), 0.25, requires_grad=True))
+    assert second.weight.shape == second.error_weight.shape == (40,) and second.weight.abs().max() == 0
+    out.rgb.sum().backward()
+    assert first.weight.abs().max() == 0 and second.weight.max() > 1
+    assert torch.allclose(second.error_weight, 0.25 * second.weight) and not second.error_weight.requires_grad
 
 
 @pytest.mark.parametrize("value", [0, -1, 17])
@@ -88,11 +86,11 @@ def test_counts_out_of_range_are_named(value: int) -> None:
         RenderSettings(samples=value)
 
 
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_one_sample_is_the_backend_itself(backend: str) -> None:
-    draw = import_module(f"neuprim.core.render.{backend}.backend").render
+    draw = find(backend).load()
     t = scenes.tensors(40, 4, seed=6)
-    settings = replace(SETTINGS, backend=backend, samples=1)  # type: ignore[arg-type]
+    settings = replace(SETTINGS, backend=backend, samples=1)
     out, direct = frame(t, settings), draw(scenes.lowered(t), CAMERA, SKY, settings)
     assert torch.equal(out.rgb, direct.rgb) and torch.equal(out.alpha, direct.alpha) and torch.equal(out.depth, direct.depth)
-    assert type(out.stats) is type(direct.stats)
+    assert out.stats.samples == direct.stats.samples == 1 and out.stats.pairs == direct.stats.pairs

@@ -1,6 +1,7 @@
 """The closed forms that fields lower to: what a renderer draws, with its task's conditions folded in.
 
-Each knows its tensors, what shapes they must have, and what can be done with it whatever it is; renderers know the forms' mathematics.
+Each knows its tensors, what shapes they must have, and its mathematics: the optical depth along chords of rays (:class:`Pairs`), the colour
+that is seen there. A renderer that asks for these draws any form; kernels know a few of them by name.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import FormError
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.tensors import MOST_UNITS, Shaped, Shapes, Sizes, function_fault, labelled, number_fault
 
 __all__ = [
@@ -26,6 +29,15 @@ __all__ = [
     "Shade",
     "Shading",
 ]
+
+
+def _sinc(z: Tensor) -> Tensor:
+    small = z.abs() < 1e-3
+    safe = torch.where(small, torch.ones_like(z), z)
+    z2 = z * z
+    series = 1 - z2 / 6 * (1 - z2 / 20 * (1 - z2 / 42))
+    return torch.where(small, series, safe.sin() / safe)
+
 
 # ---------------------------------------------------------------- closed forms of density
 
@@ -82,6 +94,15 @@ class Cosine(Shaped):
         W1, b1, w2, b2 = (x.detach()[index] for x in (self.W1, self.b1, self.w2, self.b2))
         return Cosine(W1, b1, w2, b2, self.omega0)
 
+    def optical_depth(self, pairs: Pairs) -> Tensor:
+        """(M,) float64 integrals of sigma along chords: one (cos, sinc) pair per neuron, whatever their length."""
+        prim = pairs.prim
+        W1 = self.W1.double()[prim]
+        phase = self.omega0 * ((W1 * pairs.local[:, None, :]).sum(-1) + self.b1.double()[prim])
+        rate = self.omega0 * (W1 * pairs.direction[:, None, :]).sum(-1)
+        waves = (self.w2.double()[prim] * phase.cos() * _sinc(rate * pairs.half[:, None])).sum(-1)
+        return 2 * pairs.half * (self.b2.double().reshape(-1)[prim] + waves)
+
 
 @dataclass(frozen=True)
 class Opaque(Shaped):
@@ -100,6 +121,10 @@ class Opaque(Shaped):
         """That of some primitives, (M,) int64."""
         return Opaque(lambda prim, *ray: self.line_integral(index[prim], *ray))
 
+    def optical_depth(self, pairs: Pairs) -> Tensor:
+        """Integrals of sigma along chords as the code returns them, unchecked: see :meth:`~neuprim.core.model.primitives.Lowered.optical_depth`."""
+        return self.line_integral(pairs.prim, pairs.origins, pairs.direction, *pairs.ends)
+
 
 LoweredDensity = Cosine | Opaque
 
@@ -111,6 +136,7 @@ LoweredDensity = Cosine | Opaque
 class Constant(Shaped):
     """One colour per primitive and view: rgb (N, C), any channel count."""
 
+    per_primitive: ClassVar[bool] = True
     shapes: ClassVar[Shapes] = {"rgb": (("N", "C"),)}
 
     rgb: Tensor
@@ -126,6 +152,19 @@ class Constant(Shaped):
         """The same times (N,) factors, at least 0."""
         return Constant(self.rgb * factors.to(self.rgb)[:, None])
 
+    def seen(self, pairs: Pairs) -> Tensor:
+        """(M, C) float64 colours that are seen along chords."""
+        return self.rgb.double()[pairs.prim]
+
+    def at_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
+        """(N, C) colours at the centres of the primitives, seen from ``position`` (3,)."""
+        return self.rgb
+
+    @property
+    def flat(self) -> Tensor:
+        """(N, C) colours, as they are the same all over a primitive."""
+        return self.rgb
+
 
 @dataclass(frozen=True)
 class OpaqueColour(Shaped):
@@ -135,6 +174,8 @@ class OpaqueColour(Shaped):
     and returns (M, C).
     """
 
+    per_primitive: ClassVar[bool] = False
+    flat: ClassVar[None] = None
     radiance: Callable[[Tensor, Tensor, Tensor], Tensor]
     channels: int
 
@@ -153,6 +194,16 @@ class OpaqueColour(Shaped):
 
         return OpaqueColour(radiance, self.channels)
 
+    def seen(self, pairs: Pairs) -> Tensor:
+        """Colours that are seen along chords as the code returns them, unchecked: see :meth:`~neuprim.core.model.primitives.Lowered.seen`."""
+        return self.radiance(pairs.prim, pairs.points, pairs.direction)
+
+    def at_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
+        """Colours at the centres of the primitives, seen from ``position`` (3,), unchecked."""
+        means = geometry.means
+        directions = torch.nn.functional.normalize(means - position.to(means), dim=1)
+        return self.radiance(torch.arange(geometry.count), means, directions)
+
 
 @dataclass(frozen=True)
 class RayNet(Shaped):
@@ -170,6 +221,8 @@ class RayNet(Shaped):
         Wout: (N, C, H), base: (N, C), any channel count C.
     """
 
+    per_primitive: ClassVar[bool] = True
+    flat: ClassVar[None] = None
     shapes: ClassVar[Shapes] = {"Wx": (("N", "H", 3),), "bias": (("N", "H"),), "base": (("N", "C"),), "Wout": (("N", "C", "H"),)}
 
     Wx: Tensor
@@ -196,8 +249,17 @@ class RayNet(Shaped):
         mixed = (self.Wout.double()[prim] * phase.cos()[:, None, :]).sum(-1)
         return (self.base.double()[prim] + mixed).clamp_min(0)
 
+    def seen(self, pairs: Pairs) -> Tensor:
+        """(M, C) float64 colours that are seen along chords; differentiable."""
+        return self.radiance(pairs.prim, pairs.local)
+
+    def at_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
+        """(N, C) float64 colours at the centres of the primitives; the same from everywhere."""
+        return self.radiance(torch.arange(geometry.count), torch.zeros(geometry.count, 3, dtype=torch.float64))
+
 
 LoweredColour = Constant | RayNet | OpaqueColour
+"""Of each: ``channels``, and ``per_primitive``, whether a colour at its centre says what a primitive looks like from a direction."""
 
 Shade = Callable[[Tensor], Tensor]
 """(M, 3) float64 scene points that pixels show -> (M,) factors on the light that they send to the camera, without gradient."""

@@ -24,8 +24,9 @@ from neuprim.core.model.checks import (
     method,
     source,
 )
-from neuprim.core.model.fields import ColourField, Conditions, Constant, DensityField, LoweredColour, LoweredDensity, RayNet, Shade
+from neuprim.core.model.fields import ColourField, Conditions, DensityField, LoweredColour, LoweredDensity, Shade
 from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry
+from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.schema import InitContext, ParameterSpec
 from neuprim.core.model.tensors import function_fault
 from neuprim.core.settings import RenderSettings
@@ -79,15 +80,25 @@ class Lowered:
 
     def center_colors(self, position: Tensor) -> Tensor:
         """(M, C) colours at the primitives' centres, seen from ``position`` (3,)."""
-        count = self.geometry.count
-        if isinstance(self.colour, Constant):
-            return self.colour.rgb
-        if isinstance(self.colour, RayNet):
-            return self.colour.radiance(torch.arange(count), torch.zeros(count, 3, dtype=torch.float64))
-        means = self.geometry.means
-        directions = torch.nn.functional.normalize(means - position.to(means), dim=1)
-        found = self.colour.radiance(torch.arange(count), means, directions)
-        return check_result(found, (count, self.colour.channels), f"{self.source('colour')}: radiance")
+        found = self.colour.at_centers(self.geometry, position)
+        return check_result(found, (self.geometry.count, self.colour.channels), f"{self.source('colour')}: radiance")
+
+    def optical_depth(self, pairs: Pairs) -> Tensor:
+        """(M,) float64 integrals of sigma along chords, unclamped.
+
+        Raises:
+            FormError: the density's own code returned something else.
+        """
+        return check_result(self.density.optical_depth(pairs), (len(pairs),), f"{self.source('density')}: line_integral").double()
+
+    def seen(self, pairs: Pairs) -> Tensor:
+        """(M, C) float64 colours that are seen along chords.
+
+        Raises:
+            FormError: the colour's own code returned something else.
+        """
+        found = self.colour.seen(pairs)
+        return check_result(found, (len(pairs), self.colour.channels), f"{self.source('colour')}: radiance").double()
 
 
 @dataclass(frozen=True)

@@ -10,42 +10,31 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.rays import AnyCamera, RayCamera
-from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.core.model.fields import Constant, Cosine, RayNet
+from neuprim.core.errors import ConfigError
+from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.primitives import Lowered, Primitives
-from neuprim.core.render.output import RenderOutput, RenderStats
+from neuprim.core.render.backends import Backend, available, choose, find
+from neuprim.core.render.output import RenderOutput, RenderStats, Tally
 from neuprim.core.render.refusals import refuse_non_finite
 from neuprim.core.render.samples import render_samples
 from neuprim.core.render.shading import Draw, with_shade
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["BACKENDS", "RenderOutput", "RenderSettings", "RenderStats", "choose_backend", "probe", "render", "render_lowered"]
-
-BACKENDS = ("reference", "cpu")
+__all__ = [
+    "Backend",
+    "RenderOutput",
+    "RenderSettings",
+    "RenderStats",
+    "Tally",
+    "available",
+    "choose",
+    "find",
+    "probe",
+    "render",
+    "render_lowered",
+]
 
 _PROBE_ERROR = 1e-5  # float32 with fast functions errs by less than 1e-6 here
-
-
-def choose_backend(lowered: Lowered, settings: RenderSettings, camera: AnyCamera | None = None) -> str:
-    """The backend that will draw this model through this camera; without a camera, through a pinhole.
-
-    Raises:
-        BackendUnavailable: when the fast backend is asked for by name but does not know the model's forms or the camera.
-    """
-    known = isinstance(lowered.density, Cosine) and isinstance(lowered.colour, Constant | RayNet)
-    pinhole = not isinstance(camera, RayCamera)
-    if settings.backend == "auto":
-        return "cpu" if known and pinhole else "reference"
-    if settings.backend == "cpu" and not known:
-        forms = f"{type(lowered.density).__name__} density, {type(lowered.colour).__name__} colour"
-        raise BackendUnavailable(
-            f"renderer.backend=cpu cannot draw {forms}; it knows Cosine, and Constant or RayNet. Use renderer.backend=reference"
-        )
-    if settings.backend == "cpu" and not pinhole:
-        raise BackendUnavailable(
-            "renderer.backend=cpu cannot draw a RayCamera (fisheye, equirectangular); it knows pinhole cameras. Use renderer.backend=reference"
-        )
-    return settings.backend
 
 
 def render(
@@ -60,7 +49,7 @@ def render(
     Args:
         model: the primitives; each field lowers under ``conditions`` first.
         camera: the view; rgb is (camera.height, camera.width, C). A :class:`RayCamera` (any central projection) is drawn
-            by the reference backend.
+            by the reference backend alone.
         conditions: e.g. ``{"time": tensor(0.5)}``.
         settings: every speed/accuracy knob.
         background: (C,) colour behind everything; None is black.
@@ -68,7 +57,8 @@ def render(
     Raises:
         FormError: a field, the camera or the background has a tensor that does not fit (field, tensor, found and expected).
         NonFiniteError: a parameter is NaN or infinite (named, with the primitive).
-        BackendUnavailable: the backend asked for cannot draw this model or this camera.
+        BackendUnavailable: the backend asked for cannot draw this model or this camera, or cannot run here.
+        ConfigError: there is no backend of the name asked for.
     """
     settings = settings or RenderSettings()
     return render_lowered(model.lower(camera, conditions or {}, settings), camera, settings, background)
@@ -77,12 +67,10 @@ def render(
 def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None) -> RenderOutput:
     """Draw a model whose conditions are already folded in; refuses what does not fit or is not finite, see :func:`render`."""
     lowered.check(camera.viewmat, background)
-    if choose_backend(lowered, settings, camera) == "cpu":  # which checks while it prepares
-        from neuprim.core.render.cpu.backend import render as draw
-    else:
-        from neuprim.core.render.reference.backend import render as draw
-
+    backend = choose(lowered, settings, camera)
+    if not backend.checks:
         refuse_non_finite(lowered)
+    draw = backend.load()
     paint: Draw = draw if lowered.shade is None else with_shade(draw)
     if settings.samples > 1:
         if isinstance(camera, RayCamera):
@@ -99,13 +87,16 @@ def probe(name: str) -> str | None:
     from neuprim.core.model.geometry import Geometry
 
     try:
+        missing = find(name).missing()
+        if missing is not None:
+            return missing
         view = torch.eye(4, dtype=torch.float64)
         view[2, 3] = 3.0
         camera = Camera(view, 16.0, 16.0, 8.0, 8.0, 16, 16)
         geometry = Geometry(torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]))
         density = Cosine(torch.zeros(1, 1, 3), torch.zeros(1, 1), torch.zeros(1, 1), torch.ones(1))
         lowered = Lowered(geometry, density, Constant(torch.ones(1, 3)))
-        middle = render_lowered(lowered, camera, RenderSettings(backend=name)).rgb[8, 8, 0].item()  # type: ignore[arg-type]
+        middle = render_lowered(lowered, camera, RenderSettings(backend=name)).rgb[8, 8, 0].item()
     except Exception as error:  # a broken installation may fail in any way; the reason is what the user wants to read
         return f"{type(error).__name__}: {error}"
     aside = (camera.cx - 8.5) / camera.fx  # the pixel's centre is half a pixel from the sphere's, on both axes

@@ -24,9 +24,8 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import ConfigError
 from neuprim.core.metrics import psnr
-from neuprim.core.model.checks import check_result
-from neuprim.core.model.fields import Constant, Cosine, RayNet
 from neuprim.core.model.geometry import quaternion_to_matrix
+from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import render_lowered
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
@@ -128,7 +127,7 @@ def _draw(lowered: Lowered, camera: Camera, background: Tensor | None, settings:
     boxes = screen_boxes(g, camera, settings.near)
     whiten = (quaternion_to_matrix(g.quats.double()) / g.log_scales.double().exp()[:, None, :]).transpose(1, 2)  # scene -> unit sphere
     image = torch.zeros(camera.height, camera.width, channels + 2, dtype=torch.float64)
-    stats = RenderStats("joint")
+    stats = RenderStats("joint", g.count)
     for y in range(0, camera.height, _BLOCK):
         for x in range(0, camera.width, _BLOCK):
             window = directions[y : y + _BLOCK, x : x + _BLOCK]
@@ -156,7 +155,7 @@ def _march(
     stats: RenderStats,
 ) -> Tensor:
     """(P, channels + 2): premultiplied colour, transmittance and sum of w z of P unit rays ``d`` (camera axes) against ``rows``."""
-    g, colour = lowered.geometry, lowered.colour
+    g = lowered.geometry
     origin = camera.position.detach().double()
     world = d @ camera.viewmat.detach().double()[:3, :3]
 
@@ -170,8 +169,8 @@ def _march(
     start, end = torch.maximum(tm - half, (settings.near / d[:, 2])[:, None]), tm + half
     ray, row = ((half > 0) & (end > start)).nonzero(as_tuple=True)
     prim, t0, t1 = rows[row], start[ray, row], end[ray, row]
-    chords = _Chords(lowered, prim, origin, world[ray], t0, t1)
-    alpha = -torch.expm1(-chords.optical_depth(torch.arange(len(prim)), t0, t1).clamp_min(0))
+    chords = Pairs.of(g, prim, origin, world[ray], t0, t1)
+    alpha = -torch.expm1(-lowered.optical_depth(chords).clamp_min(0))
     alpha = torch.where(alpha >= settings.alpha_min, alpha.clamp_max(settings.alpha_max), torch.zeros_like(alpha))
     stats.pairs += len(prim)
     P = d.shape[0]
@@ -194,7 +193,8 @@ def _march(
     # optical depth of every chord in every cell of it
     middle = (low + high) / 2
     chord, cell = ((middle[ray] > t0[:, None]) & (middle[ray] < t1[:, None]) & (high > low)[ray]).nonzero(as_tuple=True)
-    tau = chords.optical_depth(chord, low[ray[chord], cell], high[ray[chord], cell]).clamp_min(0)
+    pieces = Pairs.of(g, prim[chord], origin, world[ray[chord]], low[ray[chord], cell], high[ray[chord], cell])
+    tau = lowered.optical_depth(pieces).clamp_min(0)
     if keep == "opacity":
         total = torch.zeros_like(alpha).index_add(0, chord, tau)
         scale = torch.where(
@@ -203,15 +203,7 @@ def _march(
         tau = tau * scale[chord]
 
     # emission and absorption: a cell's colour is the mean of its primitives', weighted by optical depth
-    if isinstance(colour, Constant):
-        c = colour.rgb.detach().double()[prim]
-    else:
-        x = origin + ((t0 + t1) / 2)[:, None] * world[ray]
-        if isinstance(colour, RayNet):
-            c = colour.radiance(prim, (x - g.means.double()[prim]) / g.log_length_scale.double().exp()[prim, None])
-        else:
-            c = colour.radiance(prim, x, world[ray])
-            c = check_result(c, (len(prim), channels), f"{lowered.source('colour')}: radiance").double()
+    c = lowered.seen(chords)
     cells = middle.shape[1]
     at = ray[chord] * cells + cell
     depth = torch.zeros(P * cells, dtype=torch.float64).index_add(0, at, tau)
@@ -223,30 +215,3 @@ def _march(
     rgb = (weight[..., None] * mixed).sum(1)
     z = (weight * middle).sum(1) * d[:, 2]
     return torch.cat([rgb, (-behind[:, -1:]).exp(), z[:, None]], 1)
-
-
-class _Chords:
-    """Line integrals over parts of M chords, in float64: phases are measured from each chord's middle."""
-
-    def __init__(self, lowered: Lowered, prim: Tensor, origin: Tensor, world: Tensor, t0: Tensor, t1: Tensor) -> None:
-        self.density, self.prim, self.world = lowered.density, prim, world
-        self.origin, self.source = origin.expand_as(world), lowered.source("density")
-        if isinstance(self.density, Cosine):
-            f, g = self.density, lowered.geometry
-            self.m = g.log_length_scale.double().exp()[prim]
-            self.middle = (t0 + t1) / 2
-            local = (origin + self.middle[:, None] * world - g.means.double()[prim]) / self.m[:, None]
-            W1 = f.W1.double()[prim]
-            self.phase = f.omega0 * ((W1 * local[:, None, :]).sum(-1) + f.b1.double()[prim])
-            self.rate = f.omega0 * (W1 * world[:, None, :]).sum(-1) / self.m[:, None]
-            self.w2, self.b2 = f.w2.double()[prim], f.b2.double().reshape(-1)[prim]
-
-    def optical_depth(self, chord: Tensor, t0: Tensor, t1: Tensor) -> Tensor:
-        """(Q,) integrals of sigma, unclamped, from ``t0`` to ``t1`` (scene units) of chords number ``chord``."""
-        if not isinstance(self.density, Cosine):
-            found = self.density.line_integral(self.prim[chord], self.origin[chord], self.world[chord], t0, t1)
-            return check_result(found, (len(chord),), f"{self.source}: line_integral").double()
-        rate = self.rate[chord]
-        phase = self.phase[chord] + rate * ((t0 + t1) / 2 - self.middle[chord])[:, None]
-        mean = self.b2[chord] + (self.w2[chord] * phase.cos() * torch.sinc(rate * ((t1 - t0) / (2 * torch.pi))[:, None])).sum(-1)
-        return (t1 - t0) / self.m[chord] * mean

@@ -8,7 +8,59 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["RenderOutput", "RenderStats", "mean_depth"]
+from neuprim.core.model.checks import check_shape
+
+__all__ = ["RenderOutput", "RenderStats", "Tally", "Watch", "mean_depth"]
+
+
+@dataclass
+class Tally:
+    """What each of the N primitives of a frame had a part in; zeros until the frame's backward pass fills them.
+
+    Attributes:
+        weight: (N,) sum over pixels of alpha_i T_i; positive exactly for primitives the view saw.
+        error_weight: (N,) sum over pixels of alpha_i T_i x error.
+        rows: which primitives of the model the sums belong to where some were left out of the frame; None for all.
+    """
+
+    weight: Tensor
+    error_weight: Tensor
+    rows: Tensor | None = None
+
+    def of_all(self, count: int) -> tuple[Tensor, Tensor]:
+        """(count,) weight and error_weight of all primitives of the model, zero for those that were left out of the frame."""
+        if self.rows is None:
+            return self.weight, self.error_weight
+        weight, error_weight = (sums.new_zeros(count).index_copy_(0, self.rows, sums) for sums in (self.weight, self.error_weight))
+        return weight, error_weight
+
+
+@dataclass
+class Watch:
+    """What a backend's backward pass looks for and fills: sums over the rays that it drew.
+
+    Attributes:
+        error: of each ray, in the shape of the frame as the backend drew it.
+        rays: how many of a pixel; sums are divided by their number, so that frames of any compare.
+    """
+
+    error: Tensor
+    tally: Tally
+    rays: int = 1
+    sums: tuple[Tensor, Tensor] | None = None
+
+    def add(self, rows: Tensor, weight: Tensor, error_weight: Tensor) -> None:
+        """Sums of some primitives ``rows`` (R,) over some of the rays, for backends that draw in blocks."""
+        if self.sums is None:
+            self.sums = torch.zeros_like(self.tally.weight), torch.zeros_like(self.tally.error_weight)
+        for total, part in zip(self.sums, (weight, error_weight), strict=True):
+            total.index_add_(0, rows, part.to(total))
+        self.fill(*self.sums)
+
+    def fill(self, weight: Tensor, error_weight: Tensor) -> None:
+        """Sums (N,) over all rays."""
+        tally, n = self.tally, self.rays
+        tally.weight, tally.error_weight = (weight, error_weight) if n == 1 else (weight / n, error_weight / n)
 
 
 @dataclass
@@ -17,24 +69,28 @@ class RenderStats:
 
     Attributes:
         backend: the backend that drew it.
+        count: primitives of the frame.
         pairs: tile-primitive pairs (cpu) or ray-primitive pairs (reference) that were evaluated.
-        pixel_error: set this (H, W) map after the forward pass, and the backward pass fills the two sums below.
-        weight: (N,) sum over pixels of alpha_i T_i; positive exactly for primitives the view saw.
-        error_weight: (N,) sum over pixels of alpha_i T_i x pixel_error.
-        rows: which primitives the sums belong to where some were left out of the frame; None for all.
+        rows: which primitives of the model they are where some were left out of the frame; None for all.
+        samples: rays per pixel side.
+        watched: what :meth:`RenderOutput.watch` left for the backward pass.
     """
 
     backend: str
+    count: int
     pairs: int = 0
-    pixel_error: Tensor | None = None
-    weight: Tensor | None = None
-    error_weight: Tensor | None = None
     rows: Tensor | None = None
+    samples: int = 1
+    watched: Watch | None = None
     extra: dict[str, Any] = field(default_factory=dict)
 
-    def of_all(self, sums: Tensor, count: int) -> Tensor:
-        """(count,) sums of all primitives of the model, zero for those that were left out of the frame."""
-        return sums if self.rows is None else sums.new_zeros(count).index_copy_(0, self.rows, sums)
+    def watch(self, error: Tensor) -> Tally:
+        """See :meth:`RenderOutput.watch`; ``error`` fits."""
+        n, error = self.samples, error.detach()
+        tally = Tally(torch.zeros(self.count), torch.zeros(self.count), self.rows)
+        rays = error if n == 1 else error.repeat_interleave(n, 0).repeat_interleave(n, 1)
+        self.watched = Watch(rays, tally, n * n)
+        return tally
 
 
 @dataclass(frozen=True)
@@ -52,6 +108,21 @@ class RenderOutput:
     alpha: Tensor
     depth: Tensor | None
     stats: RenderStats
+
+    def watch(self, error: Tensor) -> Tally:
+        """Let the backward pass tell which primitives were seen, and which had a part in an error; call it before ``backward()``.
+
+        Args:
+            error: (H, W) any measure of what is wrong at each pixel; constant, no gradient reaches it.
+
+        Returns:
+            the sums, which the backward pass fills. A second call takes the place of the first.
+
+        Raises:
+            FormError: ``error`` is not of the frame's size.
+        """
+        check_shape("watch: error", error, tuple(self.alpha.shape), ", that of the frame")
+        return self.stats.watch(error)
 
 
 def mean_depth(weighted: Tensor, alpha: Tensor) -> Tensor:

@@ -8,58 +8,11 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.model.primitives import Lowered
-from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
+from neuprim.core.render.output import RenderOutput, mean_depth
 from neuprim.core.render.shading import Draw
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["SampledStats", "render_samples"]
-
-
-class SampledStats(RenderStats):
-    """The statistics of a finer frame, read and set per output pixel.
-
-    ``pixel_error`` (H, W) is spread over the sub-pixels of the finer frame; ``weight`` and ``error_weight`` are its sums over
-    samples^2, so that they are sums over output pixels of mean weights and compare with frames of one ray per pixel.
-    ``pairs`` and ``extra`` count the work really done.
-    """
-
-    _pixel_error: Tensor | None
-
-    def __init__(self, fine: RenderStats, samples: int) -> None:
-        self._fine, self._samples = fine, samples
-        super().__init__(fine.backend, fine.pairs, None, self._mean(fine.weight), self._mean(fine.error_weight), fine.rows, fine.extra)
-
-    @property
-    def pixel_error(self) -> Tensor | None:  # type: ignore[override]
-        return self._pixel_error
-
-    @pixel_error.setter
-    def pixel_error(self, value: Tensor | None) -> None:
-        n = self._samples
-        self._pixel_error = value
-        self._fine.pixel_error = None if value is None else value.repeat_interleave(n, 0).repeat_interleave(n, 1)
-
-    @property
-    def weight(self) -> Tensor | None:  # type: ignore[override]
-        return self._mean(self._fine.weight)
-
-    @weight.setter
-    def weight(self, value: Tensor | None) -> None:
-        self._fine.weight = self._sum(value)
-
-    @property
-    def error_weight(self) -> Tensor | None:  # type: ignore[override]
-        return self._mean(self._fine.error_weight)
-
-    @error_weight.setter
-    def error_weight(self, value: Tensor | None) -> None:
-        self._fine.error_weight = self._sum(value)
-
-    def _sum(self, mean: Tensor | None) -> Tensor | None:
-        return None if mean is None else mean * self._samples**2
-
-    def _mean(self, total: Tensor | None) -> Tensor | None:
-        return None if total is None else total / self._samples**2
+__all__ = ["render_samples"]
 
 
 def _pool(image: Tensor, n: int) -> Tensor:
@@ -77,4 +30,5 @@ def render_samples(draw: Draw, lowered: Lowered, camera: Camera, background: Ten
     fine = draw(lowered, camera.resized(camera.width * n, camera.height * n), background, replace(settings, samples=1))
     alpha = _pool(fine.alpha, n)
     depth = None if fine.depth is None else mean_depth(_pool(fine.depth * fine.alpha, n), alpha)
-    return RenderOutput(_pool(fine.rgb, n), alpha, depth, SampledStats(fine.stats, n))
+    fine.stats.samples = n  # what is watched is given and summed per pixel; pairs and extra count the work really done
+    return RenderOutput(_pool(fine.rgb, n), alpha, depth, fine.stats)

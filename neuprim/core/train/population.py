@@ -11,7 +11,7 @@ from torch import Tensor
 from neuprim.core.model.checks import check_halves, check_tensors, method
 from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render.output import RenderStats
+from neuprim.core.render.output import Tally
 from neuprim.core.train.settings import PopulationSettings
 
 __all__ = [
@@ -62,7 +62,7 @@ class Population(ABC):
         return s.start <= progress < s.stop and step % s.every == 0
 
     @abstractmethod
-    def observe(self, model: Primitives, stats: RenderStats) -> None:
+    def observe(self, model: Primitives, tally: Tally) -> None:
         """Called after each backward pass of one view, while ``.grad`` is fresh."""
 
     @abstractmethod
@@ -80,7 +80,7 @@ class Population(ABC):
 class Fixed(Population):
     """Nothing is born and nothing dies."""
 
-    def observe(self, model: Primitives, stats: RenderStats) -> None:
+    def observe(self, model: Primitives, tally: Tally) -> None:
         pass
 
     def intervene(self, model: Primitives, extent: float) -> Change | None:
@@ -131,13 +131,12 @@ class Relocate(Population):
         self.weight: Tensor | None = None
         self.error: Tensor | None = None
 
-    def observe(self, model: Primitives, stats: RenderStats) -> None:
-        if stats.weight is None or stats.error_weight is None:
-            return
+    def observe(self, model: Primitives, tally: Tally) -> None:
         if self.weight is None or self.error is None:
             self.weight, self.error = torch.zeros(model.count), torch.zeros(model.count)
-        self.weight += stats.of_all(stats.weight, model.count)
-        self.error += stats.of_all(stats.error_weight, model.count)
+        weight, error = tally.of_all(model.count)
+        self.weight += weight
+        self.error += error
 
     def intervene(self, model: Primitives, extent: float) -> Change | None:
         if self.weight is None or self.error is None:
@@ -187,12 +186,10 @@ class Gradient(Population):
         self.total: Tensor | None = None
         self.seen: Tensor | None = None
 
-    def observe(self, model: Primitives, stats: RenderStats) -> None:
-        if stats.weight is None:
-            return
+    def observe(self, model: Primitives, tally: Tally) -> None:
         if self.total is None or self.seen is None:
             self.total, self.seen = torch.zeros(model.count), torch.zeros(model.count)
-        saw = stats.of_all(stats.weight, model.count) > 0
+        saw = tally.of_all(model.count)[0] > 0
         norm = torch.zeros(model.count)
         for name in model.of(model.density):
             grad = model.params[name].grad

@@ -176,13 +176,13 @@ class Trainer:
         with torch.no_grad():
             difference = rgb - truth
             channels = difference.shape[-1]
-            output.stats.pixel_error = difference.abs() @ torch.full((channels,), 1.0 / channels)
+            tally = output.watch(difference.abs() @ torch.full((channels,), 1.0 / channels))
             flat = difference.reshape(-1)
             counted = flat.numel() if pixels.mask is None else int(pixels.mask.sum()) * channels
             mse = torch.dot(flat, flat).item() / counted
         loss.backward()
 
-        self.population.observe(model, output.stats)
+        self.population.observe(model, tally)
         self.optimizer.step(model.params, self.rates())
         self.step += 1
         change = None

@@ -13,7 +13,7 @@ from neuprim.core.data import View
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import ExportJob, TrainedModel
 from neuprim.core.model.colours import sh
-from neuprim.core.model.fields import Conditions, OpaqueColour
+from neuprim.core.model.fields import Conditions
 
 __all__ = ["Harmonics", "comparison_views", "harmonics_of", "rgb_of", "sphere"]
 
@@ -93,8 +93,8 @@ def _from_afar(run: TrainedModel, conditions: Conditions, direction: Tensor) -> 
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     camera = Camera(look_at(middle - 1e4 * reach * direction, middle, up), 1e4, 1e4, 32, 32, 64, 64)
     lowered = run.model.lower(camera, conditions, run.settings)
-    if isinstance(lowered.colour, OpaqueColour):
-        raise ConfigError(f"{run.directory}: colours of the form OpaqueColour have no value per primitive")
+    if not lowered.colour.per_primitive:
+        raise ConfigError(f"{run.directory}: colours of the form {type(lowered.colour).__name__} have no value per primitive")
     return lowered.center_colors(camera.position).double()
 
 

@@ -84,7 +84,7 @@ def drawn(case: Case, backend: str) -> tuple[np.ndarray, int]:  # type: ignore[t
     t = dict(case.tensors)
     t["colors"] = torch.ones_like(t["colors"][:, :1])
     with torch.no_grad():
-        out = render_lowered(scenes.lowered(t), case.camera, replace(case.settings, backend=backend))  # type: ignore[arg-type]
+        out = render_lowered(scenes.lowered(t), case.camera, replace(case.settings, backend=backend))
     return out.rgb[..., 0].double().numpy(), int(out.stats.extra.get("delicate", 0))
 
 
@@ -120,7 +120,7 @@ def colour_errors(case: Case, backend: str, exact: Integrals) -> Errors:
     """
     plain = case.tensors | {"Wout": 0 * case.tensors["Wout"], "base": torch.ones_like(case.tensors["base"])}
     with torch.no_grad():
-        settings = replace(case.settings, backend=backend)  # type: ignore[arg-type]
+        settings = replace(case.settings, backend=backend)
         out, of_one = (render_lowered(scenes.lowered(t), case.camera, settings) for t in (case.tensors, plain))
     opacity = of_one.rgb.double().numpy()
     seen = exact.hit & (opacity[..., 0] > 1e-30)
@@ -142,7 +142,7 @@ def gradients(case: Case, backend: str, seed: int, keep: Tensor | None = None) -
     h, w, C = case.camera.height, case.camera.width, scenes.channels(case.tensors)
     keep = torch.ones(h, w, 1, dtype=torch.float64) if keep is None else keep
     leaves = {k: v.detach().clone().requires_grad_() for k, v in case.tensors.items()}
-    out = render_lowered(scenes.lowered(leaves), case.camera, replace(case.settings, backend=backend))  # type: ignore[arg-type]
+    out = render_lowered(scenes.lowered(leaves), case.camera, replace(case.settings, backend=backend))
     grads = []
     for _ in range(FUNCTIONALS):
         rgb, alpha = ((torch.randn(h, w, n, generator=g, dtype=torch.float64) * keep).to(out.rgb.dtype) for n in (C, 1))
@@ -181,7 +181,7 @@ def frame_errors(case: Case, backend: str) -> tuple[Errors, Tensor]:
     exact = case.cast("float64")
     with torch.no_grad():
         images = [
-            render_lowered(scenes.lowered(c.tensors), c.camera, replace(c.settings, backend=name))  # type: ignore[arg-type]
+            render_lowered(scenes.lowered(c.tensors), c.camera, replace(c.settings, backend=name))
             for c, name in ((case, backend), (exact, "reference"))
         ]
     skip = undecided(exact.tensors, exact.camera, exact.settings)

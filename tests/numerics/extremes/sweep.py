@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from neuprim.core.render.backends import ORACLE, available
 from tests.numerics.extremes.measure import OPAQUE, RIM, SOLID, Errors, compare
 from tests.numerics.extremes.regions import COLOUR, REGIONS, THIN, Region
 
 __all__ = ["BACKENDS", "Result", "document", "measure", "sweep", "table"]
 
-BACKENDS = (("cpu", "float32"), ("reference", "float32"), ("reference", "float64"))
+BACKENDS = (*((backend.name, "float32") for backend in available()), (ORACLE, "float64"))
 _HEADER = (
     "| region | backend | error/S | thin | gradient | drawn in float64 | bounds | |",
     "| --- | --- | --- | --- | --- | --- | --- | --- |",
@@ -45,7 +46,7 @@ class Result:
 
     def line(self) -> str:
         e, r = self.errors, self.region
-        gradient = "" if self.backend == "reference" else f"{e.gradient:.1e} {e.parameter}"
+        gradient = "" if self.backend == ORACLE else f"{e.gradient:.1e} {e.parameter}"
         thin = "" if r.whole else f"{e.thin:.1e}"
         bounds = f"{r.forward:.0e}, {r.thin:.0e}, {r.gradient:.0e}" if not r.whole else f"{r.forward:.0e}, {r.gradient:.0e}"
         wide = f"{e.wide}/{e.primitives}" if self.backend == "cpu" else ""
@@ -58,7 +59,7 @@ def measure(region: Region, backend: str, precision: str, cases: int) -> Result:
     worst = Errors()
     for number in range(cases):
         case = region.case(number)
-        worst.absorb(compare(case, backend, precision, region.whole, backend != "reference"), case.name)
+        worst.absorb(compare(case, backend, precision, region.whole, backend != ORACLE), case.name)
     return Result(region, backend, precision, worst)
 
 

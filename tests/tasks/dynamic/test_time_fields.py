@@ -14,7 +14,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.render.output import RenderStats
+from neuprim.core.render.output import Tally
 from neuprim.core.train.population import Relocate, split
 from neuprim.core.train.settings import PopulationSettings
 from neuprim.tasks.dynamic import TASK
@@ -22,6 +22,7 @@ from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.dead import dead_fraction
 from neuprim.tasks.dynamic.density import PARTS, TimeDensity
 from tests import scenes
+from tests.backends import BACKENDS
 
 VARIANTS = ["none", *("+".join(c) for n in range(1, len(PARTS) + 1) for c in itertools.combinations(PARTS, n))]
 COUNT = 30
@@ -133,16 +134,16 @@ def test_primitives_outside_their_window_are_left_out_and_nothing_changes() -> N
     assert torch.allclose(culled, render(m, camera, at(0.5), settings).rgb, atol=1e-6)
 
 
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_gradients_reach_living_primitives_and_no_others(backend: str) -> None:
     m = model("phase+offset+window+motion", dtype=torch.float32)
-    output = render(m, scenes.camera(), at(0.5), RenderSettings(backend=backend))  # type: ignore[arg-type]
-    output.stats.pixel_error = torch.ones(output.rgb.shape[:2])
+    output = render(m, scenes.camera(), at(0.5), RenderSettings(backend=backend))
+    tally = output.watch(torch.ones(output.rgb.shape[:2]))
     (output.rgb * torch.rand(output.rgb.shape, generator=torch.Generator().manual_seed(1))).sum().backward()
     rows = m.density.alive(m.of(m.density), at(0.5))
-    assert rows is not None and output.stats.weight is not None and len(output.stats.weight) == len(rows)
-    weight = output.stats.of_all(output.stats.weight, COUNT)
-    assert torch.equal(weight[rows], output.stats.weight)
+    assert rows is not None and len(tally.weight) == len(rows)
+    weight, _ = tally.of_all(COUNT)
+    assert torch.equal(weight[rows], tally.weight)
     dead = torch.ones(COUNT, dtype=torch.bool)
     dead[rows] = False
     assert not bool(weight[dead].any())
@@ -252,7 +253,7 @@ def test_relocation_counts_frames_in_which_a_primitive_lives() -> None:
     m = model("window", dtype=torch.float32)
     population = Relocate(PopulationSettings(fraction=0.1))
     rows = torch.tensor([2, 5, 7])
-    population.observe(m, RenderStats("test", weight=torch.ones(3), error_weight=torch.tensor([1.0, 9.0, 1.0]), rows=rows))
+    population.observe(m, Tally(torch.ones(3), torch.tensor([1.0, 9.0, 1.0]), rows))
     change = population.intervene(m, 1.0)
     assert change is not None and int(change.origin[0]) == 5  # the first of the idle ones moved to the busiest
 

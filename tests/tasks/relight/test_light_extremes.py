@@ -57,7 +57,7 @@ LIGHTS: dict[str, Tensor] = {
 
 
 def picture(m: Primitives, backend: str, conditions: dict[str, Tensor], keep: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-    out = render(m, scenes.camera(33, 25), conditions, RenderSettings(backend=backend))  # type: ignore[arg-type]
+    out = render(m, scenes.camera(33, 25), conditions, RenderSettings(backend=backend))
     (out.rgb * (weights((25, 33, 3), 0) * keep[..., None]).to(out.rgb.dtype)).sum().backward()
     return out.rgb.detach().double(), {k: v.grad for k, v in m.params.items() if v.grad is not None}
 

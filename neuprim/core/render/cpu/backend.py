@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.threads import parallel_for
-from neuprim.core.errors import FormError, NonFiniteError
+from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.fields import Constant, Cosine, RayNet
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.cpu.backward import backward_tiles, sum_rows
@@ -215,10 +215,8 @@ class _Rasterize(torch.autograd.Function):
         grad_rgb = np.ascontiguousarray(g_rgb.numpy(), np.float32)
         gT = np.ascontiguousarray((g_T + g_rgb @ torch.from_numpy(frame.background)).numpy(), np.float32)
         gz = np.ascontiguousarray(g_z.numpy(), np.float32)
-        wanted = frame.stats.pixel_error
-        if wanted is not None and wanted.shape != (h, w):
-            raise FormError(f"stats.pixel_error has shape {tuple(wanted.shape)}; expected {(h, w)}, that of the frame")
-        error = np.zeros((h, w), np.float32) if wanted is None else np.ascontiguousarray(wanted.detach().numpy(), np.float32)
+        watched = frame.stats.watched
+        error = np.zeros((h, w), np.float32) if watched is None else np.ascontiguousarray(_array(watched.error), np.float32)
         width = gradient_width(frame.neurons, C, frame.net.hidden if frame.net else 0)
         pair_rows = np.empty((frame.lists.pairs, width), np.float32)
         tiles = backward_tiles_by_entry if s.sort == "entry" else backward_tiles
@@ -257,9 +255,8 @@ class _Rasterize(torch.autograd.Function):
                 net_backward, count, _PRIMITIVES_PER_CHUNK, s.threads, t["log_scales"], t["quats"], t["Wx"], frame.net.rows,
                 grads, base + C, touched, out[1], out[2], *g_net,
             )  # fmt: skip
-        if wanted is not None:
-            frame.stats.weight = torch.from_numpy(grads[:, G_WEIGHT].copy())
-            frame.stats.error_weight = torch.from_numpy(grads[:, G_ERROR].copy())
+        if watched is not None:
+            watched.fill(torch.from_numpy(grads[:, G_WEIGHT].copy()), torch.from_numpy(grads[:, G_ERROR].copy()))
         results = [*out, g_b2, np.ascontiguousarray(grads[:, base : base + C])]
         tensors = [torch.from_numpy(r).to(d) for r, d in zip(results, ctx.dtypes, strict=True)]
         view = None
@@ -278,8 +275,8 @@ def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings
     """Render a :class:`Cosine` density with :class:`Constant` or :class:`RayNet` colours; see ``neuprim.core.render.render``."""
     density, colour = lowered.density, lowered.colour
     assert isinstance(density, Cosine) and isinstance(colour, Constant | RayNet), "the caller chooses a backend that knows the forms"
-    stats = RenderStats("cpu")
     g = lowered.geometry
+    stats = RenderStats("cpu", g.count)
     palette, net = (colour.base, (colour.Wx, colour.bias, colour.Wout)) if isinstance(colour, RayNet) else (colour.rgb, ())
     if background is None:
         background = torch.zeros(palette.shape[1])

@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
-from neuprim.core.model.checks import check_result
-from neuprim.core.model.fields import Constant, Cosine, RayNet
 from neuprim.core.model.geometry import quaternion_to_matrix
+from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.render.reference.rays import Rays, pixel_directions, view_of
@@ -54,19 +53,10 @@ class _Tally(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[override]
         weights, rows, pixels = ctx.saved_tensors
         stats: RenderStats = ctx.stats
-        if stats.pixel_error is not None and stats.weight is not None and stats.error_weight is not None:
-            error = stats.pixel_error.reshape(-1)[pixels].to(weights)
-            stats.weight.index_add_(0, rows, weights.sum(1).to(stats.weight))
-            stats.error_weight.index_add_(0, rows, (weights @ error).to(stats.error_weight))
+        if stats.watched is not None:
+            error = stats.watched.error.reshape(-1)[pixels].to(weights)
+            stats.watched.add(rows, weights.sum(1), weights @ error)
         return grad, None, None, None
-
-
-def _sinc(z: Tensor) -> Tensor:
-    small = z.abs() < 1e-3
-    safe = torch.where(small, torch.ones_like(z), z)
-    z2 = z * z
-    series = 1 - z2 / 6 * (1 - z2 / 20 * (1 - z2 / 42))
-    return torch.where(small, series, safe.sin() / safe)
 
 
 class _Frame:
@@ -96,7 +86,7 @@ def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, setti
     count = lowered.geometry.count
     seen = view_of(camera, lowered.geometry, frame.center, settings.near)
     channels = lowered.colour.channels
-    stats = RenderStats("reference", weight=torch.zeros(count), error_weight=torch.zeros(count))
+    stats = RenderStats("reference", count)
     rows_of_blocks = []
     for y0 in range(0, camera.height, _BLOCK):
         line = []
@@ -161,17 +151,8 @@ def _trace(
 
     world_d = dj @ frame.rotation
     local = (frame.local[prim] @ (frame.axes[prim] * xm)[:, :, None])[..., 0]  # (x - mu)/m of the chord middle, scene axes
-    if isinstance(lowered.density, Cosine):
-        f = lowered.density
-        W1 = f.W1.double()[prim]
-        phase = f.omega0 * ((W1 * local[:, None, :]).sum(-1) + f.b1.double()[prim])
-        rate = f.omega0 * (W1 * world_d[:, None, :]).sum(-1)
-        mean_f = f.b2.double().reshape(-1)[prim] + (f.w2.double()[prim] * phase.cos() * _sinc(rate * half[:, None])).sum(-1)
-        optical_depth = 2 * half * mean_f
-    else:
-        origin = frame.origin.expand_as(world_d)
-        found = lowered.density.line_integral(prim, origin, world_d, t0 * m, t1 * m)
-        optical_depth = check_result(found, (len(prim),), f"{lowered.source('density')}: line_integral").double()
+    pairs = Pairs(prim, world_d, local, half, frame.origin, t0, t1, mid, m)
+    optical_depth = lowered.optical_depth(pairs)
 
     alpha = -torch.expm1(-optical_depth.clamp_min(0))
     alpha = alpha.clamp_max(settings.alpha_max)
@@ -198,15 +179,11 @@ def _trace(
     if weights.requires_grad:
         weights = _Tally.apply(weights, rows, pixels, stats)
 
-    if isinstance(lowered.colour, Constant):
-        rgb = weights.T @ lowered.colour.rgb.double()[rows]
+    flat = lowered.colour.flat
+    if flat is not None:
+        rgb = weights.T @ flat.double()[rows]
     else:
-        if isinstance(lowered.colour, RayNet):
-            c = lowered.colour.radiance(prim, local)
-        else:
-            xw = frame.origin + (mid * m)[:, None] * world_d
-            c = lowered.colour.radiance(prim, xw, world_d)
-            c = check_result(c, (len(prim), channels), f"{lowered.source('colour')}: radiance").double()
+        c = lowered.seen(pairs)
         rgb = torch.zeros(P, channels, dtype=torch.float64).index_add(0, j, weights[i, j][:, None] * c)
     z = torch.zeros(P, dtype=torch.float64).index_add(0, j, weights[i, j] * mid * m * rays.depth[j]) if settings.depth else T[-1] * 0
     return torch.cat([rgb, T[-1][:, None], z[:, None]], -1)

@@ -1,0 +1,66 @@
+"""Where rays meet primitives: what a closed form is asked about."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from neuprim.core.model.geometry import Geometry
+
+__all__ = ["Pairs"]
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """M chords, one for each ray and primitive that meet; float64, differentiable.
+
+    A primitive's own length is m, its longest semi-axis: what is measured in it never over- or underflows.
+
+    Attributes:
+        prim: (M,) int64 rows of the primitives.
+        direction: (M, 3) unit vectors along the rays, scene axes.
+        local: (M, 3) middles of the chords, (x - mu)/m, scene axes.
+        half: (M,) half lengths of the chords, in m.
+        origin: (M, 3) or (3,) starts of the rays, scene units.
+        near, far: (M,) ends of the chords, and middle: (M,) their middles, as ray distances in m.
+        m: (M,) scene units.
+
+    What only code of a plugin needs, in scene units, is computed when it is asked for.
+    """
+
+    prim: Tensor
+    direction: Tensor
+    local: Tensor
+    half: Tensor
+    origin: Tensor
+    near: Tensor
+    far: Tensor
+    middle: Tensor
+    m: Tensor
+
+    @classmethod
+    def of(cls, geometry: Geometry, prim: Tensor, origin: Tensor, direction: Tensor, t0: Tensor, t1: Tensor) -> Pairs:
+        """Chords ``t0`` to ``t1`` (M,) of rays, or parts of them, in scene units."""
+        m = geometry.length_scale.double()[prim]
+        middle = (t0 + t1) / 2
+        local = (origin + middle[:, None] * direction - geometry.means.double()[prim]) / m[:, None]
+        return cls(prim, direction, local, (t1 - t0) / (2 * m), origin, t0 / m, t1 / m, middle / m, m)
+
+    def __len__(self) -> int:
+        return len(self.prim)
+
+    @property
+    def origins(self) -> Tensor:
+        """(M, 3) starts of the rays, scene units."""
+        return self.origin.expand_as(self.direction)
+
+    @property
+    def ends(self) -> tuple[Tensor, Tensor]:
+        """(M,) ray distances t0 and t1 at which the chords start and end, scene units."""
+        return self.near * self.m, self.far * self.m
+
+    @property
+    def points(self) -> Tensor:
+        """(M, 3) middles of the chords, scene units."""
+        return self.origin + (self.middle * self.m)[:, None] * self.direction

@@ -9,7 +9,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,6 @@ class Fake:
     frames: int = 0
     broken: str | None = None
     dim: float = 1.0
-    loads: list[str] = field(default_factory=list)
 
     def load(self) -> Draw:
         def render(lowered: Lowered, *rest: Any) -> RenderOutput:

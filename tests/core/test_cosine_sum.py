@@ -10,11 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.conformance.integrals import chords, inside, line_integral
+from neuprim.conformance.integrals import chords, inside
 from neuprim.core.errors import FormError
 from neuprim.core.model.densities.cosine import cosine_density
 from neuprim.core.model.fields import Cosine, Opaque
 from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.model.tensors import MOST_UNITS
 from neuprim.core.render import RenderSettings, render_lowered
@@ -58,7 +59,7 @@ def test_densities_and_line_integrals_add_up(name: str) -> None:
     found, a, b = (cosine_density(f, geometry, prim, x) for f in (both, first, second))
     assert (found - a - b).abs().max() <= 1e-12 * a.abs().max() and b.abs().max() > 0.1
     ray = chords(geometry, prim, generator)
-    whole, a, b = (line_integral(f, geometry, prim, *ray) for f in (both, first, second))
+    whole, a, b = (f.optical_depth(Pairs.of(geometry, prim, *ray)) for f in (both, first, second))
     assert (whole - a - b).abs().max() <= 1e-12 * a.abs().max() and b.abs().max() > 0.01
 
 
@@ -67,7 +68,7 @@ def test_a_sum_is_drawn_as_the_sum_of_the_integrals() -> None:
     geometry, colour = where(), scenes.colour(scenes.tensors(COUNT, dtype=torch.float64))
 
     def added(*ray: Tensor) -> Tensor:
-        return sum((line_integral(f, geometry, *ray) for f in (first, second)), torch.zeros(()))
+        return sum((f.optical_depth(Pairs.of(geometry, *ray)) for f in (first, second)), torch.zeros(()))
 
     camera = scenes.camera(20, 15)
     expected = render_lowered(Lowered(geometry, Opaque(added), colour), camera, EXACT).rgb

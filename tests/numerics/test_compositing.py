@@ -160,7 +160,7 @@ def test_negative_integrals_are_empty_space(backend: str) -> None:
         ("near", 0.0),
         ("depth_floor", 0.0),
         ("threads", -1),
-        ("backend", "gpu"),
+        ("backend", ""),
     ],
 )
 def test_settings_out_of_range_are_named(name: str, value: object) -> None:

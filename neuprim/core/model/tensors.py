@@ -45,7 +45,7 @@ def tensor_fault(value: Any) -> str | None:
     if not isinstance(value, Tensor):
         return f"type {type(value).__name__}; expected a torch tensor"
     if not value.is_cpu:
-        return f"device {value.device}; expected cpu, where both backends compute"
+        return f"device {value.device}; expected cpu, where models are kept"
     if value.layout is not torch.strided or value.is_nested:
         return f"layout {'nested' if value.is_nested else value.layout}; expected a dense tensor"
     if value.dtype not in _DTYPES:

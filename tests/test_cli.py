@@ -174,7 +174,7 @@ def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
     quoted = "output_dir='it\\'s a=b, $c'"
     for words, where, there in (
         (
-            ["task=toy", "seed=3", "train.rates={means: 1e-3, other: 2}", "+task.options.a='x y'"],
+            ["task=toy", "seed=3", "train.rates={means: 1e-3, other: 2}", "task.options.gain=2.5"],
             "outputs/toy-ball",
             "has the run up to here",
         ),

@@ -24,7 +24,9 @@ MANY = """
 from neuprim.core.extensions import Exporter, ExportReport
 
 def write(job):
-    paths = tuple(job.run.directory / "export" / f"{i}.x" for i in range(job.options.get("count", 1)))
+    paths = tuple(job.out.parent / f"{i}.x" for i in range(job.options.get("count", 1)))
+    for path in paths:
+        path.touch()
     return ExportReport(paths, False)
 
 PLUGIN = Exporter(api=1, name="ply", summary="names of files", write=write, options={"count": (1, "n"), "text": ("", "t"), "size": (1.0, "x")})

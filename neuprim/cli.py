@@ -249,12 +249,11 @@ def _render(args: argparse.Namespace) -> int:
         if not Path(args.camera).is_file():
             raise ConfigError(f"--camera {args.camera}: no such file")
     environment = environment_of(args)
-    from rich.console import Console
-
+    from neuprim.console import plain_console
     from neuprim.evaluate import render_run
     from neuprim.progress import DrawProgress
 
-    with DrawProgress(Console(stderr=True)) as progress:
+    with DrawProgress(plain_console(stderr=True)) as progress:
         paths = render_run(
             *(run_dir, args.camera, args.size, args.format, args.out, args.frames, args.conditions, args.fps),
             environment=environment,
@@ -268,11 +267,10 @@ def _render(args: argparse.Namespace) -> int:
 
 def _export(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
-    from rich.console import Console
-
+    from neuprim.console import plain_console
     from neuprim.exporting import export_run, print_report
 
-    print_report(export_run(run_dir, args.format, args.out, args.options, args.force, Console(stderr=True)), args.json)
+    print_report(export_run(run_dir, args.format, args.out, args.options, args.force, plain_console(stderr=True)), args.json)
     return 0
 
 

@@ -12,12 +12,14 @@ from pathlib import Path
 from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from neuprim import __version__
+from neuprim.console import plain_console
 
 __all__ = ["doctor"]
 
-NOT_FOR_USERS = ("test", "dev")
+NOT_FOR_USERS = ("test", "docs", "dev")
 """Extras that only people who work on neuprim itself need."""
 
 Rows = list[tuple[str, str]]
@@ -25,7 +27,7 @@ Rows = list[tuple[str, str]]
 
 def doctor(console: Console | None = None) -> int:
     """Prints the report; returns 0, or 1 if no backend works."""
-    console = console or Console(soft_wrap=True)
+    console = console or plain_console()
     backends, working = _backends()
     for title, rows in (
         ("machine", _machine()),
@@ -38,7 +40,7 @@ def doctor(console: Console | None = None) -> int:
         table.add_column(no_wrap=True)
         table.add_column(overflow="fold")
         for name, value in rows:
-            table.add_row(name, value)
+            table.add_row(Text(name), Text(value))  # "neuprim[video]" is no markup
         console.print(table)
     if not working:
         console.print("no renderer backend works on this machine")
@@ -95,24 +97,31 @@ def _memory() -> str:
 
 
 def _packages() -> Rows:
-    """Each dependency and extra that neuprim's own metadata names, with what is installed."""
-    rows: Rows = []
+    """Each package that neuprim's own metadata names, for itself or for an extra, with what is installed."""
+    needed: dict[str, list[tuple[Requirement, str]]] = {}  # several extras may name one package
     for text in metadata.requires("neuprim") or []:
         requirement = Requirement(text)
         extra = _extra_of(requirement)
         if extra in NOT_FOR_USERS or not (requirement.marker is None or requirement.marker.evaluate({"extra": extra or ""})):
             continue
         wanted = f"'neuprim[{extra}]'" if extra else f"'{requirement.name}{requirement.specifier}'"
-        try:
-            version = metadata.version(requirement.name)
-        except metadata.PackageNotFoundError:
-            rows.append((requirement.name, f"not installed: pip install {wanted}"))
-            continue
-        suits = requirement.specifier.contains(version, prereleases=True)
-        rows.append((requirement.name, version if suits else f"{version}, but neuprim needs {requirement.specifier}: pip install {wanted}"))
-    if all(name != "triton" for name, _ in rows):
+        needed.setdefault(requirement.name, []).append((requirement, wanted))
+    rows: Rows = [(name, _state(name, choices)) for name, choices in needed.items()]
+    if "triton" not in needed:
         rows.append(("triton", _version_or("triton", "not installed: comes with torch's CUDA builds")))
     return rows
+
+
+def _state(name: str, needed: list[tuple[Requirement, str]]) -> str:
+    """The version of an installed package, and what to install where it is missing or does not suit all that need it."""
+    try:
+        version = metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return f"not installed: pip install {' or '.join(wanted for _, wanted in needed)}"
+    for requirement, wanted in needed:
+        if not requirement.specifier.contains(version, prereleases=True):
+            return f"{version}, but neuprim needs {requirement.specifier}: pip install {wanted}"
+    return version
 
 
 def _extra_of(requirement: Requirement) -> str | None:

@@ -34,13 +34,13 @@ class RunProgress(_Shown):
         self.console, self.title = console, title
         self.live = console.is_terminal
         self.bar = Progress(
-            TextColumn("[bold]{task.description}"),
+            TextColumn("{task.description}", style="bold", markup=False),
             BarColumn(),
             TextColumn("{task.percentage:>3.0f}%"),
             TimeElapsedColumn(),
             TextColumn("eta"),
             TimeRemainingColumn(),
-            TextColumn("{task.fields[info]}"),
+            TextColumn("{task.fields[info]}", markup=False),
             console=console,
             disable=not self.live,
         )
@@ -52,7 +52,7 @@ class RunProgress(_Shown):
 
     def note(self, text: str) -> None:
         """A line that stays."""
-        self.console.print(f"{self.title}: {text}", highlight=False, soft_wrap=True)
+        self.console.print(f"{self.title}: {text}", highlight=False, soft_wrap=True, markup=False, emoji=False)
 
     def preparing(self, text: str, fraction: float) -> None:
         """Work before the training loop."""
@@ -92,7 +92,7 @@ class DrawProgress(_Shown):
         self.console = console
         self.live = console.is_terminal
         columns = (
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             TextColumn("{task.percentage:>3.0f}%"),
             TextColumn("eta"),
@@ -104,7 +104,7 @@ class DrawProgress(_Shown):
 
     def note(self, text: str) -> None:
         """A line that stays."""
-        self.console.print(f"neuprim: {text}", highlight=False, soft_wrap=True, markup=False)
+        self.console.print(f"neuprim: {text}", highlight=False, soft_wrap=True, markup=False, emoji=False)
 
     def show(self, text: str, fraction: float) -> None:
         """How far it is; without a terminal, every half a minute."""

@@ -17,12 +17,14 @@ import torch
 from rich.console import Console
 
 from neuprim.config import RunConfig, made_now, suspects_of, task_of
+from neuprim.console import plain_console
 from neuprim.core import checkpoint, images
 from neuprim.core.channels import Channels, channels_of
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data_check import check_dataset
 from neuprim.core.errors import CheckpointError
 from neuprim.core.files import write_json, write_text
+from neuprim.core.metrics import psnr
 from neuprim.core.primitives import Primitives
 from neuprim.core.render import choose_backend
 from neuprim.core.task import Loss, TaskSpec
@@ -43,6 +45,7 @@ __all__ = ["make_loss", "make_trainer", "run", "warm_up"]
 
 _COMPILING = "compiling kernels, once per installation (about a minute)"
 _CURVE_VIEWS = 5  # held-out views behind the curve's eval_psnr
+_CURVE_PSNR_MAX = 200.0  # dB; equal images have an infinite one
 _SHOWN_VIEWS = 8  # held-out views in renders/ and the report
 _ORBIT_FRAMES = 36
 
@@ -55,7 +58,7 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
     Raises:
         NeuprimError: the input's fault, or numbers that left the finite; whatever was on disk before is intact.
     """
-    console = console or Console(stderr=True)
+    console = console or plain_console(stderr=True)
     task = task_of(config)
     config = replace(config, made_by=made_now(config, task))
     directory = config.output_dir
@@ -89,7 +92,7 @@ def run(config: RunConfig, console: Console | None = None) -> Path:
             kernels.wait()
         interrupted = _train(trainer, config, dataset, channels, progress)
         progress.finishing("measuring held-out views")
-        _finish(trainer, config, dataset, channels, directory)
+        _finish(trainer, config, dataset, channels, directory, task)
     if interrupted:
         raise KeyboardInterrupt
     return directory
@@ -191,7 +194,7 @@ def _save(trainer: Trainer, config: RunConfig, dataset: Dataset, channels: Chann
     checkpoint.save_model(config.output_dir / "model.safetensors", trainer.model, config.task, extra)
 
 
-def _finish(trainer: Trainer, config: RunConfig, dataset: Dataset, channels: Channels, directory: Path) -> None:
+def _finish(trainer: Trainer, config: RunConfig, dataset: Dataset, channels: Channels, directory: Path, task: TaskSpec) -> None:
     """Metrics, pictures and report of the last checkpoint, from the same tensors that lie on disk."""
     model = trainer.model
     for field in (model.density, model.colour):
@@ -233,7 +236,7 @@ def _finish(trainer: Trainer, config: RunConfig, dataset: Dataset, channels: Cha
     write_json(directory / "metrics.json", summary(config, model, dataset, channels, views, size, training))
     frames = [channels.display(draw(model, v, config.renderer, dataset.background)) for v in dataset.orbit(_ORBIT_FRAMES)]
     images.write_animation(folder / "orbit.webp", frames, fps=12.0)
-    write_report(directory)
+    write_report(directory, task.conditions)
 
 
 # ---------------------------------------------------------------- the curve
@@ -259,14 +262,15 @@ def _next_evaluation(trainer: Trainer) -> float:
 
 
 def _curve_psnr(trainer: Trainer) -> float:
-    """Mean PSNR of a few held-out views; does not touch the training state."""
+    """Mean PSNR of a few held-out views as :func:`~neuprim.measure.measure` has it, but at most 200 dB, so that a line of JSON can hold
+    it; does not touch the training state."""
     views = trainer.dataset.test
     picks = sorted({i * len(views) // _CURVE_VIEWS for i in range(_CURVE_VIEWS)})
     total = 0.0
     for i in picks:
-        truth = views.pixels(i).over(trainer.dataset.background)
+        pixels = views.pixels(i)
         rendered = draw(trainer.model, views.view(i), trainer.renderer, trainer.dataset.background)
-        total += -10 * torch.log10((rendered - truth).square().mean().clamp_min(1e-20)).item()
+        total += min(psnr(rendered, pixels.over(trainer.dataset.background), pixels.mask), _CURVE_PSNR_MAX)
     return total / len(picks)
 
 

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from neuprim.console import plain_console
 from neuprim.core.errors import DataError
 from neuprim.core.vdb import Grid, GridHeader, read_grids, read_header, sequence
 
@@ -31,7 +32,7 @@ def vdb_info(path: Path, as_json: bool = False, console: Console | None = None) 
     if as_json:
         print(json.dumps({"files": [describe_file(file) for file in files], "notes": notes}, indent=1, allow_nan=False))
         return 0
-    console = console or Console(soft_wrap=True)
+    console = console or plain_console()
     for file in files:
         _print(console, describe_file(file))
     for note in notes:

@@ -1,10 +1,14 @@
 import io
+from dataclasses import replace
 from importlib import metadata
+from typing import Any
 
 import pytest
 from rich.console import Console
 
+import neuprim.core.render as rendering
 from neuprim import doctor
+from neuprim.core.render import BACKENDS
 
 
 def report() -> tuple[int, str]:
@@ -20,7 +24,7 @@ def test_report(monkeypatch: pytest.MonkeyPatch) -> None:
     for word in ("python", "simd", "memory", "hydra-core", metadata.version("torch"), "pycolmap", "triton", "CUDA", "numba", "works"):
         assert word in text
     assert "does not work: no such luck" in text
-    assert "pytest" not in text, "extras for developers are not shown"
+    assert "pytest" not in text and "mkdocs" not in text, "extras for developers are not shown"
 
 
 def test_status_1_when_nothing_works(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -40,6 +44,24 @@ def test_what_is_missing_or_too_old_says_how_to_install(monkeypatch: pytest.Monk
     assert "skipped" not in rows
 
 
+def test_a_package_of_two_extras_is_one_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [name for name, _ in doctor._packages()]
+    assert len(rows) == len(set(rows)) and "pyvista" in rows
+    needs = ["not-there>=1; extra == 'viewer'", "not-there>=2; extra == 'mesh'", "rich>=1; extra == 'viewer'", "rich>=999; extra == 'mesh'"]
+    monkeypatch.setattr(metadata, "requires", lambda name: needs)
+    rows = dict(doctor._packages())
+    assert rows["not-there"] == "not installed: pip install 'neuprim[viewer]' or 'neuprim[mesh]'"
+    assert rows["rich"].endswith("but neuprim needs >=999: pip install 'neuprim[mesh]'")
+
+
+def test_the_printed_command_keeps_its_brackets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "requires", lambda name: ["not-there>=1; extra == 'video'"])
+    monkeypatch.setattr(doctor, "_probe", lambda name: "no [red]luck[/red] :boom:")
+    text = report()[1]
+    assert "not installed: pip install 'neuprim[video]'" in text
+    assert "does not work: no [red]luck[/red] :boom:" in text
+
+
 def test_a_backend_that_raises_is_shown_not_fatal(monkeypatch: pytest.MonkeyPatch) -> None:
     import neuprim.core.render
 
@@ -52,3 +74,17 @@ def test_a_backend_that_raises_is_shown_not_fatal(monkeypatch: pytest.MonkeyPatc
 
 def test_the_oracle_works_here() -> None:
     assert doctor._probe("reference") is None
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_backend_that_is_a_thousandth_off_does_not_work(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert doctor._probe(backend) is None
+    genuine = rendering.render_lowered
+
+    def dimmer(*args: Any) -> Any:
+        output = genuine(*args)
+        return replace(output, rgb=0.999 * output.rgb)
+
+    monkeypatch.setattr(rendering, "render_lowered", dimmer)
+    reason = doctor._probe(backend)
+    assert reason is not None and reason.startswith("drew 0.86")

@@ -17,9 +17,11 @@ import torch
 from PIL import Image
 
 from neuprim.core.errors import DataError
+from neuprim.core.fields import ConditionSpec
 from neuprim.core.metrics import psnr, ssim, to_json
 from neuprim.report import error_map, write_report
 from neuprim.report.record import read_run
+from tests.reports import offered
 
 NAMES = ("r_0", "r_25", "night-view", "r_75")
 
@@ -184,6 +186,16 @@ def test_a_finished_run_shows_what_it_measured(finished: Path) -> None:
         assert f"{entry['name']} {entry['psnr']:.2f} dB PSNR {entry['ssim']:.4f} SSIM" in text
     assert f"neuprim eval '{finished}'" in text
     assert f"neuprim render '{finished}' --camera orbit" in text
+
+
+def test_the_commands_offered_are_those_of_the_task(quick: Path) -> None:
+    shutil.copy(quick / "renders" / "orbit.webp", quick / "renders" / "clip_a.webp")
+    eval_it, fly = ["eval", str(quick)], ["render", str(quick), "--camera", "orbit"]
+    assert offered(write_report(quick)) == [eval_it, fly], "films alone promise no condition"
+    light = ConditionSpec("light_position", (3,), "m", (-1.0, 1.0), lambda text: [], sweep="orbit:2 3")
+    page = write_report(quick, (ConditionSpec("gain", (), "1", (0.0, 1.0), lambda text: []), light))
+    assert offered(page) == [eval_it, fly, [*fly, "--light-position", "orbit:2 3"]]
+    assert "while the light position changes" in Structure(page.read_text(encoding="utf-8")).text
 
 
 def test_pictures_and_charts_are_all_there(finished: Path) -> None:

@@ -9,26 +9,26 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from PIL import Image
-from rich.console import Console
 from torch import Tensor
 
 import neuprim.run as running
-from neuprim.config import RunConfig, compose
+from neuprim.config import RunConfig
 from neuprim.core import checkpoint
 from neuprim.core.data import Clip
 from neuprim.core.datasets.common import PosedImages
 from neuprim.core.errors import CheckpointError, DataError, NonFiniteError
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.evaluate import evaluate_run, read_metrics, render_run
+from neuprim.measure import measure
 from tests.core import tiny
-
-STEPS = 240
+from tests.short_runs import STEPS, fit, words
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -41,20 +41,6 @@ def short_orbits() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny.write_blender(tmp_path_factory.mktemp("data") / "two")
-
-
-def words(scene: Path, out: Path, iterations: int = STEPS, *more: str) -> list[str]:
-    """Overrides of a run that is over in a second or two and reproducible to the bit."""
-    return [
-        "task=static", "scene=blender", f"scene.path={scene}", "scene.background=random", f"output_dir={out}",
-        "model.primitives=40", "model.neurons=4", "model.sh_degree=3", "model.sh_every=0.5", "seed=3", f"train.iterations={iterations}",
-        "train.max_seconds=null", "train.log_every=10", "train.eval_every=0.25", "train.population.every=20", "train.population.start=0.05",
-        *more,
-    ]  # fmt: skip
-
-
-def fit(overrides: list[str]) -> Path:
-    return running.run(compose(overrides), Console(quiet=True))
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +115,26 @@ def test_curve(whole: Path) -> None:
     assert any("moved" in line.get("change", "") for line in lines)
     assert lines[-1]["eval_psnr"] > lines[0]["psnr"] + 3
     assert lines[-1]["eval_psnr"] == pytest.approx(read_metrics(whole)["psnr"], abs=1e-3)
+
+
+def test_masked_pixels_do_not_count_on_the_curve() -> None:
+    dataset = tiny.TwoPrimitives()
+    mask = torch.zeros(tiny.SIZE, tiny.SIZE, dtype=torch.bool)
+    mask[8:14, 5:20] = True
+    dataset.test.images = [  # type: ignore[attr-defined]
+        replace(p, rgb=torch.where(mask[..., None], p.rgb, torch.tensor(7.0)), mask=mask)
+        for p in dataset.test.images  # type: ignore[attr-defined]
+    ]
+    trainer = tiny.trainer(dataset, 3)
+    views = measure(trainer.model, dataset, trainer.renderer)
+    assert running._curve_psnr(trainer) == pytest.approx(sum(v.psnr for v in views) / len(views), abs=1e-9)
+
+
+def test_a_perfect_view_leaves_the_curve_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = tiny.TwoPrimitives()
+    monkeypatch.setattr(running, "draw", lambda model, view, settings, background: dataset.test.pixels(0).over(background))
+    dataset.test.images = [dataset.test.images[0]] * 2  # type: ignore[attr-defined]
+    assert running._curve_psnr(tiny.trainer(dataset, 3)) == 200.0
 
 
 def test_a_data_set_may_judge_views_and_keep_films_beside_them(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,15 +4,41 @@ from __future__ import annotations
 
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from neuprim import warm
+from neuprim.core.train import optimizer
+from tests import kernels
 
 
 def test_what_is_compiled_is_what_training_needs() -> None:
+    """A run that waited for it finds on disk every kernel that training calls, for the types that training calls it with."""
+    ahead = kernels.compiled_by("from neuprim import warm; warm.main()")
+    training = "t = tiny.trainer(tiny.TwoPrimitives(True), 4, population={'strategy': 'relocate', 'every': 2})"
+    needed = kernels.compiled_by(f"from tests.core import tiny; {training}; assert len(list(t.run())) == 4")
+    assert len(needed) > 8
+    missing = [f"{name}{types}" for name, signatures in needed.items() for types in signatures if types not in ahead.get(name, [])]
+    assert missing == []
+
+
+def test_it_says_so_once_it_is_done(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(warm, "cache_directory", lambda: tmp_path / "kernels")
+    assert not warm.compiled()
+
+    def interrupted(*args: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(optimizer.RowAdam, "step", interrupted)  # the last that it compiles
+        with pytest.raises(KeyboardInterrupt):
+            warm.main()
+    assert not warm.compiled(), "a run must not wait for less than all"
     warm.main()
-    assert warm.compiled()
+    assert warm.compiled() and not warm.compiled("RayNet")
+    monkeypatch.setattr(warm, "cache_directory", lambda: tmp_path / "other sources")
+    assert not warm.compiled()
 
 
 def test_nothing_is_started_where_there_is_nothing_to_do(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -48,12 +48,14 @@ class ConditionSpec:
     """A quantity a frame depends on besides its camera; command-line flags derive from these.
 
     Attributes:
+        name: of the flag, and the key in a frame's conditions.
         range: lowest and highest value of every element. Numbers that are not finite are refused by every command; for numbers beyond
             the range there is a warning.
         parse: the text of ``--NAME TEXT`` -> one tensor of ``shape`` per frame of an animation; raises
             :class:`~neuprim.core.errors.ConfigError`. Where ``shape`` is ``()`` it is asked for each element of a list ``A,B,C``, and
             need not know ranges ``A:B:COUNT`` (:mod:`neuprim.core.conditions`).
         strict: whether numbers beyond the range are refused, a data set's among them.
+        sweep: a text of ``--NAME TEXT`` that animates the condition, for the commands a report offers; empty: none.
     """
 
     name: str
@@ -62,6 +64,7 @@ class ConditionSpec:
     range: tuple[float, float]
     parse: Callable[[str], list[Tensor]]
     strict: bool = False
+    sweep: str = ""
 
 
 # ---------------------------------------------------------------- closed forms of density

@@ -53,7 +53,7 @@ class GaussianDensity(DensityField):
         return {"deviations": self.deviations}
 
     def parameters(self) -> list[ParameterSpec]:
-        return [ParameterSpec("log_amplitude", (1,), 1e-1, self._initial, "exp")]
+        return [ParameterSpec("log_amplitude", (1,), 1e-1, self._initial)]
 
     def _initial(self, ctx: InitContext) -> Tensor:
         alpha = 0.1 if ctx.choice("mode", "opaque", "paper") == "paper" else ctx.number("alpha", 0.8, 0, 1)

@@ -82,8 +82,8 @@ def _orientation(ctx: InitContext) -> Tensor:
 
 
 GEOMETRY_SPECS: tuple[ParameterSpec, ...] = (
-    ParameterSpec("means", (3,), 7e-4, lambda c: c.means.float(), group="geometry", lr_unit="extent"),
-    ParameterSpec("log_scales", (3,), 2e-2, _semi_axes, "exp", "geometry"),
-    ParameterSpec("quats", (4,), 1e-2, _orientation, "normalize", "geometry"),
+    ParameterSpec("means", (3,), 7e-4, lambda c: c.means.float(), lr_unit="extent"),
+    ParameterSpec("log_scales", (3,), 2e-2, _semi_axes),
+    ParameterSpec("quats", (4,), 1e-2, _orientation),
 )
 """Every model starts with these ten numbers per primitive."""

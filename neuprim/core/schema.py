@@ -21,8 +21,6 @@ __all__ = ["InitContext", "ParameterSpec", "Params"]
 Params = Mapping[str, Tensor]
 """Parameter name -> tensor of shape (N, *spec.shape)."""
 
-Activation = Literal["none", "exp", "normalize"]
-
 
 @dataclass
 class InitContext:
@@ -91,8 +89,6 @@ class ParameterSpec:
         shape: shape per primitive, ``()`` for a scalar.
         lr: base learning rate; ``train.rates.NAME`` overrides it.
         init: draws the (N, *shape) float32 start value.
-        activation: what the stored value goes through before use ("exp" for log-scales, "normalize" for quaternions).
-        group: "geometry", "density" or "colour"; population control watches the density group.
         lr_unit: "absolute", or "extent" for a rate in units of the scene's extent (positions).
     """
 
@@ -100,8 +96,6 @@ class ParameterSpec:
     shape: tuple[int, ...]
     lr: float
     init: Callable[[InitContext], Tensor]
-    activation: Activation = "none"
-    group: str = "density"
     lr_unit: Literal["absolute", "extent"] = "absolute"
 
     @property

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -10,29 +9,9 @@ from torch import Tensor
 
 from neuprim.core.errors import FormError
 from neuprim.core.forms import Shape, Sizes, tensors_fault
+from neuprim.core.sh_constants import C0, C1, C2, C3
 
 __all__ = ["C0", "basis", "coefficient_count", "colors", "initial_dc"]
-
-C0 = 0.5 / math.sqrt(math.pi)
-"""Y_00: a colour c of every direction has the coefficient (c - 0.5)/C0."""
-
-_C1 = math.sqrt(3.0 / (4.0 * math.pi))
-_C2 = (
-    math.sqrt(15.0 / (4.0 * math.pi)),
-    -math.sqrt(15.0 / (4.0 * math.pi)),
-    math.sqrt(5.0 / (16.0 * math.pi)),
-    -math.sqrt(15.0 / (4.0 * math.pi)),
-    math.sqrt(15.0 / (16.0 * math.pi)),
-)
-_C3 = (
-    -math.sqrt(35.0 / (32.0 * math.pi)),
-    math.sqrt(105.0 / (4.0 * math.pi)),
-    -math.sqrt(21.0 / (32.0 * math.pi)),
-    math.sqrt(7.0 / (16.0 * math.pi)),
-    -math.sqrt(21.0 / (32.0 * math.pi)),
-    math.sqrt(105.0 / (16.0 * math.pi)),
-    -math.sqrt(35.0 / (32.0 * math.pi)),
-)
 
 
 def coefficient_count(degree: int) -> int:
@@ -51,19 +30,19 @@ def basis(directions: Tensor, degree: int) -> Tensor:
     x, y, z = directions.unbind(-1)
     rows = [torch.full_like(x, C0)]
     if degree >= 1:
-        rows += [-_C1 * y, _C1 * z, -_C1 * x]
+        rows += [-C1 * y, C1 * z, -C1 * x]
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
-        rows += [_C2[0] * x * y, _C2[1] * y * z, _C2[2] * (2 * zz - xx - yy), _C2[3] * x * z, _C2[4] * (xx - yy)]
+        rows += [C2[0] * x * y, C2[1] * y * z, C2[2] * (2 * zz - xx - yy), C2[3] * x * z, C2[4] * (xx - yy)]
     if degree >= 3:
         rows += [
-            _C3[0] * y * (3 * xx - yy),
-            _C3[1] * x * y * z,
-            _C3[2] * y * (4 * zz - xx - yy),
-            _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
-            _C3[4] * x * (4 * zz - xx - yy),
-            _C3[5] * z * (xx - yy),
-            _C3[6] * x * (xx - 3 * yy),
+            C3[0] * y * (3 * xx - yy),
+            C3[1] * x * y * z,
+            C3[2] * y * (4 * zz - xx - yy),
+            C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+            C3[4] * x * (4 * zz - xx - yy),
+            C3[5] * z * (xx - yy),
+            C3[6] * x * (xx - 3 * yy),
         ]
     return torch.stack(rows, -1)
 

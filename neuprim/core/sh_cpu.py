@@ -9,14 +9,12 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from neuprim.core import sh
 from neuprim.core.render.cpu.compile import exact_kernel
 from neuprim.core.render.cpu.threads import parallel_for
+from neuprim.core.sh_constants import C0, C1, C2, C3
 
 __all__ = ["fused_colors"]
 
-_C0 = sh.C0
-_C1, _C2, _C3 = sh._C1, sh._C2, sh._C3
 _CHUNK = 1024
 
 strict = njit(error_model="numpy", forceinline=True)
@@ -25,29 +23,29 @@ strict = njit(error_model="numpy", forceinline=True)
 @strict
 def _basis(x, y, z, degree, Y):  # type: ignore[no-untyped-def]
     """Bands 1..degree of sh.basis at a unit direction, into Y[0:15]."""
-    Y[0], Y[1], Y[2] = -_C1 * y, _C1 * z, -_C1 * x
+    Y[0], Y[1], Y[2] = -C1 * y, C1 * z, -C1 * x
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
-        Y[3], Y[4], Y[5], Y[6], Y[7] = _C2[0] * x * y, _C2[1] * y * z, _C2[2] * (2 * zz - xx - yy), _C2[3] * x * z, _C2[4] * (xx - yy)
+        Y[3], Y[4], Y[5], Y[6], Y[7] = C2[0] * x * y, C2[1] * y * z, C2[2] * (2 * zz - xx - yy), C2[3] * x * z, C2[4] * (xx - yy)
         if degree >= 3:
-            Y[8], Y[9] = _C3[0] * y * (3 * xx - yy), _C3[1] * x * y * z
-            Y[10], Y[11], Y[12] = _C3[2] * y * (4 * zz - xx - yy), _C3[3] * z * (2 * zz - 3 * xx - 3 * yy), _C3[4] * x * (4 * zz - xx - yy)
-            Y[13], Y[14] = _C3[5] * z * (xx - yy), _C3[6] * x * (xx - 3 * yy)
+            Y[8], Y[9] = C3[0] * y * (3 * xx - yy), C3[1] * x * y * z
+            Y[10], Y[11], Y[12] = C3[2] * y * (4 * zz - xx - yy), C3[3] * z * (2 * zz - 3 * xx - 3 * yy), C3[4] * x * (4 * zz - xx - yy)
+            Y[13], Y[14] = C3[5] * z * (xx - yy), C3[6] * x * (xx - 3 * yy)
 
 
 @strict
 def _basis_gradient(x, y, z, degree, g, out):  # type: ignore[no-untyped-def]
     """out = sum_k g[k] dY_k/d(x, y, z), the basis taken as polynomials of a free direction."""
-    gx, gy, gz = -_C1 * g[2], -_C1 * g[0], _C1 * g[1]
+    gx, gy, gz = -C1 * g[2], -C1 * g[0], C1 * g[1]
     if degree >= 2:
-        a, b, c, d, e = _C2[0] * g[3], _C2[1] * g[4], _C2[2] * g[5], _C2[3] * g[6], _C2[4] * g[7]
+        a, b, c, d, e = C2[0] * g[3], C2[1] * g[4], C2[2] * g[5], C2[3] * g[6], C2[4] * g[7]
         gx += a * y - 2 * c * x + d * z + 2 * e * x
         gy += a * x + b * z - 2 * c * y - 2 * e * y
         gz += b * y + 4 * c * z + d * x
         if degree >= 3:
             xx, yy, zz = x * x, y * y, z * z
-            a, b, c, d = _C3[0] * g[8], _C3[1] * g[9], _C3[2] * g[10], _C3[3] * g[11]
-            e, f, h = _C3[4] * g[12], _C3[5] * g[13], _C3[6] * g[14]
+            a, b, c, d = C3[0] * g[8], C3[1] * g[9], C3[2] * g[10], C3[3] * g[11]
+            e, f, h = C3[4] * g[12], C3[5] * g[13], C3[6] * g[14]
             gx += 6 * a * x * y + b * y * z - 2 * c * x * y - 6 * d * x * z + e * (4 * zz - 3 * xx - yy) + 2 * f * x * z + 3 * h * (xx - yy)
             gy += 3 * a * (xx - yy) + b * x * z + c * (4 * zz - xx - 3 * yy) - 6 * d * y * z - 2 * e * x * y - 2 * f * y * z - 6 * h * x * y
             gz += b * x * y + 8 * c * y * z + d * (6 * zz - 3 * xx - 3 * yy) + 8 * e * x * z + f * (xx - yy)
@@ -64,7 +62,7 @@ def _colors(start, stop, means, dc, rest, origin, degree, color):  # type: ignor
         n = 1.0 / max(np.sqrt(x * x + y * y + z * z), 1e-30)
         _basis(x * n, y * n, z * n, degree, Y)
         for c in range(C):
-            value = _C0 * dc[i, c] + 0.5
+            value = C0 * dc[i, c] + 0.5
             for k in range(bands):
                 value += Y[k] * rest[i, k, c]
             color[i, c] = max(value, 0.0)
@@ -83,7 +81,7 @@ def _colors_backward(start, stop, means, rest, origin, degree, color, grad, g_me
         gY[:] = 0.0
         for c in range(C):
             g = np.float64(grad[i, c]) if color[i, c] > 0 else 0.0
-            g_dc[i, c] = _C0 * g
+            g_dc[i, c] = C0 * g
             for k in range(bands):
                 g_rest[i, k, c] = Y[k] * g
                 gY[k] += g * rest[i, k, c]

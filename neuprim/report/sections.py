@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from neuprim.core.conditions import flag
+from neuprim.core.fields import ConditionSpec
 from neuprim.core.metrics import from_json
 from neuprim.report.curves import curve, dots, series
 from neuprim.report.pictures import ERROR_SCALE, Inlined, color_bar, inline
@@ -303,12 +305,14 @@ def facts(run: RunRecord) -> str:
     return _section("Run", '<dl class="facts">' + "".join(f"<div><dt>{k}</dt><dd>{v}</dd></div>" for k, v in pairs) + "</dl>")
 
 
-def commands(run: RunRecord) -> str:
-    """The commands that go on from here."""
+def commands(run: RunRecord, conditions: Sequence[ConditionSpec]) -> str:
+    """The commands that go on from here: what every run can do, and an animation of each of the task's conditions that has one."""
     folder = shlex.quote(str(run.run_dir))
     lines = [(f"neuprim eval {folder}", "measure again"), (f"neuprim render {folder} --camera orbit", "fly around the scene")]
-    if run.clips:
-        lines.append((f"neuprim render {folder} --camera orbit --time 0:1", "fly around it while time goes by"))
+    for spec in conditions:
+        if spec.sweep:
+            changing = f"fly around it while the {escape(spec.name.replace('_', ' '))} changes"
+            lines.append((f"neuprim render {folder} --camera orbit {flag(spec.name)} {shlex.quote(spec.sweep)}", changing))
     items = "".join(f"<li><code>{escape(line)}</code><span>{what}</span></li>" for line, what in lines)
     return _section("Go on", f'<ul class="commands">{items}</ul>')
 

@@ -21,7 +21,7 @@ from neuprim.core.train.settings import ModelSettings, PopulationSettings, Train
 from neuprim.core.train.trainer import StepReport, Trainer, initial_model
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.core import tiny
-from tests.test_run import fit, words
+from tests.short_runs import fit, words
 
 SIZE = 64
 ABUSES = ("rates times ten", "one view", "one primitive", "black images", "a camera inside")

@@ -13,7 +13,18 @@ from neuprim.core.errors import FormError
 from neuprim.core.geometry import Geometry
 from neuprim.core.primitives import Primitives
 from neuprim.core.render.output import RenderStats
-from neuprim.core.train.population import Fixed, Gradient, Population, Relocate, make_population
+from neuprim.core.train.population import (
+    SPLIT_GAUSSIAN,
+    SPLIT_LONG,
+    SPLIT_OTHERS,
+    SPLIT_SHIFT,
+    Fixed,
+    Gradient,
+    Population,
+    Relocate,
+    make_population,
+    split,
+)
 from neuprim.core.train.settings import PopulationSettings
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
@@ -58,6 +69,27 @@ def relocate(m: Primitives, weight: Tensor, error: Tensor, fraction: float = 0.2
     population = Relocate(PopulationSettings(fraction=fraction))
     population.observe(m, stats(weight, error))
     return population.intervene(m, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("factors", "covered", "twice", "volume"),
+    [((SPLIT_LONG, SPLIT_OTHERS), 0.78, 0.02, 0.97), ((SPLIT_GAUSSIAN, SPLIT_GAUSSIAN), 0.45, 0.01, 0.49)],
+)
+def test_children_cover_what_is_said_of_them(factors: tuple[float, float], covered: float, twice: float, volume: float) -> None:
+    """Shares of the parent's volume: in a child, in both, and of the children's own volumes together."""
+    m = model(4)
+    children = split(m, torch.arange(4), SPLIT_SHIFT, *factors)
+    g = Geometry(children["means"], children["log_scales"], children["quats"])
+    ball = 2 * torch.rand(200_000, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 1
+    ball = ball[ball.norm(dim=1) < 1]
+    for n in range(4):
+        parent = m.geometry[torch.tensor([n])]
+        x = (parent.means + (ball * parent.scales) @ parent.rotations[0].T).detach()
+        inside = [(((x - g.means[i]) @ g.rotations[i]) / g.scales[i]).norm(dim=1) < 1 for i in (n, n + 4)]
+        assert float((inside[0] | inside[1]).double().mean()) == pytest.approx(covered, abs=0.01)
+        assert float((inside[0] & inside[1]).double().mean()) == pytest.approx(twice, abs=0.01)
+    share = g.scales.prod(1).reshape(2, 4).sum(0) / m.geometry.scales.prod(1)
+    assert share.tolist() == pytest.approx([volume] * 4, abs=0.01)
 
 
 def test_relocation_moves_the_idle_to_the_busy() -> None:

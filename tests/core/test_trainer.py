@@ -14,9 +14,11 @@ from torch import Tensor
 from neuprim.core import checkpoint
 from neuprim.core.data import Dataset, Pixels
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NonFiniteError
+from neuprim.core.metrics import psnr
 from neuprim.core.task import Supervision
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer, initial_model
+from neuprim.measure import draw
 from tests.core import tiny
 
 
@@ -146,6 +148,19 @@ def test_masked_pixels_do_not_count(plain: Dataset) -> None:
         list(trainer.run())
         results.append(trainer)
     same(*results)
+
+
+def test_the_psnr_of_a_step_is_that_of_the_pixels_that_count() -> None:
+    dataset = tiny.TwoPrimitives()
+    mask = torch.zeros(tiny.SIZE, tiny.SIZE, dtype=torch.bool)
+    mask[8:14, 5:20] = True
+    dataset.train.images = [replace(p, mask=mask) for p in dataset.train.images]  # type: ignore[attr-defined]
+    trainer = tiny.trainer(dataset, 3)
+    drawn = [draw(trainer.model, dataset.train.view(i), trainer.renderer, dataset.background) for i in range(len(dataset.train))]
+    report = trainer.train_step()
+    index = [dataset.train.view(i).name for i in range(len(dataset.train))].index(report.view)
+    expected = psnr(drawn[index], dataset.train.pixels(index).over(dataset.background), mask)
+    assert report.psnr == pytest.approx(expected, abs=1e-4)
 
 
 # ---------------------------------------------------------------- what goes wrong

@@ -3,55 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras import Camera
 from neuprim.core.errors import BackendUnavailable, NonFiniteError
 from neuprim.core.fields import Constant, Opaque, OpaqueColour
 from neuprim.core.render import RenderSettings, choose_backend, render_lowered
 from tests import scenes
+from tests.numerics.cases import CASES, DEFAULT, case
 from tests.numerics.compare import assert_same_frame, draw, row_errors
-
-DEFAULT = RenderSettings(depth=True)
-
-CASES: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
-    "K=0 C=1": ({"neurons": 0, "channels": 1}, {}, {}),
-    "K=1 C=3": ({"neurons": 1}, {}, {}),
-    "K=3 C=5": ({"neurons": 3, "channels": 5}, {}, {}),
-    "K=8 C=3": ({"neurons": 8}, {}, {}),
-    "K=16 C=1": ({"neurons": 16, "channels": 1}, {}, {}),
-    "off-centre": ({}, {"shift": (19.3, -11.7)}, {}),
-    "principal point outside": ({}, {"shift": (-40.0, 5.0)}, {}),
-    "inside": ({"count": 90}, {"distance": 0.15, "fov": 70.0}, {}),
-    "near plane": ({}, {}, {"near": 2.9}),
-    "wide": ({}, {"distance": 1.2, "fov": 120.0}, {}),
-    "high frequencies": ({"frequency": 3.0}, {}, {}),
-    "odd size": ({}, {"width": 41, "height": 23}, {}),
-    "one row": ({}, {"width": 50, "height": 1}, {}),
-    "one pixel": ({"count": 30}, {"width": 1, "height": 1, "fov": 5.0}, {}),
-    "one primitive": ({"count": 1}, {}, {}),
-    "many small": ({"count": 700, "radius": 0.04, "neurons": 2}, {}, {}),
-    "opaque": ({"count": 250, "radius": 0.35, "neurons": 2}, {}, {}),
-    "no depth": ({}, {}, {"depth": False}),
-    "low ceiling": ({}, {}, {"alpha_max": 0.2}),
-    "cuts off": ({}, {}, {"alpha_min": 0.0, "transmittance_min": 0.0}),
-}
-
-
-def case(name: str) -> tuple[dict[str, Tensor], Camera, RenderSettings]:
-    model, view, knobs = CASES[name]
-    t = scenes.tensors(**{"seed": 7, **model})
-    if name == "one primitive":
-        t["means"] *= 0.1
-    if name == "opaque":
-        t["b2"] += 0.2
-    if name == "K=16 C=1":
-        t["w2"] *= 0.5  # optical depths like the other cases': denser ones graze with D ~ 1e-6, where float32 has few digits left
-    return t, scenes.camera(**{"width": 48, "height": 35, **view}), replace(DEFAULT, **knobs)
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -11,12 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras import Camera, look_at
+from neuprim.core.cameras import Camera
 from neuprim.core.errors import ConfigError
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from tests import scenes
+from tests.numerics.cases import CASES, along_z, case, needle_and_sphere, spheres
 from tests.numerics.compare import assert_same_frame, draw, entries
-from tests.numerics.test_backends import CASES, case
 
 ENTRY = RenderSettings(sort="entry", depth=True)
 BACKENDS = ("reference", "cpu")
@@ -26,26 +26,6 @@ def render(t: dict[str, Tensor], camera: Camera, settings: RenderSettings, backe
     dtype = torch.float64 if backend == "reference" else torch.float32
     model = scenes.lowered({k: v.to(dtype) for k, v in t.items()})
     return render_lowered(model, camera, replace(settings, backend=backend, **knobs))  # type: ignore[arg-type]
-
-
-def spheres(means: list[list[float]], radii: list[float], density: list[float]) -> dict[str, Tensor]:
-    """Homogeneous spheres of the colours red, green, blue; ``density`` times the diameter is a central chord's optical depth."""
-    count = len(radii)
-    t = scenes.tensors(count, 0, dtype=torch.float64)
-    t["means"] = torch.tensor(means, dtype=torch.float64)
-    radius = torch.tensor(radii, dtype=torch.float64)
-    t["log_scales"] = radius.log()[:, None].repeat(1, 3)
-    t["quats"][:] = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-    t["b2"] = (torch.tensor(density, dtype=torch.float64) * radius)[:, None]
-    t["colors"] = torch.eye(3, dtype=torch.float64)[:count]
-    return t
-
-
-def along_z(size: int = 21, fov: float = 40.0, turn: float = 0.0, distance: float = 3.0) -> Camera:
-    """A camera ``distance`` from the origin on the negative z axis, turned about the y axis by ``turn`` radians."""
-    eye = distance * torch.tensor([math.sin(turn), 0.0, -math.cos(turn)], dtype=torch.float64)
-    f = 0.5 * size / math.tan(math.radians(fov) / 2)
-    return Camera(look_at(eye, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])), f, f, size / 2, size / 2, size, size)
 
 
 # ---------------------------------------------------------------- cpu against reference
@@ -145,15 +125,6 @@ def test_against_the_order_by_hand(distance: float, extra: float, knobs: dict[st
     for backend, bound in (("reference", 1e-11), ("cpu", 1e-5)):
         out = render(t, camera, settings, backend)
         assert (out.rgb.double() - rgb).abs().max() < bound and (out.alpha.double() - alpha).abs().max() < bound, backend
-
-
-def needle_and_sphere() -> dict[str, Tensor]:
-    """A long red needle that reaches far towards the camera passes in front of a green sphere whose centre is nearer than its own."""
-    t = spheres([[0.0, 0.0, 0.0], [-0.3, 0.0, -0.05]], [1.0, 0.15], [8.0, 40.0])
-    angle = math.radians(20)  # the needle lies in the x-z plane, its near end at x = -sin(angle), z = -cos(angle)
-    t["log_scales"][0] = torch.tensor([0.1, 0.1, 1.0]).log()
-    t["quats"][:] = torch.tensor([math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0])
-    return t
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

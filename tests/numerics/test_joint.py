@@ -14,8 +14,8 @@ from neuprim.core.fields import Constant, Cosine, Opaque, OpaqueColour
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.joint import joint_volume, sorting_errors
 from tests import scenes
+from tests.numerics.cases import along_z, needle_and_sphere, spheres
 from tests.numerics.compare import entries
-from tests.numerics.test_entry import along_z, needle_and_sphere, spheres
 
 EXACT = RenderSettings(backend="reference", alpha_min=0.0, alpha_max=0.9999, transmittance_min=0.0, depth=True)
 SKY = torch.tensor([0.2, 0.4, 0.7], dtype=torch.float64)

@@ -242,8 +242,8 @@ def lenient(text: str) -> list[Tensor]:
         return [torch.tensor(0.0)]
 
 
-def timed(colour: type = Timed, parse: Callable[[str], list[Tensor]] = number, **more: Any) -> TaskSpec:
-    return using(colour=colour, conditions=(ConditionSpec("time", (), "s", (0.0, 1.0), parse),), **more)
+def timed(colour: type = Timed, parse: Callable[[str], list[Tensor]] = number, sweep: str = "", **more: Any) -> TaskSpec:
+    return using(colour=colour, conditions=(ConditionSpec("time", (), "s", (0.0, 1.0), parse, sweep),), **more)
 
 
 class WithoutTime(Example):
@@ -327,8 +327,7 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("fields", "TaskSpec.fields['CosineDensity']", replace(TASK, fields={"SphericalHarmonics": SphericalHarmonics})),
     ("parameter_specs", "'means': found a name used twice", using(specs(name="means"))),
     ("parameter_specs", "'b2': lr: found 0", using(specs(lr=0))),
-    ("parameter_specs", "'b2': group: found 'colour'", using(specs(group="colour"))),
-    ("parameter_specs", "'b2': activation", using(specs(activation="log"))),
+    ("parameter_specs", "'b2': lr_unit: found 'metre'", using(specs(lr_unit="metre"))),
     ("parameter_specs", "'b2': shape", using(specs(shape=(-1,)))),
     ("parameter_specs", "'b 2'", using(specs(name="b 2"))),
     ("initialisers", "density.parameters: 'W1': init: two draws with one seed", using(Lazy)),
@@ -381,6 +380,7 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("conditions", "parse('no such value'): found it was taken", timed(parse=lenient)),
     ("conditions", "parse('0.25'): found shape (1,)", timed(parse=lambda text: [number(text)[0].reshape(1)])),
     ("conditions", "parse('0.25'): found 0.5", timed(parse=lambda text: [2 * number(text)[0]])),
+    ("conditions", "condition 'time': frames of its sweep '0.5': found 1; expected two or more", timed(sweep="0.5")),
     ("conditions", "condition 'time' = 0.0: found colors of primitive 0 is not finite", timed(BlowsUp)),
     ("missing_conditions", "it was drawn", timed(TimedByDefault)),
     ("missing_conditions", "something is missing", timed(Mute)),

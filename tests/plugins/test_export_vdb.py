@@ -16,7 +16,7 @@ from neuprim.core.vdb import Grid, read_grid
 from neuprim.exporting import export_run
 from neuprim.plugins.export import vdb as exporter
 from neuprim.trained import trained_model
-from tests.core.test_vdb_oracle import compare, environment, other_python
+from tests.core.openvdb_oracle import compare, environment, other_python
 from tests.plugins import marked
 
 

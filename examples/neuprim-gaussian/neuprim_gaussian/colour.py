@@ -26,8 +26,8 @@ class ViewDependentColour(ColourField):
 
     def parameters(self) -> list[ParameterSpec]:
         rest, C = sh.coefficient_count(self.degree) - 1, self.channels
-        base = ParameterSpec("base", (C,), lr=2e-2, init=lambda c: sh.initial_dc(c.colors), group="colour")
-        shine = ParameterSpec("shine", (rest, C), lr=2e-3, init=lambda c: torch.zeros(c.count, rest, C), group="colour")
+        base = ParameterSpec("base", (C,), lr=2e-2, init=lambda c: sh.initial_dc(c.colors))
+        shine = ParameterSpec("shine", (rest, C), lr=2e-3, init=lambda c: torch.zeros(c.count, rest, C))
         return [base, shine] if rest else [base]
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:

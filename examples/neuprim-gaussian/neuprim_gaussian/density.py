@@ -40,7 +40,7 @@ class BellDensity(DensityField):
         return {"deviations": self.deviations}
 
     def parameters(self) -> list[ParameterSpec]:
-        return [ParameterSpec("log_kappa", (1,), lr=5e-2, init=self._initial, activation="exp")]
+        return [ParameterSpec("log_kappa", (1,), lr=5e-2, init=self._initial)]
 
     def _initial(self, context: InitContext) -> Tensor:
         """Opacity ``model.init.alpha`` through the centre of a fresh primitive, which is a ball."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import torch
@@ -22,6 +23,8 @@ from neuprim.core.render.shading import Draw, with_shade
 __all__ = ["BACKENDS", "RenderOutput", "RenderSettings", "RenderStats", "choose_backend", "probe", "render", "render_lowered"]
 
 BACKENDS = ("reference", "cpu")
+
+_PROBE_ERROR = 1e-5  # float32 with fast functions errs by less than 1e-6 here
 
 
 def choose_backend(lowered: Lowered, settings: RenderSettings, camera: AnyCamera | None = None) -> str:
@@ -106,5 +109,7 @@ def probe(name: str) -> str | None:
         middle = render_lowered(lowered, camera, RenderSettings(backend=name)).rgb[8, 8, 0].item()  # type: ignore[arg-type]
     except Exception as error:  # a broken installation may fail in any way; the reason is what the user wants to read
         return f"{type(error).__name__}: {error}"
-    expected = 0.8646
-    return None if abs(middle - expected) < 2e-2 else f"drew {middle:.4f} where {expected} was expected"
+    aside = (camera.cx - 8.5) / camera.fx  # the pixel's centre is half a pixel from the sphere's, on both axes
+    missed = 3.0 * math.sin(math.atan(math.hypot(aside, aside)))  # how far from the centre its ray passes
+    expected = 1.0 - math.exp(-2.0 * math.sqrt(1.0 - missed**2))  # density 1 along the chord of a unit sphere
+    return None if abs(middle - expected) < _PROBE_ERROR else f"drew {middle:.6f} where {expected:.6f} was expected"

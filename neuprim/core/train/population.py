@@ -14,7 +14,31 @@ from neuprim.core.primitives import Primitives
 from neuprim.core.render.output import RenderStats
 from neuprim.core.train.settings import PopulationSettings
 
-__all__ = ["Change", "Fixed", "Gradient", "Population", "Relocate", "make_population", "split"]
+__all__ = [
+    "SPLIT_GAUSSIAN",
+    "SPLIT_LONG",
+    "SPLIT_OTHERS",
+    "SPLIT_SHIFT",
+    "Change",
+    "Fixed",
+    "Gradient",
+    "Population",
+    "Relocate",
+    "make_population",
+    "split",
+]
+
+SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS = 0.5, 0.6, 0.9
+"""A child's centre and semi-axes over its parent's: shift along the longest axis, that axis, the other two.
+
+As exact children carry their parent's sigma only inside themselves, what they leave uncovered vanishes and what both cover counts twice.
+These cover 78 % of the parent and overlap in 2 %, with 2 x 0.6 x 0.9^2 = 0.97 of its volume. Found by training: relocation with them gained
+0.5 to 1.2 dB over a fixed set on photographs of a chair, and five other shapes tried on smoke and fire were no better.
+"""
+
+SPLIT_GAUSSIAN = 1 / 1.6
+"""All semi-axes of a child over its parent's, in the rule of 3D Gaussian splatting (Kerbl et al. 2023: 0.8 times the number of children)
+that the authors of the method keep; such children cover 45 % of their parent."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +90,7 @@ class Fixed(Population):
 def split(model: Primitives, parents: Tensor, shift: float, long_factor: float, other_factor: float) -> dict[str, Tensor]:
     """Two children per parent, all first ones then all second ones, each carrying its parent's fields unchanged.
 
-    Children sit at +-shift x the longest semi-axis, inside the parent's support; that axis shrinks by ``long_factor``,
+    Children sit at +-shift x the longest semi-axis from the parent's centre; that axis shrinks by ``long_factor``,
     the others by ``other_factor``. Parents that the density divides along a condition (time) stay where they are.
 
     Raises:
@@ -131,7 +155,7 @@ class Relocate(Population):
         if moves == 0:
             return None
         idle, busiest = idle[:moves], busiest[:moves]
-        children = split(model, busiest, 0.5, 0.6, 0.9)
+        children = split(model, busiest, SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS)
         params = {n: v.detach().clone() for n, v in model.params.items()}
         target = torch.cat([busiest, idle])
         for name, value in params.items():
@@ -206,7 +230,7 @@ class Gradient(Population):
         place[kept] = torch.arange(len(kept))
         for name, value in halved.items():
             params[name][place[clones]] = value
-        children = split(model, splits, 0.5, 1 / 1.6, 1 / 1.6)
+        children = split(model, splits, SPLIT_SHIFT, SPLIT_GAUSSIAN, SPLIT_GAUSSIAN)
         params = {n: torch.cat([params[n], copies[n], children[n]]) for n in params}
         origin = torch.cat([kept, clones, splits, splits])
         fresh = torch.zeros(len(origin), dtype=torch.bool)

@@ -178,7 +178,8 @@ class Trainer:
             channels = difference.shape[-1]
             output.stats.pixel_error = difference.abs() @ torch.full((channels,), 1.0 / channels)
             flat = difference.reshape(-1)
-            mse = torch.dot(flat, flat).item() / flat.numel()
+            counted = flat.numel() if pixels.mask is None else int(pixels.mask.sum()) * channels
+            mse = torch.dot(flat, flat).item() / counted
         loss.backward()
 
         self.population.observe(model, output.stats)

@@ -33,6 +33,9 @@ def check_conditions(t: Subject) -> None:
         low, high = spec.range
         t.require(low < high, f"{where}: range", spec.range, "a lower and a higher end")
         _parses(t, spec, where)
+        if spec.sweep:
+            frames, expected = spec.parse(spec.sweep), "two or more, an animation"
+            t.require(len(frames) > 1, f"{where}: frames of its sweep {spec.sweep!r}", len(frames), expected)
         try:
             spec.parse("no such value")
         except NeuprimError:

@@ -75,7 +75,7 @@ def _refuses_unknown(t: Subject, field: Any, settings: dict[str, Any]) -> None:
 
 
 def check_parameter_specs(t: Subject) -> None:
-    """Names are unique, shapes and rates possible, groups the field's own: optimiser, checkpoint and export all live off this list."""
+    """Names are unique, shapes and rates possible: optimiser, checkpoint and export all live off this list."""
     taken = {s.name for s in GEOMETRY_SPECS}
     for kind, spec in t.specs():
         where = f"{kind}.parameters: {spec.name!r}"
@@ -86,9 +86,7 @@ def check_parameter_specs(t: Subject) -> None:
         fits = isinstance(spec.shape, tuple) and all(isinstance(n, int) and n >= 0 for n in spec.shape)
         t.require(fits, f"{where}: shape", spec.shape, "a tuple of whole numbers, () for a scalar")
         t.require(math.isfinite(spec.lr) and spec.lr > 0, f"{where}: lr", spec.lr, "a positive rate")
-        t.require(spec.activation in ("none", "exp", "normalize"), f"{where}: activation", spec.activation, "none, exp or normalize")
         t.require(spec.lr_unit in ("absolute", "extent"), f"{where}: lr_unit", spec.lr_unit, "absolute or extent")
-        t.require(spec.group == kind, f"{where}: group", repr(spec.group), repr(kind))
         t.require(callable(spec.init), f"{where}: init", type(spec.init).__name__, "a function of InitContext")
 
 

@@ -9,6 +9,7 @@ from neuprim.core.fields import Conditions
 from neuprim.core.geometry import Geometry
 from neuprim.core.primitives import Primitives
 from neuprim.core.render import render
+from neuprim.core.train.population import SPLIT_LONG, SPLIT_OTHERS, SPLIT_SHIFT
 from neuprim.plugins.conformance.forms import double
 from neuprim.plugins.conformance.integrals import Alive, inside
 from neuprim.plugins.conformance.subject import EXACT, Subject
@@ -56,8 +57,8 @@ def check_on_split(t: Subject) -> None:
     model = t.model()
     old = model.geometry
     axis = torch.nn.functional.one_hot(old.log_scales.argmax(-1), 3).double()
-    step = 0.5 * (old.rotations * (axis * old.scales)[:, None]).sum(-1)
-    shrink = torch.where(axis > 0, 0.6, 0.9).double().log()
+    step = SPLIT_SHIFT * (old.rotations * (axis * old.scales)[:, None]).sum(-1)
+    shrink = torch.where(axis > 0, SPLIT_LONG, SPLIT_OTHERS).double().log()
     parents = model.of(model.density)
     colours = model.of(model.colour)
     children = []

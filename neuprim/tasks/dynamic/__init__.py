@@ -77,7 +77,7 @@ TASK = TaskSpec(
     build=_build,
     loss=photometric,
     check=_check,
-    conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_times),),
+    conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_times, sweep="0:1"),),
     fields={"TimeDensity": TimeDensity, "TimeHarmonics": TimeHarmonics},
     uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),
 )

@@ -59,12 +59,12 @@ class TimeHarmonics(ColourField):
 
     def parameters(self) -> list[ParameterSpec]:
         C, rest = self.channels, sh.coefficient_count(self.degree) - 1
-        specs = [ParameterSpec("sh_dc", (C,), 1e-2, lambda c: sh.initial_dc(c.colors), group="colour")]
+        specs = [ParameterSpec("sh_dc", (C,), 1e-2, lambda c: sh.initial_dc(c.colors))]
         for name, terms in (("time_poly", self.powers), ("time_cos", self.waves), ("time_sin", self.waves)):
             if terms:
-                specs.append(ParameterSpec(name, (terms, C), 5e-3, _zeros(terms, C), group="colour"))
+                specs.append(ParameterSpec(name, (terms, C), 5e-3, _zeros(terms, C)))
         if rest:
-            specs.append(ParameterSpec("sh_rest", (rest, C), 2e-3, _zeros(rest, C), group="colour"))
+            specs.append(ParameterSpec("sh_rest", (rest, C), 2e-3, _zeros(rest, C)))
         return specs
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:

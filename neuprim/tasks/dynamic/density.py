@@ -22,6 +22,7 @@ from neuprim.core.cosine import OMEGA0, CosineDensity, cosine_density, split_cos
 from neuprim.core.fields import Conditions, Cosine, DensityField
 from neuprim.core.geometry import Geometry
 from neuprim.core.schema import InitContext, ParameterSpec, Params
+from neuprim.core.train.population import SPLIT_LONG, SPLIT_SHIFT
 
 __all__ = ["PARTS", "TimeDensity", "time_of"]
 
@@ -128,14 +129,17 @@ class TimeDensity(DensityField):
         return children
 
     def divide(self, params: Params, geometry: Geometry) -> tuple[Tensor, dict[str, Tensor], Geometry] | None:
-        """Windows longer than ``divide_above`` are halved; the halves overlap, as windows fade at their ends."""
+        """Windows longer than ``divide_above`` are halved; the halves overlap, as windows fade at their ends.
+
+        Time is one more axis: halves lie along it as the children of a split do along the longest axis of space.
+        """
         if "window" not in self.parts or self.divide_above <= 0:
             return None
         tau = params["log_window"].double().exp()
-        later = torch.cat([-0.5 * tau, 0.5 * tau]).float()
+        later = torch.cat([-SPLIT_SHIFT * tau, SPLIT_SHIFT * tau]).float()
         halves = {name: torch.cat([value, value]) for name, value in params.items()}
         halves["window_center"] = halves["window_center"] + later
-        halves["log_window"] = halves["log_window"] + math.log(0.6)
+        halves["log_window"] = halves["log_window"] + math.log(SPLIT_LONG)
         means = torch.cat([geometry.means, geometry.means])
         if "motion" in self.parts:
             velocity, acceleration = halves["velocity"], halves["acceleration"]

@@ -80,7 +80,7 @@ TASK = TaskSpec(
     loss=l1,
     check=_check,
     conditions=(
-        ConditionSpec("light", (3,), "position, scene units", (-1e6, 1e6), parse_lights),
+        ConditionSpec("light", (3,), "position, scene units", (-1e6, 1e6), parse_lights, sweep="orbit"),
         ConditionSpec("light_intensity", (3,), "radiometric", (0.0, 1e6), parse_intensities),
     ),
     fields={"CosineDensity": CosineDensity, "LightNetwork": LightNetwork, "LightHarmonics": LightHarmonics},

@@ -81,12 +81,12 @@ class LightNetwork(ColourField):
         H, C = self.hidden, self.channels
         outputs = (C, H) if self.form == "additive" else (1, H)
         return [
-            ParameterSpec("c_dc", (C,), 1e-2, lambda c: c.colors.clamp_min(_DARKEST).float(), group="colour"),
-            ParameterSpec("net_x", (H, 3), 1e-2, lambda c: c.uniform(H, 3, bound=1 / 9), group="colour"),
-            ParameterSpec("net_view", (H, 3), 1e-2, lambda c: c.uniform(H, 3, bound=1 / 3), group="colour"),
-            ParameterSpec("net_light", (H, 3), 1e-2, lambda c: c.uniform(H, 3, bound=1 / 3), group="colour"),
-            ParameterSpec("net_phase", (H,), 1e-2, lambda c: c.uniform(H, bound=math.pi / self.boost), group="colour"),
-            ParameterSpec("net_out", outputs, 2e-2, lambda c: c.uniform(*outputs, bound=_output(c)), group="colour"),
+            ParameterSpec("c_dc", (C,), 1e-2, lambda c: c.colors.clamp_min(_DARKEST).float()),
+            ParameterSpec("net_x", (H, 3), 1e-2, lambda c: c.uniform(H, 3, bound=1 / 9)),
+            ParameterSpec("net_view", (H, 3), 1e-2, lambda c: c.uniform(H, 3, bound=1 / 3)),
+            ParameterSpec("net_light", (H, 3), 1e-2, lambda c: c.uniform(H, 3, bound=1 / 3)),
+            ParameterSpec("net_phase", (H,), 1e-2, lambda c: c.uniform(H, bound=math.pi / self.boost)),
+            ParameterSpec("net_out", outputs, 2e-2, lambda c: c.uniform(*outputs, bound=_output(c))),
         ]
 
     def shade(self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings) -> Shading | None:

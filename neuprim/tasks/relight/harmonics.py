@@ -35,9 +35,9 @@ class LightHarmonics(ColourField):
 
     def parameters(self) -> list[ParameterSpec]:
         C, rest = self.channels, (self.degree + 1) ** 2 - 1
-        specs = [ParameterSpec("c_dc", (C,), 1e-2, lambda c: c.colors.clamp_min(1e-3).float(), group="colour")]
+        specs = [ParameterSpec("c_dc", (C,), 1e-2, lambda c: c.colors.clamp_min(1e-3).float())]
         if rest:
-            specs.append(ParameterSpec("light_sh", (rest, C), 1e-2, lambda c: torch.zeros(c.count, rest, C), group="colour"))
+            specs.append(ParameterSpec("light_sh", (rest, C), 1e-2, lambda c: torch.zeros(c.count, rest, C)))
         return specs
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:

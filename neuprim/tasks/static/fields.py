@@ -38,9 +38,9 @@ class SphericalHarmonics(ColourField):
 
     def parameters(self) -> list[ParameterSpec]:
         C, rest = self.channels, sh.coefficient_count(self.degree) - 1
-        specs = [ParameterSpec("sh_dc", (C,), 2e-2, lambda c: sh.initial_dc(c.colors), group="colour")]
+        specs = [ParameterSpec("sh_dc", (C,), 2e-2, lambda c: sh.initial_dc(c.colors))]
         if rest:
-            specs.append(ParameterSpec("sh_rest", (rest, C), 2e-3, lambda c: torch.zeros(c.count, rest, C), group="colour"))
+            specs.append(ParameterSpec("sh_rest", (rest, C), 2e-3, lambda c: torch.zeros(c.count, rest, C)))
         return specs
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:

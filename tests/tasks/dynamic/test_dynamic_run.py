@@ -19,7 +19,8 @@ from neuprim.evaluate import evaluate_run, load_run, render_run
 from neuprim.run import run
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.time import parse_times
-from tests.tasks.dynamic.test_volume_scene import blob
+from tests.reports import offered
+from tests.tasks.dynamic.sequences import blob
 
 SMALL = ["scene.size=24", "scene.cameras=6", "scene.samples=1", "model.primitives=60", "model.neurons=2", "train.max_seconds=null"]
 
@@ -63,6 +64,14 @@ def test_the_report_shows_films_beside_their_truth(finished: Path) -> None:
         assert film.size == (48, 24) and getattr(film, "n_frames", 1) == 4
     page = (finished / "report.html").read_text()
     assert "Held-out films" in page and "PSNR over the frames" in page and "PSNR inside the mask" in page
+
+
+def test_the_report_offers_commands_that_work(finished: Path, tmp_path: Path) -> None:
+    commands = offered(finished / "report.html")
+    assert ["render", str(finished), "--camera", "orbit", "--time", "0:1"] in commands
+    for i, words in enumerate(commands):
+        small = ["--size", "6x5", "--frames", "2", "--out", str(tmp_path / str(i))] if words[0] == "render" else []
+        assert main([*words, *small]) == 0, words
 
 
 def test_eval_gives_the_same_numbers(finished: Path) -> None:

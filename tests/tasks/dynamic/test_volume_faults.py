@@ -15,7 +15,7 @@ from neuprim.core.vdb import Grid, scale_transform, write_vdb
 from neuprim.tasks.dynamic.volume.looks import changed, named_look
 from neuprim.tasks.dynamic.volume.normalise import Normalisation
 from neuprim.tasks.dynamic.volume.optics import medium_of
-from tests.tasks.dynamic.test_volume_scene import VOXEL, blob, dataset
+from tests.tasks.dynamic.sequences import VOXEL, blob, dataset
 
 
 @pytest.fixture

@@ -13,25 +13,14 @@ import torch
 
 from neuprim.core.density_grid import lattice
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.task import SceneContext
 from neuprim.core.vdb import Grid, scale_transform, write_vdb
 from neuprim.tasks.dynamic.volume import shoot as shooting
 from neuprim.tasks.dynamic.volume.compare import extinction_on
-from neuprim.tasks.dynamic.volume.dataset import FrameViews, VolumeDataset
-from neuprim.tasks.dynamic.volume.scene import load
+from neuprim.tasks.dynamic.volume.dataset import FrameViews
 from neuprim.tasks.dynamic.volume.settings import choose_frames
+from tests.tasks.dynamic.sequences import VOXEL, blob, dataset
 
 NUMBERS = (2, 9, 10, 11)
-VOXEL = 0.5
-
-
-def blob(center: float, names: tuple[str, ...] = ("density", "flames")) -> list[Grid]:
-    """A ball of radius 5 voxels at x = ``center``, denser in the middle."""
-    index = np.stack(np.meshgrid(*(np.arange(24, dtype=np.float32),) * 3, indexing="ij"), -1)
-    radius = np.linalg.norm(index - np.array([center, 12, 12], np.float32), axis=-1)
-    value = np.clip(1 - radius / 5, 0, None)
-    transform = scale_transform(VOXEL, (10.0, 0.0, -3.0))
-    return [Grid.from_dense(name, value * (0.2 if name == "flames" else 1.0), transform=transform) for name in names]
 
 
 @pytest.fixture
@@ -43,13 +32,6 @@ def folder(tmp_path: Path) -> Path:
     for step, number in enumerate(NUMBERS[1:]):
         write_vdb(made / f"ball_{number}.vdb", blob(8.0 + 4 * step))
     return made
-
-
-def dataset(folder: Path, tmp_path: Path, **changes: Any) -> VolumeDataset:
-    settings = {"vdb": str(folder), "size": 24, "cameras": 6, "samples": 1, "look": "smoke_fire", **changes}
-    found = load(settings, SceneContext(0, tmp_path / "cache"))
-    assert isinstance(found, VolumeDataset)
-    return found
 
 
 def test_frames_in_numerical_order_cameras_and_times(folder: Path, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from neuprim.tasks.relight import TASK
 from neuprim.tasks.relight.colour import FORMS, LightNetwork
 from neuprim.tasks.relight.harmonics import LightHarmonics, real_harmonics
 from neuprim.tasks.relight.lights import parse_intensities, parse_lights
-from neuprim.tasks.relight.visibility import light_visibility
+from neuprim.tasks.relight.visibility import BIAS, SOFTNESS, light_visibility
 from tests import scenes
 
 COUNT = 12
@@ -142,10 +142,21 @@ def slabs() -> tuple[Geometry, Cosine]:
 
 def test_what_lies_behind_something_is_in_its_shadow() -> None:
     geometry, density = slabs()
-    straight = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 5.0]), SETTINGS, bias=0.35)(geometry.means)
+    straight = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 5.0]), SETTINGS, bias=0.0875)(geometry.means)
     assert float(straight[3]) < 0.05 and bool((straight[[0, 1, 2, 4, 5]] > 0.8).all())
-    slanted = light_visibility(geometry, density, torch.tensor([4.0, 0.0, 1.0 + 4.0 * (1.0 / 0.75)]), SETTINGS, bias=0.35)(geometry.means)
+    slanted = light_visibility(geometry, density, torch.tensor([4.0, 0.0, 1.0 + 4.0 * (1.0 / 0.75)]), SETTINGS, bias=0.0875)(geometry.means)
     assert float(slanted[2]) < 0.3 and float(slanted[3]) > 0.8
+
+
+@pytest.mark.parametrize("size", [1.0, 50.0])
+def test_light_fades_over_parts_of_the_scene_s_diameter(size: float) -> None:
+    """Behind a disc, at the depths that BIAS and SOFTNESS name."""
+    geometry = Geometry(torch.zeros(1, 3), (size * torch.tensor([[1.0, 1.0, 1e-4]])).log(), torch.tensor([[1.0, 0, 0, 0]]))
+    density = Cosine(torch.zeros(1, 0, 3), torch.zeros(1, 0), torch.zeros(1, 0), torch.full((1, 1), 1e6))
+    behind = torch.tensor([0.0, BIAS, BIAS + SOFTNESS, 3 * BIAS]) * 2 * size
+    points = torch.stack([torch.zeros(4), torch.zeros(4), -behind], -1)
+    found = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 4.0 * size]))(points)
+    assert torch.allclose(found, torch.tensor([0.924, 0.5, 0.269, 0.007]), atol=0.01)
 
 
 def test_shadows_carry_no_gradient_and_are_bounded() -> None:

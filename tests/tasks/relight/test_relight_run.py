@@ -15,8 +15,10 @@ from neuprim.cli import main
 from neuprim.config import compose
 from neuprim.core.errors import ConfigError
 from neuprim.core.images import write_exr
-from neuprim.evaluate import render_run
-from neuprim.run import run
+from neuprim.evaluate import load_dataset, load_run, render_run
+from neuprim.plugins.registry import load_task
+from neuprim.run import make_trainer, run
+from tests.reports import offered
 
 SCENE = ["task=relight", "scene=lit_solids", "scene.size=32", "scene.train_views=24", "scene.test_views=6", "scene.supersampling=1"]
 SMALL = ["model.primitives=150", "model.neurons=2", "model.colour.hidden=3", "train.max_seconds=null"]
@@ -51,6 +53,24 @@ def test_the_light_goes_round(finished: Path, tmp_path: Path) -> None:
         assert getattr(film, "n_frames", 1) == 5
 
 
+def test_the_report_offers_commands_that_work(finished: Path, tmp_path: Path) -> None:
+    commands = offered(finished / "report.html")
+    assert ["render", str(finished), "--camera", "orbit", "--light", "orbit"] in commands
+    assert not any("--time" in words for words in commands), "a scene under lights has no time"
+    for i, words in enumerate(commands):
+        small = ["--size", "6x5", "--frames", "2", "--out", str(tmp_path / str(i))] if words[0] == "render" else []
+        assert main([*words, *small]) == 0, words
+
+
+def test_a_missing_condition_is_asked_for_by_its_flag(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    camera = {"w": 6, "h": 5, "camera_angle_x": 0.5, "frames": [{"name": "a", "transform_matrix": np.eye(4).tolist()}]}
+    (tmp_path / "cameras.json").write_text(json.dumps(camera))
+    words = ["render", str(finished), "--camera", str(tmp_path / "cameras.json"), "--light", "3,0,3"]
+    assert main(words) == 2
+    assert "has no light_intensity, which task 'relight' needs; give --light-intensity" in capsys.readouterr().err
+    assert main([*words, "--light-intensity", "9", "--out", str(tmp_path / "a.png")]) == 0
+
+
 def test_light_from_all_around(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sky = torch.linspace(1.0, 0.0, 16)[:, None, None].expand(16, 32, 3)
     write_exr(tmp_path / "sky.exr", sky, half=False)
@@ -65,18 +85,28 @@ def test_light_from_all_around(finished: Path, tmp_path: Path, capsys: pytest.Ca
 
 
 @pytest.mark.parametrize(
-    "words",
+    ("words", "colour"),
     [
-        ["model.colour.form=multiplicative"],
-        ["model.colour.form=harmonics", "model.colour.degree=3"],
-        ["model.colour.visibility=none", "train.loss=compressed"],
-        ["model.colour.hidden=0", "train.loss=relative"],
-        ["preset=paper", "train.population.every=5"],
+        (["model.colour.form=multiplicative"], {"form": "multiplicative", "hidden": 3, "visibility": "primitive"}),
+        (["model.colour.form=harmonics", "model.colour.degree=3"], {"degree": 3}),
+        (["model.colour.visibility=none", "train.loss=compressed"], {"form": "additive", "hidden": 3, "visibility": "none"}),
+        (["model.colour.hidden=0", "train.loss=relative"], {"form": "additive", "hidden": 0, "visibility": "primitive"}),
+        (["preset=paper", "train.population.every=5"], {"form": "additive", "hidden": 3, "visibility": "none"}),
     ],
 )
-def test_every_variant_runs(tmp_path: Path, words: list[str]) -> None:
+def test_every_variant_runs(tmp_path: Path, words: list[str], colour: dict[str, object]) -> None:
+    """To the end: the model on disk is what was asked for, has moved from where it started, and was measured."""
     small = [w for w in SMALL if not (w.startswith("model.colour") and "harmonics" in str(words))]
-    assert run(compose([*SCENE, *small, *words, "train.iterations=8", f"output_dir='{tmp_path / 'run'}'"]), Console(quiet=True))
+    config = compose([*SCENE, *small, *words, "train.iterations=8", f"output_dir='{tmp_path / 'run'}'"])
+    task = load_task("relight")
+    start = make_trainer(config, task, load_dataset(config, task)).model
+    m = json.loads((run(config, Console(quiet=True)) / "metrics.json").read_text())
+    assert m["iterations"] == 8 and len(m["per_view"]) == 6 and m["psnr_linear_clamped"] > 5
+    end = load_run(tmp_path / "run")[2]
+    assert colour.items() <= end.colour.settings().items()
+    for name in end.params:
+        changed = not torch.equal(start.params[name], end.params[name])
+        assert changed == (end.params[name].numel() > 0), name
 
 
 @pytest.mark.parametrize(
@@ -96,4 +126,4 @@ def test_a_wrong_loss() -> None:
     with pytest.raises(ConfigError, match=r"train\.loss=l2: no such loss; did you mean 'l1'\?"):
         compose(["task=relight", "train.loss=l2"], False)
     with pytest.raises(ConfigError, match=r"task\.options\.loss: task 'relight' has no such option; did you mean 'train\.loss'\?"):
-        compose(["task=relight", "task.options.loss=compressed"], False)
+        compose(["task=relight", "train.loss=compressed"], False)

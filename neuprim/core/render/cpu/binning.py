@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from neuprim.core.render.cpu.compile import exact_kernel
 from neuprim.core.render.cpu.layout import HX, HY, SKEW, TILE, UNBOUNDED, UX, UY, XC, YC
+from neuprim.core.render.cpu.prepare import VISIBLE
 from neuprim.core.render.cpu.threads import parallel_for
 
 __all__ = ["TileLists", "bin_primitives", "depth_order"]
@@ -79,11 +80,11 @@ def _tile_range(span, ux, uy, box, ty):  # type: ignore[no-untyped-def]
 
 
 @exact_kernel
-def _count(start, stop, order, rows, spans, boxes, visible, counts):  # type: ignore[no-untyped-def]
+def _count(start, stop, order, rows, spans, boxes, status, counts):  # type: ignore[no-untyped-def]
     for r in range(start, stop):
         i = order[r]
         total = 0
-        if visible[i] == 0:
+        if status[i] == VISIBLE:
             box = boxes[i]
             for ty in range(box[1] // TILE, (box[3] - 1) // TILE + 1):
                 lo, hi = _tile_range(spans[i], np.float64(rows[i, UX]), np.float64(rows[i, UY]), box, ty)

@@ -1,14 +1,16 @@
 """How the kernels are compiled: flags, and where numba keeps the result.
 
-numba's cache does not notice edits in *other* files that were inlined, and site-packages may be read-only, so the cache
-lives in the user's own cache folder under a name made of the version and a hash of all kernel sources.
-``NUMBA_CACHE_DIR``, where set, wins.
+numba's cache notices edits of the file a kernel is in, but not of *other* files whose functions it inlined or whose constants it froze;
+and site-packages may be read-only. So the cache lives in the user's own cache folder, under a name made of the version and a hash of
+every source that can end up in compiled code: see :func:`kernel_sources`. ``NUMBA_CACHE_DIR``, where set, wins.
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ from numba import njit
 import neuprim
 from neuprim.core import files
 
-__all__ = ["FAST", "cache_directory", "exact_kernel", "inline", "kernel"]
+__all__ = ["FAST", "cache_directory", "exact_kernel", "inline", "kernel", "kernel_sources", "sources_hash"]
 
 
 def _prefer_wide_vectors() -> None:
@@ -39,15 +41,33 @@ FAST = {"nnan", "nsz", "arcp", "contract", "afn", "reassoc"}
 """Floating-point freedom of the pixel kernels. NaN checks vanish under it: rows are checked before (``prepare``)."""
 
 
+_COMPILED = re.compile(rb"\bnumba\b|\bcpu\.compile import [^\n]*\b(?:exact_kernel|kernel|inline)\b")
+
+
+def kernel_sources(package: Path) -> list[Path]:
+    """Files of a package that can end up in compiled code: all of ``core/render/cpu``, and those that use its decorators or name numba.
+
+    A module of constants for kernels outside that folder says "numba" in its text, and is found by that; the tests compare this list with
+    all that the kernels refer to.
+    """
+    own = package / "core" / "render" / "cpu"
+    return [file for file in sorted(package.rglob("*.py")) if own in file.parents or _COMPILED.search(file.read_bytes())]
+
+
+@functools.cache
+def sources_hash(package: Path) -> str:
+    """Twelve hexadecimal digits that change with any of :func:`kernel_sources`."""
+    digest = hashlib.sha256()
+    for source in kernel_sources(package):
+        digest.update(source.relative_to(package).as_posix().encode() + b"\0" + source.read_bytes() + b"\0")
+    return digest.hexdigest()[:12]
+
+
 def cache_directory() -> Path:
     """Folder of the compiled kernels for this version of the sources."""
     if os.environ.get("NUMBA_CACHE_DIR"):
         return Path(os.environ["NUMBA_CACHE_DIR"])
-    digest = hashlib.sha256()
-    core = Path(__file__).parents[2]
-    for source in sorted([*core.glob("render/cpu/*.py"), *core.glob("**/*_cpu.py"), core / "train" / "optimizer.py"]):
-        digest.update(source.read_bytes())
-    return files.cache_directory() / "kernels" / f"{neuprim.__version__}-{digest.hexdigest()[:12]}"
+    return files.cache_directory() / "kernels" / f"{neuprim.__version__}-{sources_hash(Path(neuprim.__file__).parent)}"
 
 
 def _jit(**options: Any) -> Callable[[Any], Any]:

@@ -306,7 +306,11 @@ def prepare_backward(  # type: ignore[no-untyped-def]
     start, stop, means, log_scales, quats, W1, R, t, cam, near, turns, rows, order, grads, touched,
     g_means, g_log_scales, g_quats, g_W1, g_b1, g_w2, g_b2, g_view, want_view,
 ):  # fmt: skip
-    """Chain rule from gradient rows to parameters, for primitives ``start:stop``; returns dL/d(R | t) of this chunk, (3, 4)."""
+    """Chain rule from gradient rows to parameters, for primitives ``start:stop``.
+
+    With ``want_view`` it also fills ``g_view`` (N, 3, 4), each primitive's part of dL/d(R | t); rows that are not ``touched`` stay as they
+    are.
+    """
     K = W1.shape[1]
     local, B, A, gA, gB, gL = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     axes, c, anchor, ref, w = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)

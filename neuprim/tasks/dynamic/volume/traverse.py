@@ -4,8 +4,6 @@ A cell is the cube between eight voxel centres. Along a straight line through it
 two Gauss points integrate exactly: the optical depth of a ray has no discretisation error at all. For the radiance, the points'
 sources are weighted by the transmittance up to each, and the weights scaled so that a constant source is integrated exactly: fourth
 order in the step. Steps of an optical depth above 0.5 are made shorter where the ray is, so thick smoke needs no setting.
-
-Both kernels are in one file because numba's cache does not notice edits of other files.
 """
 
 from __future__ import annotations

@@ -1,0 +1,28 @@
+"""Factors of the real spherical harmonics up to degree 3, with the signs of 3D Gaussian splatting; numba freezes them into its kernels."""
+
+from __future__ import annotations
+
+import math
+
+__all__ = ["C0", "C1", "C2", "C3"]
+
+C0 = 0.5 / math.sqrt(math.pi)
+"""Y_00: a colour c of every direction has the coefficient (c - 0.5)/C0."""
+
+C1 = math.sqrt(3.0 / (4.0 * math.pi))
+C2 = (
+    math.sqrt(15.0 / (4.0 * math.pi)),
+    -math.sqrt(15.0 / (4.0 * math.pi)),
+    math.sqrt(5.0 / (16.0 * math.pi)),
+    -math.sqrt(15.0 / (4.0 * math.pi)),
+    math.sqrt(15.0 / (16.0 * math.pi)),
+)
+C3 = (
+    -math.sqrt(35.0 / (32.0 * math.pi)),
+    math.sqrt(105.0 / (4.0 * math.pi)),
+    -math.sqrt(21.0 / (32.0 * math.pi)),
+    math.sqrt(7.0 / (16.0 * math.pi)),
+    -math.sqrt(21.0 / (32.0 * math.pi)),
+    math.sqrt(105.0 / (16.0 * math.pi)),
+    -math.sqrt(35.0 / (32.0 * math.pi)),
+)

@@ -100,7 +100,7 @@ class Plain(ColourField):
         return {{"channels": self.channels}}
 
     def parameters(self):
-        return [ParameterSpec("logit", (self.channels,), 5e-2, self.start, group="colour")]
+        return [ParameterSpec("logit", (self.channels,), 5e-2, self.start)]
 
     def start(self, context):
         {start}

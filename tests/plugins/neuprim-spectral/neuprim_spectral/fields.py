@@ -85,7 +85,7 @@ class ShiftedSpectrum(ColourField):
             logit = c.colors.logit(eps=0.02)
             return torch.cat([logit, logit[:, -1:]], dim=1)
 
-        return [ParameterSpec("logit", (self.channels + 1,), 5e-2, start, group="colour")]
+        return [ParameterSpec("logit", (self.channels + 1,), 5e-2, start)]
 
     def lower(self, params, geometry, camera, conditions):
         return Constant(spectrum(params["logit"], conditions["wavelength_shift"]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from neuprim.conformance.subject import Subject
-from neuprim.core.errors import NeuprimError
+from neuprim.core.errors import FormError, NeuprimError
 from neuprim.core.render import render
 
 __all__ = ["check_channels"]
@@ -29,8 +29,10 @@ def check_channels(t: Subject) -> None:
         data = f"with data of {count} channel{'s' * (count > 1)}"
         t.require(declared[count] == count, f"colour.channels {data}", declared[count], str(count))
         model, view = other.model(), other.views()[0]
-        rgb = render(model, view.camera, view.conditions, other.settings.renderer).rgb
-        t.require(rgb.shape[-1] == count, f"colour.lower {data}: channels", rgb.shape[-1], str(count))
+        try:
+            render(model, view.camera, view.conditions, other.settings.renderer)
+        except FormError as error:
+            raise FormError(f"{data}: {error}") from error
         trainer = other.trainer(2)
         for _ in trainer.run():
             pass

@@ -166,7 +166,7 @@ class Exporter:
         read: for lossless formats, ``neuprim import``: what ``write`` wrote, from an untrusted file; raises
             :class:`~neuprim.core.errors.DataError`. Chosen by the file's suffix, which is then the exporter's name.
         default: name of the file or folder in ``RUN_DIR/export`` where the user names none; "" for the exporter's name with the first
-            suffix.
+            suffix. It ends in one of these, where there are any.
         suffixes: what the name of its one file may end in, as ``(".glb", ".ply")``; other names, and folders, are refused before it is
             called. Empty: it takes any name, also that of a folder.
     """

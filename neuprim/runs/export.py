@@ -48,7 +48,11 @@ def export_run(
     Raises:
         NeuprimError: no such run, format or option, something that the format cannot hold, files in its way, or an exporter that crashed.
     """
-    exporter = load_exporter(name)
+    try:
+        exporter = load_exporter(name)
+    except UnknownPlugin:
+        load_run(run_dir)  # that the run's own package is gone says more
+        raise
     final = _destination(run_dir, exporter, out)
     refuse_taken(final, overwrite)
     run = trained_model(run_dir, progress)

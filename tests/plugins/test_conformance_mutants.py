@@ -286,6 +286,16 @@ def uphill(settings: Mapping[str, Any]) -> Any:
     return loss
 
 
+def maskless(settings: Mapping[str, Any]) -> Any:
+    """Fails where some pixels do not count, which only some data sets have."""
+
+    def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
+        difference = (rendered - truth).abs()
+        return difference.mean() if frame.mask is None else difference[:, frame.mask].mean(), {}
+
+    return loss
+
+
 def per_pixel(settings: Mapping[str, Any]) -> Any:
     return lambda rendered, truth, frame: ((rendered - truth).abs(), {})
 
@@ -337,14 +347,15 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("loss", "shape (9, 10, 3)", using(loss=per_pixel)),
     ("loss", "no gradient", using(loss=detached)),
     ("loss", "loss part 'l1'", using(loss=wordy)),
+    ("loss", "stopped by IndexError", using(loss=maskless)),
     ("lowered_forms", "density field Transposed lowered to Cosine: b2 has shape (1, 12); expected (12, 1) or (12,)", using(Transposed)),
     (
         "lowered_forms",
         "density.lower: W1: found torch.float32; expected torch.float64",
         using(lowers(lambda f, g: replace(f, W1=f.W1.float()))),
     ),
-    ("lowered_forms", "colour field Grey: lower returned 1 channels; expected 3", using(colour=Grey)),
-    ("channels", "colour field FirstThree: lower returned 3 channels; expected 5", using(colour=FirstThree)),
+    ("lowered_forms", "colour field Grey: lower returned a colour of C=1; expected 3", using(colour=Grey)),
+    ("channels", "with data of 5 channels: colour field FirstThree: lower returned a colour of C=3; expected 5", using(colour=FirstThree)),
     ("channels", "colour.channels with data of 5 channels: found 3; expected 5", replace(using(), build=at_most_three)),
     ("channels", "stopped by RuntimeError", replace(using(), loss=three_only)),
     ("alive", "density.alive: density of a primitive that it leaves out", using(LeavesOut)),

@@ -107,7 +107,7 @@ def test_the_default_place_is_in_the_run(tmp_path: Path) -> None:
         ("ply", ("time",), "KEY=VALUE"),
         ("mesh", ("gird=3",), "did you mean 'grid'"),
         ("mesh", ("grid=3", "grid=4"), "twice"),
-        ("mesh", ("grid=many",), "expected a number"),
+        ("mesh", ("grid=many",), "expected a whole number"),
         ("vdb", ("grid=8.5",), "whole number"),
         ("vdb", ("half=1",), "true or false"),
         ("vdb", ("units=metres",), "source or world"),

@@ -91,7 +91,9 @@ def _check_form(kind: str, form: Any, kinds: tuple[type[Shaped], ...], sizes: Si
 def check_channels(found: int, colour: ColourField) -> None:
     """Raise :class:`FormError` unless a lowered colour has as many channels as its field says, which are the data set's."""
     if found != colour.channels:
-        raise FormError(f"{method(colour, 'lower')} returned {found} channels; expected {colour.channels}, as its member channels says")
+        raise FormError(
+            f"{method(colour, 'lower')} returned a colour of C={found}; expected {colour.channels}, as its member channels says"
+        )
 
 
 def check_shape(name: str, value: Any, shape: tuple[int, ...], why: str = "") -> None:

@@ -53,7 +53,7 @@ class ConditionSpec:
         parse: the text of ``--NAME TEXT`` -> one tensor of ``shape`` per frame of an animation; raises
             :class:`~neuprim.core.errors.ConfigError`. Where ``shape`` is ``()`` it is asked for each element of a list ``A,B,C``, and
             need not know ranges ``A:B:COUNT`` (:mod:`neuprim.core.conditions`).
-        strict: whether numbers beyond the range are refused.
+        strict: whether numbers beyond the range are refused, a data set's among them.
         sweep: a text of ``--NAME TEXT`` that animates the condition, for the commands a report offers; empty: none.
     """
 

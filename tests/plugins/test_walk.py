@@ -25,7 +25,7 @@ from neuprim.core.extensions import Exporter
 from neuprim.core.io.images import write_exr, write_png
 from neuprim.plugins.members import fault
 from neuprim.plugins.registry import TASKS, list_tasks, load_task
-from neuprim.runs.draw import load_run, read_metrics
+from neuprim.runs.open import load_run, read_metrics
 from tests.plugins.fakes import site, uninstall
 from tests.plugins.spectral import NAMES, PACKAGE, fit, forget, install_spectral
 
@@ -34,7 +34,7 @@ __all__ = ["site"]
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(running, "_ORBIT_FRAMES", 2)
+    monkeypatch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 2)
 
 
 @pytest.fixture

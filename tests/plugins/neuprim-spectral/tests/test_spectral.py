@@ -2,7 +2,7 @@ from neuprim_spectral import TASK
 
 from neuprim.config import compose
 from neuprim.conformance import checks
-from neuprim.runs.draw import read_metrics
+from neuprim.runs.open import read_metrics
 from neuprim.runs.run import run
 
 

@@ -55,7 +55,9 @@ class _Finder(MetaPathFinder, Loader):
     """Asked last, so that a module which is there always wins."""
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
-        return ModuleSpec(fullname, self) if fullname in MOVED else None
+        if fullname not in MOVED:
+            return None
+        return ModuleSpec(fullname, self, is_package=any(name.startswith(f"{fullname}.") for name in MOVED))
 
     def exec_module(self, module: ModuleType) -> None:
         name = module.__name__

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.errors import ConfigError
+from neuprim.core.errors import ConfigError, NonFiniteError
 from neuprim.core.model.colours import sh
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import Cosine, RayNet
@@ -192,6 +192,15 @@ def test_what_nothing_covers_is_lit_fully(light: tuple[float, float, float]) -> 
     towards = torch.tensor(light)[:2] / torch.tensor(light).norm()
     clear = (geometry.means[:, :2] @ towards > 0.3) if light[0] else (geometry.means[:, :2].norm(dim=1) > 1)
     assert int(clear.sum()) > 100 and float(found[clear].min()) > 0.999
+
+
+@pytest.mark.parametrize("row", [0, 3, 5])
+def test_a_number_that_is_not_finite_is_named_by_its_primitive(row: int) -> None:
+    """Not by its place in the slab that it is drawn with."""
+    geometry, density = slabs()
+    density.b2[row] = math.nan
+    with pytest.raises(NonFiniteError, match=rf"^b2 of primitive {row} is not finite"):
+        light_visibility(geometry, density, torch.tensor([0.0, 0.0, 5.0]), SETTINGS)
 
 
 def test_depth_images_are_drawn_as_the_frame_is(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -48,7 +48,7 @@ KEYS = (
     "psnr", "psnr_mask", "psnr_pooled_mask", "psnr_black_image", "psnr_black_image_mask", "psnr_srgb", "ssim", "ssim_srgb",
     "sigma_correlation_early", "sigma_correlation_middle", "sigma_correlation_late",
     "sigma_relative_l2_early", "sigma_relative_l2_middle", "sigma_relative_l2_late",
-    "dead_fraction", "primitives", "parameters_per_primitive", "model_bytes", "vdb_bytes", "iterations", "train_seconds", "seed",
+    "invisible_fraction", "primitives", "parameters_per_primitive", "model_bytes", "vdb_bytes", "iterations", "train_seconds", "seed",
 )  # fmt: skip
 
 
@@ -201,7 +201,7 @@ def main_table(recorded: dict[str, Any]) -> str:
         line("correlation of σ with the files, early / middle / late frames", thirds("correlation")),
         line("relative L2 error of σ, early / middle / late frames", thirds("relative_l2")),
         line("model", lambda own: f"{own[0]['model_bytes'] / 1e6:.2f} MB, {own[0]['vdb_bytes'] / own[0]['model_bytes']:.0f} times less than the .vdb files"),
-        line("primitives that never show", lambda own: f"{100 * statistics.mean(r['dead_fraction'] for r in own):.1f} %"),
+        line("primitives that never show", lambda own: f"{100 * statistics.mean(r['invisible_fraction'] for r in own):.1f} %"),
         line("steps, seeds", lambda own: f"{round(statistics.mean(r['iterations'] for r in own)):,}, {len(own)}"),
     ])  # fmt: skip
 
@@ -240,7 +240,7 @@ def variants_table(recorded: dict[str, Any]) -> str:
         lines.append(
             f"| {time} | {own[0]['parameters_per_primitive']} | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB "
             f"| {_spread(own, 'psnr_pooled_mask')} dB | {_spread(own, 'sigma_correlation_late', 3)} "
-            f"| {100 * statistics.mean(r['dead_fraction'] for r in own):.0f} % | {1e3 * statistics.mean(r['train_seconds'] / r['iterations'] for r in own):.0f} |"
+            f"| {100 * statistics.mean(r['invisible_fraction'] for r in own):.0f} % | {1e3 * statistics.mean(r['train_seconds'] / r['iterations'] for r in own):.0f} |"
         )
     if runs:
         lines.append(

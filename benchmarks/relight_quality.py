@@ -32,7 +32,7 @@ from tables import README, ROOT, between_markers
 from neuprim.config import compose
 from neuprim.core.compute.threads import core_count
 from neuprim.core.data import Dataset
-from neuprim.runs.fit import Fitted, complete, start, warm_up
+from neuprim.runs.fit import Fitted, compile_kernels, complete, start
 
 RESULTS = Path(__file__).parent / "results" / "relight_quality.json"
 PLAIN = "model.colour.visibility=none"
@@ -62,7 +62,7 @@ def prepared(words: list[str], dataset: Dataset | None) -> Fitted:
         check_output=False,
     )
     fitted = start(config, dataset=dataset)
-    warm_up(fitted.trainer)
+    compile_kernels(fitted.trainer)
     return fitted
 
 

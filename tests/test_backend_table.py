@@ -74,7 +74,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_commands_know_it(fake: Fake, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 2)
-    monkeypatch.setattr("neuprim.runs.warm.subprocess.Popen", lambda *a, **k: pytest.fail("nothing of this run compiles ahead"))
+    monkeypatch.setattr("neuprim.runs.compile.subprocess.Popen", lambda *a, **k: pytest.fail("nothing of this run compiles ahead"))
     folder = tmp_path / "run"
     assert main(["run", *words(scene, folder, 3, "renderer.backend=fake")]) == 0
     drawn = fake.frames

@@ -23,7 +23,7 @@ from neuprim.plugins.tracebacks import written
 __all__ = ["Suspects", "blamed", "origin_of"]
 
 _OURS = "neuprim"
-Frame = tuple[str, str, int, str]
+StackFrame = tuple[str, str, int, str]
 """(module, file, line, function)"""
 
 
@@ -137,7 +137,7 @@ def _a_crash(error: BaseException | None) -> bool:
     return isinstance(error, (Exception, SystemExit)) and not isinstance(error, NeuprimError)
 
 
-def _frames(trace: TracebackType | None) -> list[Frame]:
+def _frames(trace: TracebackType | None) -> list[StackFrame]:
     """Outermost first."""
     found = []
     while trace is not None:
@@ -151,7 +151,7 @@ def _top(module: str) -> str:
     return module.partition(":")[0].partition(".")[0]
 
 
-def _line(what: str, origin: PluginInfo, error: BaseException | None, theirs: list[Frame], folder: Path | None) -> str:
+def _line(what: str, origin: PluginInfo, error: BaseException | None, theirs: list[StackFrame], folder: Path | None) -> str:
     text = " ".join(str(error).split())
     place = f" ({Path(theirs[-1][1]).name} line {theirs[-1][2]}, in {theirs[-1][3]})" if theirs else ""
     return f"{what} of {origin.origin}: {type(error).__name__}{': ' * bool(text)}{text}{place}; {_kept(what, origin, error, folder)}"

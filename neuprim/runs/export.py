@@ -22,7 +22,7 @@ from neuprim.plugins.blame import origin_of
 from neuprim.plugins.crashes import reported
 from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin, load_exporter
 from neuprim.runs.export_record import record_export
-from neuprim.runs.open import load_run, trained_model
+from neuprim.runs.open import load_run, open_run
 
 __all__ = ["export_run", "import_model", "import_run"]
 
@@ -55,7 +55,7 @@ def export_run(
         raise
     final = _destination(run_dir, exporter, out)
     refuse_taken(final, overwrite)
-    run = trained_model(run_dir, progress)
+    run = open_run(run_dir, progress)
     options, conditions = _options(words, exporter, run.task.conditions)
     notes: list[str] = []
     read_conditions(run.task.conditions, conditions, notes.append)

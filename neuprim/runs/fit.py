@@ -26,7 +26,7 @@ from neuprim.runs.events import Evaluated, Events, Note, Preparing, Step, silent
 from neuprim.runs.measure import measure, summary
 from neuprim.runs.open import LOGS, load_dataset
 
-__all__ = ["Fitted", "complete", "fit", "make_loss", "make_trainer", "one_torch_thread", "start", "steps", "warm_up"]
+__all__ = ["Fitted", "complete", "fit", "make_loss", "make_trainer", "one_torch_thread", "start", "steps", "compile_kernels"]
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def fit(config: RunConfig, events: Events = silent, dataset: Dataset | None = No
 
 def complete(fitted: Fitted, events: Events = silent) -> Fitted:
     """Train what :func:`start` made to the end of its budget; returns it."""
-    warm_up(fitted.trainer)
+    compile_kernels(fitted.trainer)
     with one_torch_thread():
         for _ in steps(fitted.trainer, events):
             pass
@@ -161,14 +161,14 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss
     return Trainer(model, dataset, loss or make_loss(config, task), settings, config.renderer, config.seed)
 
 
-def warm_up(trainer: Trainer) -> None:
+def compile_kernels(trainer: Trainer) -> None:
     """Compile the kernels outside the training clock: one throw-away step on a copy of a few primitives."""
     model = trainer.model
     rows = torch.arange(0, model.count, max(model.count // 64, 1))  # some of them live in the view
     few = Primitives(model.density, model.colour, model.rows(rows))
-    warm = Trainer(few, trainer.dataset, trainer.loss, trainer.settings, trainer.renderer, 0)
-    warm.step = max(warm.settings.iterations, 1)  # at the end of the budget every band of colour is in use
-    warm.train_step()
+    trial = Trainer(few, trainer.dataset, trainer.loss, trainer.settings, trainer.renderer, 0)
+    trial.step = max(trial.settings.iterations, 1)  # at the end of the budget every band of colour is in use
+    trial.train_step()
 
 
 @contextmanager

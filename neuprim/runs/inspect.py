@@ -27,7 +27,7 @@ from neuprim.plugins.inspect.headless import has_display, prepare_headless, requ
 from neuprim.plugins.inspect.page import write_page
 from neuprim.plugins.inspect.window import Window, panels_of
 from neuprim.plugins.registry import INSPECTORS, load_inspector
-from neuprim.runs.open import trained_model
+from neuprim.runs.open import open_run
 
 __all__ = ["OUTPUTS", "Request", "inspect_run"]
 
@@ -155,7 +155,7 @@ class _Film:
     """The frames that were asked for, made one at a time; box and scale are the same for all."""
 
     def __init__(self, request: Request) -> None:
-        run = trained_model(request.run_dir)
+        run = open_run(request.run_dir)
         self.model = run.model
         self.truth: DensityTruth | None = None
         self.channels, self.needed = run.channels, tuple(c.name for c in run.task.conditions)

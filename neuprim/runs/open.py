@@ -21,7 +21,7 @@ from neuprim.plugins.blame import blamed
 from neuprim.plugins.mechanism import PluginError
 from neuprim.plugins.provenance import warn_of_neuprim
 
-__all__ = ["LOGS", "load_dataset", "load_run", "read_metrics", "trained_model"]
+__all__ = ["LOGS", "load_dataset", "load_run", "read_metrics", "open_run"]
 
 LOGS = "logs"
 """Folder of a run directory for tracebacks of plugins."""
@@ -75,7 +75,7 @@ def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Pr
     return config, task, model, header
 
 
-def trained_model(run_dir: Path, progress: Progress = lambda text, fraction: None) -> TrainedModel:
+def open_run(run_dir: Path, progress: Progress = lambda text, fraction: None) -> TrainedModel:
     """The model of a run directory; its scene is loaded only when asked for.
 
     Raises:

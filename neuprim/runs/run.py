@@ -18,12 +18,12 @@ from neuprim.core.errors import CheckpointError
 from neuprim.core.io.files import write_text
 from neuprim.core.render.backends import choose, compiled_ahead
 from neuprim.plugins.provenance import check_resumed
+from neuprim.runs.compile import compiled, compiling, mark_compiled
 from neuprim.runs.curve import open_curve
 from neuprim.runs.events import Events, Finishing, Note, Preparing, silent
 from neuprim.runs.finish import finish
-from neuprim.runs.fit import Fitted, one_torch_thread, start, steps, warm_up
+from neuprim.runs.fit import Fitted, compile_kernels, one_torch_thread, start, steps
 from neuprim.runs.open import LOGS
-from neuprim.runs.warm import compiled, compiling, mark_compiled
 
 __all__ = ["run"]
 
@@ -81,7 +81,7 @@ def _train(fitted: Fitted, events: Events) -> bool:
     backend = choose(lowered, trainer.renderer, view.camera)
     if backend.compiles and not compiled(backend.name, form):
         events(Preparing(_COMPILING))
-    warm_up(trainer)
+    compile_kernels(trainer)
     if backend.compiles:
         mark_compiled(backend.name, form)
     curve = open_curve(config.output_dir / "metrics.jsonl", trainer.step)

@@ -109,7 +109,7 @@ def test_code_that_returns_something_else_is_named() -> None:
 KERNELS = {"core/render/backends.py", "core/render/cpu/backend.py", "core/volumes/grid.py"}
 """Where code asks which form it has, as compiled kernels know only some."""
 
-OWN = {"core/model/forms.py", "tasks/dynamic/dead.py"}
+OWN = {"core/model/forms.py", "tasks/dynamic/invisible.py"}
 """A sum of two of a kind; a density that is the task's own."""
 
 

@@ -56,7 +56,7 @@ def test_float64_pixels_are_sorted_too() -> None:
     t = scenes.tensors(40, 4, seed=2, radius=0.3)
     t["log_scales"][:, 0] -= 4.0
     camera = scenes.camera(40, 30, distance=0.5, fov=60)
-    assert render(t, camera, ENTRY, "cpu").stats.extra["delicate"] > 3
+    assert render(t, camera, ENTRY, "cpu").stats.extra["float64"] > 3
     assert_same_frame(t, camera, replace(ENTRY, depth_floor=1e-3))
 
 

@@ -19,7 +19,7 @@ from tests.kernels import PACKAGE, frozen_into_kernels
 
 def frames() -> int:
     gc.collect()
-    return sum(type(x) is backend._Frame for x in gc.get_objects())
+    return sum(type(x) is backend._Prepared for x in gc.get_objects())
 
 
 def test_a_frame_without_gradients_keeps_nothing() -> None:

@@ -13,8 +13,8 @@ from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.rays import RayCamera
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
 from neuprim.core.render import RenderSettings, choose, render, render_lowered
-from neuprim.core.render.reference.backend import _Frame
-from neuprim.core.render.reference.rays import pixel_directions, view_of
+from neuprim.core.render.reference.backend import _Prepared
+from neuprim.core.render.reference.rays import frame_rays, pixel_directions
 from tests import scenes
 
 EYE = torch.eye(4, dtype=torch.float64)
@@ -133,7 +133,7 @@ def test_blocks_leave_out_nothing_that_is_hit(kind: str) -> None:
     whole = render_lowered(low, camera, SETTINGS)
     assert (whole.alpha > 0.05).double().mean() > 0.1
     with torch.no_grad():
-        seen = view_of(camera, low.geometry, _Frame(low, camera).center, 0.01)
+        seen = frame_rays(camera, low.geometry, _Prepared(low, camera).center, 0.01)
         everything, corner = seen.rays, seen.block(0, 0, 16, 16)
     assert everything.directions.shape == (camera.height, camera.width, 3) and len(corner[1]) < 40
     for y, x in [(y, x) for y in range(0, camera.height, 3) for x in range(0, camera.width, 5)]:

@@ -43,7 +43,7 @@ def test_equals_reference(backend: str, neurons: int, hidden: int, channels: int
     t = scenes.tensors(40, neurons, channels, seed=7, hidden=hidden)
     fast, slow = assert_same_frame(t, scenes.camera(33, 25), RenderSettings(sort=sort), backend=backend)  # type: ignore[arg-type]
     assert slow.output.alpha.max() > 0.3
-    assert fast.output.stats.backend == backend and fast.output.stats.extra.get("delicate", 0) == 0
+    assert fast.output.stats.backend == backend and fast.output.stats.extra.get("float64", 0) == 0
     if hidden:
         assert all(slow.grads[k].abs().max() > 1e-3 for k in NET)
 
@@ -99,7 +99,7 @@ def test_extremes(name: str, sort: str) -> None:
     fast, slow = assert_same_frame(t, camera, replace(settings, sort=sort))  # type: ignore[arg-type]
     assert slow.output.alpha.max() > 0.1, "the view must show something"
     if " rad" in name:  # float32 knows the slower phases well enough, the others not
-        assert (fast.output.stats.extra["delicate"] > 30) == ("30 rad" not in name)
+        assert (fast.output.stats.extra["float64"] > 30) == ("30 rad" not in name)
 
 
 def test_cases_mean_what_they_say() -> None:

@@ -24,7 +24,7 @@ from neuprim.plugins.export.gaussian_ply import LAYOUT
 from neuprim.plugins.export.gaussians import Gaussians, draw_gaussians, fit_gaussians
 from neuprim.plugins.registry import load_task
 from neuprim.runs.export import export_run
-from neuprim.runs.open import trained_model
+from neuprim.runs.open import open_run
 from tests.core import tiny
 from tests.plugins import marked
 
@@ -44,7 +44,7 @@ def one_ellipsoid(tmp_path: Path, thickness: float = 6.0) -> Path:
 
 
 def test_moments_of_a_constant_density_are_those_of_an_ellipsoid(tmp_path: Path) -> None:
-    run = trained_model(one_ellipsoid(tmp_path))
+    run = open_run(one_ellipsoid(tmp_path))
     g = fit_gaussians(run, {}, footprint=False)
     axes = quaternion_to_matrix(run.model.params["quats"].double())[0] * torch.tensor([0.4, 0.2, 0.1], dtype=torch.float64)
     assert torch.allclose(g.means[0], torch.tensor([0.5, 0.7, 0.9], dtype=torch.float64), atol=1e-3)
@@ -62,7 +62,7 @@ def test_a_density_on_one_side_moves_the_mean_there(tmp_path: Path) -> None:
     rows["quats"] = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
     rows["W1"], rows["b1"] = torch.tensor([[[0.0, 1 / 30, 0.0]]]), torch.tensor([[-math.pi / 2 / 30]])
     rows["w2"], rows["b2"] = torch.tensor([[5.0]]), torch.tensor([[0.0]])  # sigma ~ sin(y/m): none below the middle
-    g = fit_gaussians(trained_model(marked.static_run(tmp_path / "run", Primitives(CosineDensity(1), model.colour, rows))), {}, False)
+    g = fit_gaussians(open_run(marked.static_run(tmp_path / "run", Primitives(CosineDensity(1), model.colour, rows))), {}, False)
     assert abs(float(g.means[0, 0])) < 1e-6 and abs(float(g.means[0, 2])) < 1e-6 and 0.1 < float(g.means[0, 1]) < 0.2
     assert float(g.covariances[0, 1, 1]) < 0.5 * float(g.covariances[0, 0, 0])
 
@@ -70,7 +70,7 @@ def test_a_density_on_one_side_moves_the_mean_there(tmp_path: Path) -> None:
 def test_footprints_cover_what_thin_and_thick_primitives_cover(tmp_path: Path) -> None:
     """The area of alpha on the screen, seen from far away along an axis."""
     for i, thickness in enumerate((0.02, 6.0)):
-        run = trained_model(one_ellipsoid(tmp_path / str(i), thickness))
+        run = open_run(one_ellipsoid(tmp_path / str(i), thickness))
         g = fit_gaussians(run, {}, footprint=True)
         areas = []
         R = quaternion_to_matrix(run.model.params["quats"].double())[0]
@@ -94,7 +94,7 @@ def test_the_layout_and_every_convention(tmp_path: Path) -> None:
     found = read_ply(report.files[0])
     assert found.names == LAYOUT and len(LAYOUT) == 62 and not report.lossless
     assert all(found.rows.dtype[name] == "<f4" for name in LAYOUT)
-    model = trained_model(run).model
+    model = open_run(run).model
     assert np.allclose(found.columns(["x", "y", "z"]), marked.PLACES.numpy(), atol=0.01)  # the marked corner is the last
     assert np.allclose(found.columns(["f_dc_0", "f_dc_1", "f_dc_2"]), model.params["sh_dc"].numpy(), atol=1e-6)
     rest = model.params["sh_rest"].numpy()  # (N, 8, 3)
@@ -119,7 +119,7 @@ def test_what_it_wrote_starts_a_model_where_it_was(tmp_path: Path) -> None:
     fresh = initial_model(CosineDensity(3), field, tiny.TwoPrimitives(), settings, 0)  # type: ignore[arg-type]
     assert torch.allclose(fresh.params["means"], marked.PLACES, atol=0.01)
     assert torch.allclose(fresh.params["log_scales"], marked.RADII.log()[:, None], atol=0.1)
-    assert torch.allclose(fresh.params["sh_dc"], trained_model(run).model.params["sh_dc"], atol=1e-3)
+    assert torch.allclose(fresh.params["sh_dc"], open_run(run).model.params["sh_dc"], atol=1e-3)
 
 
 def test_the_renderer_draws_one_gaussian_as_the_formula_says() -> None:
@@ -177,7 +177,7 @@ def test_a_relit_model_takes_a_light_and_fits_its_colours(tmp_path: Path) -> Non
     report = export_run(run, "gaussian-ply", tmp_path / "g.ply", ["light=1,2,3", "light_intensity=1,1,1"])
     assert any("no harmonics" in note for note in report.notes) and report.errors["psnr"] > 20
     light = {"light": torch.tensor([1.0, 2.0, 3.0]), "light_intensity": torch.ones(3)}
-    fitted = harmonics_of(trained_model(run), light)
+    fitted = harmonics_of(open_run(run), light)
     assert 0 < fitted.residual < 0.05
     eye = torch.tensor([0.0, 0.0, 500.0])
     camera = Camera(look_at(eye, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])), 50.0, 50.0, 8, 8, 16, 16)

@@ -15,7 +15,7 @@ from neuprim.core.io.vdb import Grid, read_grid
 from neuprim.core.volumes.grid import density_grid
 from neuprim.plugins.export import vdb as exporter
 from neuprim.runs.export import export_run
-from neuprim.runs.open import trained_model
+from neuprim.runs.open import open_run
 from tests.core.openvdb_oracle import compare, environment, other_python
 from tests.plugins import marked
 
@@ -61,7 +61,7 @@ def test_values_are_sigma_at_the_centres(static: Path, tmp_path: Path, monkeypat
     assert np.array_equal(matrix, np.diag([0.04, 0.04, 0.04, 1]))
     matrix[:3, 3] += matrix[:3, :3] @ np.array(low)
     shape = tuple(h - l for l, h in zip(low, high, strict=True))
-    expected = density_grid(trained_model(static).model, {}, torch.from_numpy(matrix), shape).numpy()  # type: ignore[arg-type]
+    expected = density_grid(open_run(static).model, {}, torch.from_numpy(matrix), shape).numpy()  # type: ignore[arg-type]
     expected[expected < 1] = 0
     assert expected.max() > 10 and np.allclose(grid.to_dense(), expected, rtol=1e-5, atol=1e-5)
 
@@ -69,7 +69,7 @@ def test_values_are_sigma_at_the_centres(static: Path, tmp_path: Path, monkeypat
 def test_a_sequence_lies_on_the_voxels_of_its_files_and_in_their_units(moving: Path, tmp_path: Path) -> None:
     report = export_run(moving, "vdb", tmp_path / "frames")
     assert [p.name for p in report.files] == ["density_0003.vdb", "density_0004.vdb", "density_0005.vdb"]
-    run = trained_model(moving)
+    run = open_run(moving)
     source = run.volume()
     assert source is not None
     world_from_scene = np.linalg.inv(source.placement.scene_from_world)
@@ -91,7 +91,7 @@ def test_errors_are_those_of_the_runs_own_comparison(moving: Path, tmp_path: Pat
     from neuprim.tasks.dynamic.volume.compare import compare_with_truth
 
     report = export_run(moving, "vdb", tmp_path / "frames")
-    run = trained_model(moving)
+    run = open_run(moving)
     expected = compare_with_truth(run.model, run.volume().shoot, [0.0, 0.5, 1.0])["sigma_frames"]  # type: ignore[union-attr]
     assert len(expected) == 3
     for entry in expected:
@@ -110,8 +110,8 @@ def test_units_times_and_voxels_can_be_chosen(moving: Path, tmp_path: Path) -> N
         grid = read_grid(report.files[2], "smoke")
         assert grid.range is not None and grid.bounds is not None
         values[units] = grid.range[1]
-    per_unit = trained_model(moving).volume().placement.sigma_per_unit  # type: ignore[union-attr]
-    scale = trained_model(moving).volume().placement.scene_from_world[0, 0]  # type: ignore[union-attr]
+    per_unit = open_run(moving).volume().placement.sigma_per_unit  # type: ignore[union-attr]
+    scale = open_run(moving).volume().placement.scene_from_world[0, 0]  # type: ignore[union-attr]
     assert values["scene"] == pytest.approx(values["source"] * per_unit, rel=1e-5)
     assert values["world"] == pytest.approx(values["scene"] * scale, rel=1e-5)
     one = export_run(moving, "vdb", tmp_path / "one.vdb", ["time=0.5"])
@@ -120,7 +120,7 @@ def test_units_times_and_voxels_can_be_chosen(moving: Path, tmp_path: Path) -> N
 
 def test_without_the_files_the_header_still_places_it(tmp_path: Path) -> None:
     files = marked.write_sequence(tmp_path / "files")
-    known = trained_model(marked.dynamic_run(tmp_path / "a", files)).volume()
+    known = open_run(marked.dynamic_run(tmp_path / "a", files)).volume()
     assert known is not None
     run = marked.dynamic_run(tmp_path / "b", files, world=known.placement.to_json())
     with_files = export_run(run, "vdb", tmp_path / "with", ["voxel_size=0.25"])

@@ -15,7 +15,7 @@ from neuprim.core.data import Dataset, PointCloud, ViewSet, camera_extent
 from neuprim.core.data.context import SceneContext
 from neuprim.core.data.focus import focus_point
 from neuprim.core.data.initial import initial_points
-from neuprim.core.data.views import Frame, ImageViews
+from neuprim.core.data.views import ImageFrame, ImageViews
 from neuprim.core.errors import ConfigError, DataError
 
 __all__ = ["IMAGE_SUFFIXES", "PosedImages", "StartingPoints", "every_nth", "find_image", "missing_files", "posed_images", "unique_names"]
@@ -67,7 +67,7 @@ def _stem(path: str, whole: bool = False) -> str:
     return next((text[: -len(s)] for s in IMAGE_SUFFIXES if text.endswith(s)), text)
 
 
-def every_nth(frames: Sequence[Frame], n: int) -> tuple[list[Frame], list[Frame]]:
+def every_nth(frames: Sequence[ImageFrame], n: int) -> tuple[list[ImageFrame], list[ImageFrame]]:
     """(the others, every n-th beginning with the first)."""
     return [f for i, f in enumerate(frames) if i % n], list(frames[::n])
 
@@ -113,8 +113,8 @@ class PosedImages(Dataset):
 def posed_images(
     where: str,
     name: str,
-    train: Sequence[Frame],
-    test: Sequence[Frame],
+    train: Sequence[ImageFrame],
+    test: Sequence[ImageFrame],
     settings: Mapping[str, Any],
     context: SceneContext,
     up: Tensor | None = None,
@@ -176,7 +176,7 @@ def posed_images(
     )
 
 
-def _reduction(frames: Sequence[Frame], reduced: Camera, factor: int) -> str:
+def _reduction(frames: Sequence[ImageFrame], reduced: Camera, factor: int) -> str:
     """E.g. "200x200 from 800x800 by area", "1/4 by area" where sizes differ, "" for none."""
     if factor == 1:
         return ""

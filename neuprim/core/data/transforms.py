@@ -14,7 +14,7 @@ from neuprim.core.cameras import Camera, opengl_to_viewmat
 from neuprim.core.data.common import every_nth, find_image, missing_files, unique_names
 from neuprim.core.data.distortion import Distortion, Fisheye, Radial
 from neuprim.core.data.records import Record
-from neuprim.core.data.views import Frame
+from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import ImageInfo, image_info
 
@@ -23,7 +23,7 @@ __all__ = ["read_frames", "split_frames"]
 _RADIAL = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 
 
-def read_frames(folder: Path, document: Record, records: list[Record], skip_missing: bool) -> tuple[list[Record], list[Frame]]:
+def read_frames(folder: Path, document: Record, records: list[Record], skip_missing: bool) -> tuple[list[Record], list[ImageFrame]]:
     """The frames whose images exist, and their records, both in the order of ``records``; names are unique among them.
 
     Args:
@@ -52,7 +52,7 @@ def read_frames(folder: Path, document: Record, records: list[Record], skip_miss
         merged = Record({**document.values, **{k: v for k, v in record.values.items() if v is not None}}, record.where)
         camera = _camera(merged, file, info)
         distortion = _distortion(merged)
-        frames.append(Frame(name, file, camera.validate(record.where), info, mask, distortion))
+        frames.append(ImageFrame(name, file, camera.validate(record.where), info, mask, distortion))
     return kept, frames
 
 
@@ -98,7 +98,9 @@ def _distortion(record: Record) -> Distortion | None:
     return Radial(*k, *p) if any(k) or any(p) else None
 
 
-def split_frames(document: Record, records: Sequence[Record], frames: Sequence[Frame], every: int) -> tuple[list[Frame], list[Frame]]:
+def split_frames(
+    document: Record, records: Sequence[Record], frames: Sequence[ImageFrame], every: int
+) -> tuple[list[ImageFrame], list[ImageFrame]]:
     """(training, test) by ``train_filenames`` and ``test_filenames``, the absent one being the rest; else every n-th is a test view.
 
     Raises:

@@ -21,7 +21,7 @@ from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import ImageInfo, read_image, read_mask, srgb_to_linear
 from neuprim.core.model.fields import Conditions
 
-__all__ = ["Frame", "ImageViews", "SomeViews"]
+__all__ = ["ImageFrame", "ImageViews", "SomeViews"]
 
 _CACHE_BYTES = 2 * 2**30
 _GRIDS = 4
@@ -29,7 +29,7 @@ _LINEAR = srgb_to_linear(torch.arange(256) / 255.0)
 
 
 @dataclass(frozen=True)
-class Frame:
+class ImageFrame:
     """One image file and its pose.
 
     Attributes:
@@ -94,7 +94,7 @@ class ImageViews(ViewSet):
         ConfigError: an image is smaller than the factor.
     """
 
-    def __init__(self, frames: Sequence[Frame], downsample: int = 1, cache_bytes: int = _CACHE_BYTES, to_linear: bool = False) -> None:
+    def __init__(self, frames: Sequence[ImageFrame], downsample: int = 1, cache_bytes: int = _CACHE_BYTES, to_linear: bool = False) -> None:
         self._frames = list(frames)
         self._to_linear = to_linear
         self.scale = 1.0
@@ -155,7 +155,7 @@ class ImageViews(ViewSet):
             for done, _ in enumerate(pool.map(self._load, range(len(self)))):
                 progress((done + 1) / len(self))
 
-    def _bytes(self, frame: Frame, camera: Camera) -> int:
+    def _bytes(self, frame: ImageFrame, camera: Camera) -> int:
         processed = frame.distortion is not None or self._factor > 1
         values = frame.info.channels * (2 if frame.info.linear or (self._to_linear and processed) else 1)
         return camera.width * camera.height * (values + (frame.mask is not None or frame.distortion is not None))
@@ -172,7 +172,7 @@ class ImageViews(ViewSet):
                 self._used += size
         return stored
 
-    def _read(self, frame: Frame) -> _Stored:
+    def _read(self, frame: ImageFrame) -> _Stored:
         size = (frame.info.width, frame.info.height)
         image = read_image(frame.path, size)
         if image.shape[-1] != frame.info.channels or (image.dtype != torch.uint8) != frame.info.linear:
@@ -191,7 +191,7 @@ class ImageViews(ViewSet):
             image = image.half()
         return _Stored(image, premultiplied, mask)
 
-    def _process(self, frame: Frame, image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    def _process(self, frame: ImageFrame, image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """Undistorted and reduced, colours premultiplied, in the file's own number type."""
         eight_bit = image.dtype == torch.uint8
         if eight_bit and self._to_linear:
@@ -243,7 +243,7 @@ class SomeViews(ViewSet):
         return self._views.pixels(self._indices[index])
 
 
-def _reduced(frame: Frame, factor: int) -> Camera:
+def _reduced(frame: ImageFrame, factor: int) -> Camera:
     """The camera of a frame after area reduction: exactly 1/factor, as the remainder is cut off and not squeezed in."""
     camera = frame.camera
     if factor == 1:

@@ -192,8 +192,8 @@ class Primitives:
         sizes = check_geometry(geometry, "geometry")
         density = self._lower_density(living, conditions)
         check_density(density, sizes, names[0])  # before the colour looks at it, which may draw it
-        tint = {s.name: living.params[s.name] for s in self.colour.parameters()}
-        colour = self.colour.lower(tint, geometry, camera, conditions)
+        own = {s.name: living.params[s.name] for s in self.colour.parameters()}
+        colour = self.colour.lower(own, geometry, camera, conditions)
         check_colour(colour, sizes, names[1])
         check_channels(sizes["C"][0], self.colour)
         found = self.colour.shade(geometry, density, conditions, settings or RenderSettings())

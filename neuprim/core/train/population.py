@@ -106,9 +106,9 @@ def split(model: Primitives, parents: Tensor, shift: float, long_factor: float, 
     reach = (before.scales * pick).sum(-1, keepdim=True)
     shrink = torch.where(pick > 0, torch.full_like(pick, long_factor), torch.full_like(pick, other_factor))
     after = Geometry(before.means + sign * shift * reach * direction, before.log_scales + shrink.log(), before.quats)
-    own, tint = ({k: old[k] for k in model.of(field)} for field in (model.density, model.colour))
+    own, own_colour = ({k: old[k] for k in model.of(field)} for field in (model.density, model.colour))
     density = check_tensors(model.density.on_split(own, before, after), own, method(model.density, "on_split"))
-    colour = check_tensors(model.colour.on_split(tint, before, after), tint, method(model.colour, "on_split"))
+    colour = check_tensors(model.colour.on_split(own_colour, before, after), own_colour, method(model.colour, "on_split"))
     children = {**old, "means": after.means, "log_scales": after.log_scales, **density, **colour}
     first = slice(len(parents))
     divided = model.density.divide({k: v[first] for k, v in own.items()}, before[first])

@@ -120,7 +120,7 @@ def draw_gaussians(gaussians: Gaussians, colours: Harmonics, camera: Camera, bac
     flat = J @ W @ cov @ W.T @ J.transpose(1, 2) + _BLUR * torch.eye(2, dtype=torch.float64)
     centers = torch.stack([camera.fx * t[:, 0] / z + camera.cx, camera.fy * t[:, 1] / z + camera.cy], -1)
     away = gaussians.means[order] - camera.position.double()
-    tints = colours.towards(gaussians.rows[order], away / away.norm(dim=-1, keepdim=True)).numpy()
+    colors = colours.towards(gaussians.rows[order], away / away.norm(dim=-1, keepdim=True)).numpy()
     inverse, opacity = torch.linalg.inv(flat).numpy(), gaussians.opacities[order].numpy()
     reach = np.sqrt(2 * np.log(np.maximum(opacity / _ALPHA_MIN, 1.0)))[:, None] * flat.diagonal(dim1=1, dim2=2).sqrt().numpy()
     middle = centers.numpy()
@@ -137,7 +137,7 @@ def draw_gaussians(gaussians: Gaussians, colours: Harmonics, camera: Camera, bac
         drawn = (alpha >= _ALPHA_MIN) & (here > 0)
         ends = drawn & (after < _TRANSMITTANCE_MIN)
         drawn &= ~ends
-        image[y0:y1, x0:x1] += np.where(drawn, here * alpha, 0.0)[..., None] * tints[i]
+        image[y0:y1, x0:x1] += np.where(drawn, here * alpha, 0.0)[..., None] * colors[i]
         here[drawn] = after[drawn]
         here[ends] = -here[ends]  # finished: the sign marks it, the magnitude still lets the background through
     picture: Tensor = torch.from_numpy(image + np.abs(left)[..., None] * background.double().numpy()).float()

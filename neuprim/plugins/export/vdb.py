@@ -45,7 +45,7 @@ _MOST_VOXELS = 2**34
 
 
 @dataclass(frozen=True)
-class _Frame:
+class _GridFrame:
     """``number`` is of its file name; ``source`` its index in the scene's files, None where it has none."""
 
     number: int
@@ -119,16 +119,16 @@ def _origin(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Placemen
     return None, None, notes
 
 
-def _frames(job: ExportJob, placement: Placement | None, source: VolumeSource | None) -> list[_Frame]:
+def _frames(job: ExportJob, placement: Placement | None, source: VolumeSource | None) -> list[_GridFrame]:
     """Those the user names, else those of the run; a model without conditions has one."""
     if not job.run.task.conditions:
-        return [_Frame(0, {})]
+        return [_GridFrame(0, {})]
     if job.conditions or placement is None:
-        frames = [_Frame(i, c) for i, c in enumerate(job.frames(several=True))]
-        return [_Frame(f.number, f.conditions, _same(f.conditions, source)) for f in frames]
+        frames = [_GridFrame(i, c) for i, c in enumerate(job.frames(several=True))]
+        return [_GridFrame(f.number, f.conditions, _same(f.conditions, source)) for f in frames]
     times = placement.times
     return [
-        _Frame(n, {name: torch.tensor(values[i]) for name, values in times.items()}, i if source is not None else None)
+        _GridFrame(n, {name: torch.tensor(values[i]) for name, values in times.items()}, i if source is not None else None)
         for i, n in enumerate(placement.numbers)
     ]
 
@@ -143,7 +143,7 @@ def _same(conditions: Conditions, source: VolumeSource | None) -> int | None:
     return None
 
 
-def _paths(job: ExportJob, frames: list[_Frame]) -> list[Path]:
+def _paths(job: ExportJob, frames: list[_GridFrame]) -> list[Path]:
     """One file under its own name, or files in a folder."""
     suffix = job.out.suffix.lower()
     if suffix == ".vdb":
@@ -232,7 +232,7 @@ def _slabs(
 
 
 def _errors(
-    job: ExportJob, source: VolumeSource, frame: _Frame, path: Path, scene_from_world: np.ndarray, factor: float
+    job: ExportJob, source: VolumeSource, frame: _GridFrame, path: Path, scene_from_world: np.ndarray, factor: float
 ) -> dict[str, float]:
     """The model and the written file, each against the source, on the lattice of ``metrics.json``."""
     assert frame.source is not None

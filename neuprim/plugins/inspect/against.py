@@ -12,7 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb import Frame, Grid, read_grid, read_header, sequence, write_vdb
+from neuprim.core.io.vdb import Grid, VdbFrame, read_grid, read_header, sequence, write_vdb
 from neuprim.core.model.fields import Conditions
 from neuprim.core.volumes.source import VolumeSource
 from neuprim.core.volumes.truth import DensityTruth, TruthFrame
@@ -42,7 +42,7 @@ def open_truth(path: str, volume: Callable[[], VolumeSource | None]) -> tuple[De
         return truth, "ground truth: the scene's own volumes"
     if not place.exists():
         raise DataError(f"--against {path}: no such file or folder; expected .vdb files, or scene for the scene's own")
-    frames = list(sequence(place).frames) if place.is_dir() else [Frame(0, place)]
+    frames = list(sequence(place).frames) if place.is_dir() else [VdbFrame(0, place)]
     if _is_ours(frames[0].path):
         return SceneUnits(frames), f"ground truth: {path}, written by neuprim in scene units"
     scene = volume()
@@ -82,7 +82,7 @@ class SceneUnits(DensityTruth):
 
     resolution = 96
 
-    def __init__(self, frames: Sequence[Frame]) -> None:
+    def __init__(self, frames: Sequence[VdbFrame]) -> None:
         self._files = list(frames)
         self.frames, lows, highs = [], [], []
         for frame in frames:
@@ -98,7 +98,7 @@ class SceneUnits(DensityTruth):
         self.bounds = torch.from_numpy(np.stack([np.min(lows, 0), np.max(highs, 0)])).double()
 
     @staticmethod
-    def _read(frame: Frame) -> Grid:
+    def _read(frame: VdbFrame) -> Grid:
         names = [g.name for g in read_header(frame.path).grids if g.refusal() is None]
         chosen = next((name for name in _USUAL if name in names), names[0] if len(names) == 1 else None)
         if chosen is None:

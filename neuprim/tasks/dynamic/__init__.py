@@ -12,7 +12,7 @@ from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim.core.volumes.source import VolumeSource
-from neuprim.tasks.dynamic.colour import FREQUENCIES, TimeHarmonics
+from neuprim.tasks.dynamic.colour import FREQUENCIES, RENAMED, TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.dynamic.time import parse_times
 
@@ -21,7 +21,8 @@ __all__ = ["TASK"]
 
 def _check(model: Mapping[str, Any]) -> None:
     choose(model["density"], "model.density", {"time": str, "divide_above": float})
-    choose(model["colour"], "model.colour", {"frequencies": tuple(FREQUENCIES), "powers": int, "waves": int})
+    colour = {key: RENAMED.get(value, value) if key == "frequencies" else value for key, value in model["colour"].items()}
+    choose(colour, "model.colour", {"frequencies": tuple(FREQUENCIES), "powers": int, "waves": int})
     try:
         _density(model)
     except ValueError as error:

@@ -17,9 +17,12 @@ from neuprim.tasks.dynamic.density import time_of
 
 __all__ = ["TimeHarmonics"]
 
-FREQUENCIES = {"turns": 2 * math.pi, "printed": 1.0}
+FREQUENCIES = {"periods": 2 * math.pi, "printed": 1.0}
 """Angle of the first Fourier term at xi = 1. The paper prints i xi, whose basis is nearly rank-deficient on [0, 1] (condition
-5e13); whole turns are well conditioned (2e5)."""
+5e13); whole periods are well conditioned (2e5)."""
+
+RENAMED = {"turns": "periods"}
+"""Words of before, which configurations and models on disk still hold."""
 
 
 class TimeHarmonics(ColourField):
@@ -36,7 +39,7 @@ class TimeHarmonics(ColourField):
         sh_every: float = 0.0,
         powers: int = 4,
         waves: int = 4,
-        frequencies: str = "turns",
+        frequencies: str = "periods",
     ) -> None:
         if not isinstance(degree, int) or not 0 <= degree <= 3:
             raise ValueError(f"spherical-harmonics degree {degree!r}; expected 0..3")
@@ -44,6 +47,7 @@ class TimeHarmonics(ColourField):
             raise ValueError(f"{channels!r} colour channels; expected at least 1")
         if not all(isinstance(n, int) and 0 <= n <= 16 for n in (powers, waves)):
             raise ValueError(f"{powers!r} powers and {waves!r} waves; expected 0..16")
+        frequencies = RENAMED.get(frequencies, frequencies)
         if frequencies not in FREQUENCIES:
             raise ValueError(f"frequencies {frequencies!r}; expected {' or '.join(FREQUENCIES)}")
         self.degree, self.channels, self.sh_every = degree, channels, sh_every

@@ -27,7 +27,7 @@ from neuprim.core.data.common import posed_images
 from neuprim.core.data.records import Record, read_json
 from neuprim.core.data.settings import Setting, count, data_folder, read_settings, text
 from neuprim.core.data.transforms import read_frames, split_frames
-from neuprim.core.data.views import Frame
+from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import DataError
 from neuprim.core.task import SceneContext
 from neuprim.tasks.dynamic.moving import moving_points
@@ -69,7 +69,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     return posed_images(str(folder), name, train, test, values, context, up=torch.tensor([0.0, 0.0, 1.0]), start=moving_points)
 
 
-def _frames(folder: Path, document: Record, records: list[Record], clock: _Range) -> tuple[list[Record], list[Frame]]:
+def _frames(folder: Path, document: Record, records: list[Record], clock: _Range) -> tuple[list[Record], list[ImageFrame]]:
     """The frames with their times 0..1, and their records."""
     records, frames = read_frames(folder, document, records, skip_missing=False)
     low, high = clock

@@ -40,7 +40,7 @@ from neuprim.core.cameras import Camera, opengl_to_viewmat
 from neuprim.core.data.common import IMAGE_SUFFIXES, every_nth, find_image, missing_files, posed_images, unique_names
 from neuprim.core.data.records import Record, read_json
 from neuprim.core.data.settings import BACKGROUNDS, Setting, data_folder, flag, read_settings, text
-from neuprim.core.data.views import Frame
+from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import ImageInfo, image_info
 from neuprim.core.task import SceneContext
@@ -87,7 +87,7 @@ def read(settings: Mapping[str, Any], context: SceneContext, kind: type[Made]) -
     return dataset
 
 
-def read_split(folder: Path, split: str, ignore_corrections: bool = False) -> list[Frame]:
+def read_split(folder: Path, split: str, ignore_corrections: bool = False) -> list[ImageFrame]:
     """The frames of one split, with their lights as conditions.
 
     Raises:
@@ -112,7 +112,7 @@ def read_split(folder: Path, split: str, ignore_corrections: bool = False) -> li
         camera = Camera(_viewmat(record, ignore_corrections), fx, fy, cx, cy, info.width, info.height)
         light = {"light": record.array("pl_pos", (3,), "the point light's position, 3 numbers").float()}
         light["light_intensity"] = _intensity(record if record.has("pl_intensity") else document)
-        frames.append(Frame(name, file, camera.validate(record.where), info, conditions=light))
+        frames.append(ImageFrame(name, file, camera.validate(record.where), info, conditions=light))
     return frames
 
 

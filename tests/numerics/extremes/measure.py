@@ -85,7 +85,7 @@ def drawn(case: Case, backend: str) -> tuple[np.ndarray, int]:  # type: ignore[t
     t["colors"] = torch.ones_like(t["colors"][:, :1])
     with torch.no_grad():
         out = render_lowered(scenes.lowered(t), case.camera, replace(case.settings, backend=backend))
-    return out.rgb[..., 0].double().numpy(), int(out.stats.extra.get("delicate", 0))
+    return out.rgb[..., 0].double().numpy(), int(out.stats.extra.get("float64", 0))
 
 
 def integral_errors(case: Case, backend: str, exact: Integrals | None = None) -> Errors:
@@ -132,7 +132,7 @@ def colour_errors(case: Case, backend: str, exact: Integrals) -> Errors:
     solid, thin = np.where(short, 0, error), np.where(short, error, 0)
     at = np.unravel_index(np.argmax(solid), solid.shape)
     where = float(exact.scale[at] / exact.central[at])
-    wide = int(out.stats.extra.get("delicate", 0))
+    wide = int(out.stats.extra.get("float64", 0))
     return Errors(float(solid.max()), float(thin.max()), 0.0, "", where, int(seen.sum()), wide, 1)
 
 
@@ -190,7 +190,7 @@ def frame_errors(case: Case, backend: str) -> tuple[Errors, Tensor]:
     kept = torch.where(skip, torch.zeros_like(difference), difference)
     hits = int((images[1].alpha > 0).sum())
     return Errors(
-        float(kept.max()), hits=hits, wide=int(images[0].stats.extra.get("delicate", 0)), primitives=len(case.tensors["means"])
+        float(kept.max()), hits=hits, wide=int(images[0].stats.extra.get("float64", 0)), primitives=len(case.tensors["means"])
     ), skip
 
 

@@ -55,7 +55,7 @@ def test_a_run_learns_and_reports_every_number(finished: Path) -> None:
     assert len(m["per_frame"]) == 4 and all({"psnr", "psnr_mask", "psnr_black_image"} <= f.keys() for f in m["per_frame"])
     assert m["psnr_srgb"] > 0 and m["ssim_srgb"] > 0 and m["color_space"] == "linear"
     assert m["sigma_correlation_middle"] > 0.5 and 0 < m["sigma_relative_l2_middle"] < 1
-    assert m["vdb_bytes"] > 0 and 0 <= m["dead_fraction"] <= 1 and m["data_source"] == "real"
+    assert m["vdb_bytes"] > 0 and 0 <= m["invisible_fraction"] <= 1 and m["data_source"] == "real"
 
 
 def test_the_report_shows_films_beside_their_truth(finished: Path) -> None:
@@ -180,7 +180,7 @@ def test_a_simulated_scene_says_so(tmp_path: Path) -> None:
     [
         ("model.density.time=windows", r"model\.density\.time: 'windows': expected none or some of phase, offset, window, motion"),
         ("model.density.tme=phase", r"model\.density\.tme: no such setting; did you mean 'time'"),
-        ("model.colour.frequencies=odd", r"model\.colour\.frequencies='odd': expected turns or printed"),
+        ("model.colour.frequencies=odd", r"model\.colour\.frequencies='odd': expected periods or printed"),
         ("model.density.divide_above=long", r"model\.density\.divide_above='long': expected a number"),
         ("model.colour.powers=1.5", r"model\.colour\.powers=1\.5: expected a whole number"),
         ("model.colour.waves=99", r"model\.colour: .*expected 0\.\.16"),

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from neuprim.config import compose
 from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
@@ -19,8 +20,8 @@ from neuprim.core.train.population import Relocate, split
 from neuprim.core.train.settings import PopulationSettings
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.colour import TimeHarmonics
-from neuprim.tasks.dynamic.dead import dead_fraction
 from neuprim.tasks.dynamic.density import PARTS, TimeDensity
+from neuprim.tasks.dynamic.invisible import invisible_fraction
 from tests import scenes
 from tests.backends import BACKENDS
 
@@ -185,8 +186,13 @@ def test_a_frame_without_a_time_is_an_error() -> None:
 # ---------------------------------------------------------------- colour
 
 
+def test_the_word_of_before_for_whole_periods_still_works() -> None:
+    assert TimeHarmonics(frequencies="turns").settings() == TimeHarmonics(frequencies="periods").settings()
+    assert compose(["task=dynamic", "model.colour.frequencies=turns"], check_output=False).model.colour["frequencies"] == "turns"
+
+
 def test_colour_follows_equations_10_to_12() -> None:
-    for frequencies, w in (("turns", 2 * math.pi), ("printed", 1.0)):
+    for frequencies, w in (("periods", 2 * math.pi), ("printed", 1.0)):
         field = TimeHarmonics(0, 3, powers=2, waves=2, frequencies=frequencies)
         generator = torch.Generator().manual_seed(0)
         p = {s.name: torch.rand((6, *s.shape), generator=generator, dtype=torch.float64) for s in field.parameters()}
@@ -258,7 +264,7 @@ def test_relocation_counts_frames_in_which_a_primitive_lives() -> None:
     assert change is not None and int(change.origin[0]) == 5  # the first of the idle ones moved to the busiest
 
 
-def test_dead_primitives_are_counted() -> None:
+def test_invisible_primitives_are_counted() -> None:
     m = model("window", neurons=0, dtype=torch.float32)
     params = {k: v.detach().clone() for k, v in m.params.items()}
     params["b2"][:] = 1.0
@@ -267,7 +273,7 @@ def test_dead_primitives_are_counted() -> None:
     m.params = params
     params["log_scales"][:] = math.log(0.3)
     times = [torch.tensor(t) for t in torch.linspace(0, 1, 50).tolist()]
-    assert dead_fraction(m, times) == pytest.approx(5 / COUNT)
+    assert invisible_fraction(m, times) == pytest.approx(5 / COUNT)
 
 
 def test_the_task_rebuilds_its_fields_from_their_settings() -> None:

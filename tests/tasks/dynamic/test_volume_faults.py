@@ -82,16 +82,16 @@ def test_the_box_is_that_of_the_grid_that_the_look_absorbs_by(folder: Path, tmp_
     write_vdb(folder / "ball_1.vdb", [hot, far])
     write_vdb(folder / "ball_2.vdb", [hot])  # has what absorbs, whatever else it lacks
     data = dataset(folder, tmp_path, look="embergen_fire")
-    assert data.shoot.normalisation.center[0] < 100
+    assert data.capture.normalisation.center[0] < 100
     alphas = [data.test.pixels(i).alpha for i in range(2)]
     assert all(a is not None and bool(a.any()) for a in alphas)
-    assert dataset(folder, tmp_path, look="dust_tornado").shoot.normalisation.center[0] > 400
+    assert dataset(folder, tmp_path, look="dust_tornado").capture.normalisation.center[0] > 400
 
 
 def test_a_frame_without_the_grid_that_absorbs_takes_no_other(folder: Path, tmp_path: Path) -> None:
     write_vdb(folder / "ball_2.vdb", blob(12.0, ("temperature", "flames")))
     data = dataset(folder, tmp_path, look="smoke_fire")
-    assert data.shoot.medium(data.shoot.frames[1]).empty and not data.shoot.medium(data.shoot.frames[0]).empty
+    assert data.capture.medium(data.capture.frames[1]).empty and not data.capture.medium(data.capture.frames[0]).empty
 
 
 def test_a_look_whose_grids_are_missing(folder: Path, tmp_path: Path) -> None:
@@ -136,7 +136,7 @@ def test_a_gap_in_the_numbers_is_a_gap_in_time(folder: Path, tmp_path: Path) -> 
 
 
 def test_more_starting_points_than_were_kept_are_distinct(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neuprim.tasks.dynamic.volume.shoot.POINTS", 64)
+    monkeypatch.setattr("neuprim.tasks.dynamic.volume.capture.POINTS", 64)
     points = dataset(folder, tmp_path).initial_points(1000, torch.Generator().manual_seed(0))
     assert len(points.means) == 1000 == len(np.unique(points.means.numpy(), axis=0))
     assert float(points.means.abs().max()) < 0.7
@@ -166,15 +166,15 @@ def test_two_runs_that_render_the_same_frame_do_not_disturb_each_other(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = dataset(folder, tmp_path)
-    image = data.shoot.image(data.folder, data.shoot.frames[0], 0)
+    image = data.capture.image(data.folder, data.capture.frames[0], 0)
     before = os.stat(image).st_ino
-    data.shoot._take_frame(data.folder, data.shoot.frames[0])  # as the slower one of two does
+    data.capture._take_frame(data.folder, data.capture.frames[0])  # as the slower one of two does
     assert os.stat(image).st_ino == before
     assert not list(data.folder.glob(".*"))
 
 
 def test_a_damaged_image_says_what_to_do(folder: Path, tmp_path: Path) -> None:
     data = dataset(folder, tmp_path)
-    data.shoot.image(data.folder, data.shoot.frames[1], 0).write_bytes(b"")
+    data.capture.image(data.folder, data.capture.frames[1], 0).write_bytes(b"")
     with pytest.raises(DataError, match=r"cam_00\.exr: file is empty.*; delete the folder .*frame_00002 to render the frame again"):
         data.train.pixels(1)

@@ -14,7 +14,7 @@ import torch
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.volumes.grid import lattice
-from neuprim.tasks.dynamic.volume import shoot as shooting
+from neuprim.tasks.dynamic.volume import capture as capturing
 from neuprim.tasks.dynamic.volume.compare import extinction_on
 from neuprim.tasks.dynamic.volume.dataset import FrameViews
 from neuprim.tasks.dynamic.volume.settings import choose_frames
@@ -36,7 +36,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_frames_in_numerical_order_cameras_and_times(folder: Path, tmp_path: Path) -> None:
     data = dataset(folder, tmp_path)
-    assert [f.number for f in data.shoot.frames] == list(NUMBERS)
+    assert [f.number for f in data.capture.frames] == list(NUMBERS)
     assert len(data.train) == 4 * 4 and len(data.test) == 2 * 4
     assert [round(float(data.test.view(i).conditions["time"]), 4) for i in range(4)] == [0, 0.7778, 0.8889, 1]  # by number
     assert data.data_source == "real" and data.color_space == "linear"
@@ -73,7 +73,7 @@ def test_starting_points_lie_where_and_when_there_is_matter(folder: Path, tmp_pa
     cloud = data.initial_points(500, torch.Generator().manual_seed(1))
     again = data.initial_points(500, torch.Generator().manual_seed(1))
     assert torch.equal(cloud.means, again.means) and torch.equal(cloud.conditions["time"], again.conditions["time"])
-    world = data.shoot.normalisation.to_world(cloud.means.numpy())
+    world = data.capture.normalisation.to_world(cloud.means.numpy())
     for time, center in ((7 / 9, 8.0), (8 / 9, 12.0), (1.0, 16.0)):
         here = (cloud.conditions["time"] - time).abs() < 1e-6
         assert 100 < int(here.sum()) < 250
@@ -87,8 +87,8 @@ def test_a_second_call_renders_nothing_and_an_interrupted_one_goes_on(
 ) -> None:
     first = dataset(folder, tmp_path)
     calls: list[int] = []
-    genuine = shooting.integrate
-    monkeypatch.setattr(shooting, "integrate", lambda *a, **k: calls.append(1) or genuine(*a, **k))
+    genuine = capturing.integrate
+    monkeypatch.setattr(capturing, "integrate", lambda *a, **k: calls.append(1) or genuine(*a, **k))
     before = first.train.pixels(5).rgb
     second = dataset(folder, tmp_path)
     assert not calls and torch.equal(second.train.pixels(5).rgb, before)
@@ -118,7 +118,7 @@ def test_what_was_rendered_is_written_down(folder: Path, tmp_path: Path) -> None
     data = dataset(folder, tmp_path)
     record = json.loads((data.folder / "scene.json").read_text())
     assert [f["number"] for f in record["frames"]] == list(NUMBERS) and record["cameras"] == 6
-    assert record["normalisation"] == data.shoot.normalisation.to_json()
+    assert record["normalisation"] == data.capture.normalisation.to_json()
 
 
 def test_every_nth_frame_may_be_left_out_of_training(folder: Path, tmp_path: Path) -> None:
@@ -133,7 +133,7 @@ def test_every_nth_frame_may_be_left_out_of_training(folder: Path, tmp_path: Pat
 def test_decoded_images_are_bounded(folder: Path, tmp_path: Path) -> None:
     data = dataset(folder, tmp_path)
     one = 24 * 24 * 4 * 2
-    few = FrameViews(data.shoot, data.folder, range(4), data.exposure, memory=3 * one)
+    few = FrameViews(data.capture, data.folder, range(4), data.exposure, memory=3 * one)
     images = [few.pixels(i).rgb for i in range(16)]
     assert len(few._kept) == 3
     assert all(torch.equal(few.pixels(i).rgb, images[i]) for i in range(16))
@@ -141,14 +141,14 @@ def test_decoded_images_are_bounded(folder: Path, tmp_path: Path) -> None:
 
 def test_the_files_extinction_on_a_lattice(folder: Path, tmp_path: Path) -> None:
     data = dataset(folder, tmp_path)
-    matrix, shape = lattice(data.shoot.bounds, 48)
-    medium = data.shoot.medium(data.shoot.frames[1])
+    matrix, shape = lattice(data.capture.bounds, 48)
+    medium = data.capture.medium(data.capture.frames[1])
     found = extinction_on(medium, matrix, shape)
     peak = np.array(np.unravel_index(found.argmax(), shape))
-    world = data.shoot.normalisation.to_world((matrix[:3, :3].numpy() @ peak + matrix[:3, 3].numpy())[None])[0]
+    world = data.capture.normalisation.to_world((matrix[:3, :3].numpy() @ peak + matrix[:3, 3].numpy())[None])[0]
     assert np.linalg.norm(world - np.array([14.0, 6.0, 3.0])) < VOXEL
     assert found.max() == pytest.approx(float(medium.values[..., 0].max()), rel=0.15)
-    assert not extinction_on(data.shoot.medium(data.shoot.frames[0]), matrix, shape).any()
+    assert not extinction_on(data.capture.medium(data.capture.frames[0]), matrix, shape).any()
 
 
 # ---------------------------------------------------------------- bad input
@@ -195,14 +195,14 @@ def test_a_grid_by_another_name(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_look_chosen_by_the_grids(folder: Path, tmp_path: Path) -> None:
-    assert dataset(folder, tmp_path, look="auto").shoot.look.extinction_grids == ("density", "temperature")
+    assert dataset(folder, tmp_path, look="auto").capture.look.extinction_grids == ("density", "temperature")
     other = tmp_path / "hot"
     other.mkdir()
     for number in (1, 2):
         write_vdb(other / f"x{number}.vdb", blob(10.0 + number, ("temperature", "flames")))
     data = dataset(other, tmp_path, look="auto")
-    assert data.shoot.look.extinction_grids == ("temperature",)
-    assert data.shoot.look.flame_range == (0.0, pytest.approx(0.2, abs=0.01))  # the hottest flame of the files
+    assert data.capture.look.extinction_grids == ("temperature",)
+    assert data.capture.look.flame_range == (0.0, pytest.approx(0.2, abs=0.01))  # the hottest flame of the files
 
 
 def test_level_sets_are_refused_by_name(tmp_path: Path) -> None:

@@ -141,9 +141,9 @@ def test_the_loader_of_the_layout_reads_the_same_pixels_and_lights(cache: Path, 
             assert a.name == b.name and torch.equal(a.camera.viewmat, b.camera.viewmat) and a.camera.fx == b.camera.fx
             assert all(torch.equal(a.conditions[k], b.conditions[k]) for k in ("light", "light_intensity"))
             assert torch.equal(mine.pixels(i).rgb, theirs.pixels(i).rgb)
-    shot = json.loads((folder / "transforms_train.json").read_text())["frames"][2]
-    pose = np.array(shot["transform_matrix"])
-    fresh = picture(scene, pose, np.array(shot["pl_pos"]), 24, 2)
+    view = json.loads((folder / "transforms_train.json").read_text())["frames"][2]
+    pose = np.array(view["transform_matrix"])
+    fresh = picture(scene, pose, np.array(view["pl_pos"]), 24, 2)
     np.testing.assert_array_equal(dataset.train.pixels(2).rgb.numpy(), fresh.rgba[..., :3].astype(np.float16).astype(np.float32))
     np.testing.assert_array_equal(dataset.classes(2, dataset.train).numpy(), fresh.classes)
     np.testing.assert_allclose(pose, camera_to_world(pose[:3, 3]), atol=1e-12)

@@ -113,8 +113,8 @@ def test_pictures_do_not_depend_on_how_rays_are_batched(monkeypatch: pytest.Monk
 
 
 def test_distances_and_angles_are_those_promised() -> None:
-    shots = [s for split in splits(300, 60).values() for s in split]
-    for positions, polar in ((np.array([s.camera for s in shots]), 75.0), (np.array([s.light for s in shots]), 60.0)):
+    views = [s for split in splits(300, 60).values() for s in split]
+    for positions, polar in ((np.array([s.camera for s in views]), 75.0), (np.array([s.light for s in views]), 60.0)):
         distance = np.linalg.norm(positions, axis=1)
         angle = np.degrees(np.arccos(positions[:, 2] / distance))
         assert DISTANCE[0] <= distance.min() < 4.05 and 4.95 < distance.max() <= DISTANCE[1]
@@ -125,11 +125,11 @@ def test_parts_of_the_test_split_have_seen_what_they_say() -> None:
     found = splits(100, 20)
     cameras, lights = ({s.camera.tobytes() for s in found["train"]}, {s.light.tobytes() for s in found["train"]})
     counts = dict.fromkeys(PARTS, 0)
-    for shot in found["test"]:
-        part = next(p for p in PARTS if shot.name.startswith(p))
+    for view in found["test"]:
+        part = next(p for p in PARTS if view.name.startswith(p))
         counts[part] += 1
-        assert (shot.camera.tobytes() in cameras) == (part == "new_light"), shot.name
-        assert (shot.light.tobytes() in lights) == (part == "new_view"), shot.name
+        assert (view.camera.tobytes() in cameras) == (part == "new_light"), view.name
+        assert (view.light.tobytes() in lights) == (part == "new_view"), view.name
     assert list(counts.values()) == [7, 7, 6]
     assert len({s.name for s in found["test"]}) == 20 and found["test"][7].name == "new_light_00"
 
@@ -137,11 +137,11 @@ def test_parts_of_the_test_split_have_seen_what_they_say() -> None:
 def test_the_nearest_light_is_a_training_light_and_not_the_answer() -> None:
     found = splits(100, 30)
     known = [s.light for s in found["train"][:NEAR_LIGHTS]]
-    for shot in found["test"]:
-        assert shot.near_light is not None and any((shot.near_light == k).all() for k in known)
-        assert not (shot.near_light == shot.light).all()
-        cosines = [k @ shot.light / np.linalg.norm(k) for k in known]
-        assert shot.near_light @ shot.light / np.linalg.norm(shot.near_light) == max(cosines)
+    for view in found["test"]:
+        assert view.near_light is not None and any((view.near_light == k).all() for k in known)
+        assert not (view.near_light == view.light).all()
+        cosines = [k @ view.light / np.linalg.norm(k) for k in known]
+        assert view.near_light @ view.light / np.linalg.norm(view.near_light) == max(cosines)
 
 
 def test_more_training_views_begin_with_the_fewer() -> None:

@@ -8,7 +8,7 @@ found and what was expected; no claim in a file makes memory be taken that its b
 from neuprim.core.io.vdb.grid import DENSE_LIMIT, Bounds, Grid, Tiles, scale_transform
 from neuprim.core.io.vdb.header import FileHeader, GridHeader, read_header
 from neuprim.core.io.vdb.read import LEAF_LIMIT, read_grid, read_grids
-from neuprim.core.io.vdb.sequence import Frame, FrameSurvey, Sequence, Survey, sequence
+from neuprim.core.io.vdb.sequence import FrameSurvey, Sequence, Survey, VdbFrame, sequence
 from neuprim.core.io.vdb.write import COMPRESSIONS, write_vdb
 
 __all__ = [
@@ -17,7 +17,7 @@ __all__ = [
     "LEAF_LIMIT",
     "Bounds",
     "FileHeader",
-    "Frame",
+    "VdbFrame",
     "FrameSurvey",
     "Grid",
     "GridHeader",

@@ -15,11 +15,11 @@ from neuprim.core.io.vdb.grid import Bounds, Grid
 from neuprim.core.io.vdb.header import FileHeader, read_header
 from neuprim.core.io.vdb.read import LEAF_LIMIT, read_grid
 
-__all__ = ["Frame", "FrameSurvey", "Sequence", "Survey", "sequence"]
+__all__ = ["VdbFrame", "FrameSurvey", "Sequence", "Survey", "sequence"]
 
 
 @dataclass(frozen=True)
-class Frame:
+class VdbFrame:
     """One file and the number in its name."""
 
     number: int
@@ -40,7 +40,7 @@ class FrameSurvey:
         active_voxels, non_finite: counts.
     """
 
-    frame: Frame
+    frame: VdbFrame
     present: bool = False
     voxel_size: tuple[float, float, float] | None = None
     bounds: Bounds | None = None
@@ -96,7 +96,7 @@ class Sequence:
     """
 
     folder: Path
-    frames: tuple[Frame, ...]
+    frames: tuple[VdbFrame, ...]
     gaps: tuple[tuple[int, int], ...]
 
     def __len__(self) -> int:
@@ -166,14 +166,14 @@ def sequence(folder: Path, prefix: str | None = None) -> Sequence:
         paths = sorted(p for p in folder.iterdir() if p.suffix.lower() == ".vdb" and p.is_file())
     except OSError as error:  # no permission, a name that is too long
         raise DataError(f"{folder}: cannot be read ({error.strerror or error}); expected a folder with .vdb files") from error
-    found: dict[str, list[Frame]] = {}
+    found: dict[str, list[VdbFrame]] = {}
     odd: list[str] = []
     for path in paths:
         match = re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", path.stem, re.DOTALL)
         if match is None or len(match[2]) > 18:
             odd.append(path.name)
         else:
-            found.setdefault(match[1] + "*" * bool(match[3]) + match[3], []).append(Frame(int(match[2]), path))
+            found.setdefault(match[1] + "*" * bool(match[3]) + match[3], []).append(VdbFrame(int(match[2]), path))
     if prefix is not None:
         found, odd = {k: v for k, v in found.items() if k == prefix}, []
     if not found and not odd:

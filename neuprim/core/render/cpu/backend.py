@@ -34,7 +34,7 @@ Array = np.ndarray[Any, Any]
 
 
 @dataclass
-class _Frame:
+class _Prepared:
     """Everything the backward pass shares with the forward pass of one view."""
 
     camera: Camera
@@ -93,29 +93,29 @@ def _norms(width: int, height: int, fx: float, fy: float, cx: float, cy: float) 
 
 def _prepare(
     tensors: dict[str, Array], camera: Camera, view: Array, omega0: float, background: Array, settings: RenderSettings, stats: RenderStats
-) -> _Frame:
+) -> _Prepared:
     count, K = tensors["W1"].shape[:2]
     neurons = K + K % 2  # the backward kernel takes neurons in pairs; a padded one has amplitude 0
     rows = np.empty((count, row_width(neurons)), np.float32)
     spans = np.zeros((count, SPAN_WIDTH), np.float32)
     kinds, order = np.empty((count, neurons // 2), np.uint8), np.empty((count, K), np.uint8)
     boxes, depth, status = np.empty((count, 4), np.int32), np.empty(count, np.float64), np.empty(count, np.uint8)
-    delicate = np.empty(count, np.bool_)
+    in_float64 = np.empty(count, np.bool_)
     R, t = np.ascontiguousarray(view[:3, :3]), np.ascontiguousarray(view[:3, 3])
     cam = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
     size = np.array([camera.width, camera.height], np.int64)
     names = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
     parallel_for(
         prepare, count, _PRIMITIVES_PER_CHUNK, settings.threads, *(tensors[n] for n in names),
-        R, t, cam, size, settings.near, omega0 / _TURN, rows, spans, kinds, order, boxes, depth, status, delicate,
+        R, t, cam, size, settings.near, omega0 / _TURN, rows, spans, kinds, order, boxes, depth, status, in_float64,
     )  # fmt: skip
     if bool((status == NON_FINITE).any()):
         raise _non_finite(tensors, int(np.flatnonzero(status == NON_FINITE)[0]))
     net_narrow = None
     if "Wx" in tensors:
         net_narrow, fast = net_rows(np.arange(count), tensors, False, settings.threads)
-        delicate |= fast
-    slots, which = np.full(count, -1, np.int32), np.flatnonzero(delicate & (status == VISIBLE))
+        in_float64 |= fast
+    slots, which = np.full(count, -1, np.int32), np.flatnonzero(in_float64 & (status == VISIBLE))
     slots[which] = np.arange(len(which), dtype=np.int32)
     wide = np.empty((len(which), rows.shape[1]))
     parallel_for(
@@ -126,11 +126,11 @@ def _prepare(
     if net_narrow is not None:
         hidden = tensors["Wx"].shape[1]
         net = Net(net_narrow, net_rows(which, tensors, True, settings.threads)[0], hidden + hidden % 2)
-    stats.extra["delicate"] = len(which)
+    stats.extra["float64"] = len(which)
     lists = bin_primitives(rows, spans, boxes, depth, status, camera.width, camera.height, settings.threads)
     stats.pairs = lists.pairs
     limits = np.array([settings.alpha_min, settings.alpha_max, settings.transmittance_min, settings.depth_floor], np.float32)
-    return _Frame(
+    return _Prepared(
         camera,
         settings,
         omega0,
@@ -179,15 +179,15 @@ class _Rasterize(torch.autograd.Function):
         *net: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         names = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
-        tint = _NET if net else ("colors",)
-        kernels = zip((*names, *tint[:-1]), (means, log_scales, quats, W1, b1, w2, b2, *net), strict=True)
-        tensors = _alike({n: _array(v) for n, v in kernels}) | {tint[-1]: _array(colors)}
-        _check_colours(tensors, tint)
+        painted = _NET if net else ("colors",)
+        kernels = zip((*names, *painted[:-1]), (means, log_scales, quats, W1, b1, w2, b2, *net), strict=True)
+        tensors = _alike({n: _array(v) for n, v in kernels}) | {painted[-1]: _array(colors)}
+        _check_colours(tensors, painted)
         frame = _prepare(tensors, camera, viewmat.detach().double().numpy(), omega0, _array(background.float()), settings, stats)
         h, w, C = camera.height, camera.width, colors.shape[1]
         rgb, T = np.empty((h, w, C), np.float32), np.empty((h, w), np.float32)
         z, last = np.zeros((h, w) if settings.depth else (1, 1), np.float32), np.empty((h, w), np.int32)
-        palette = np.ascontiguousarray(tensors[tint[-1]], np.float32)
+        palette = np.ascontiguousarray(tensors[painted[-1]], np.float32)
         tiles = composite_tiles_by_entry if settings.sort == "entry" else composite_tiles
         lanes = parallel_for(
             tiles, frame.tiles, frame.chunk, settings.threads, frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
@@ -204,7 +204,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, g_rgb: Tensor | None, g_T: Tensor | None, g_z: Tensor | None) -> tuple[Any, ...]:  # type: ignore[override]
-        frame: _Frame = ctx.frame
+        frame: _Prepared = ctx.frame
         s, t = frame.settings, ctx.tensors
         count = t["W1"].shape[0]
         (h, w), C = ctx.T.shape, ctx.palette.shape[1]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import exact_kernel, inline, kernel
-from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH
+from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.gradients import chord_gradient, field_gradient, two_neurons
 from neuprim.core.render.cpu.layout import (
     ALPHA,
@@ -36,19 +36,25 @@ from neuprim.core.render.cpu.layout import (
     OVER,
     PER_NEURON,
     PIXELS,
+    RAY_COLOUR,
     SLIDE,
     SLOPE,
     T_,
     TILE,
-    TINT,
     UNIT,
     UX,
     UY,
 )
 from neuprim.core.render.cpu.neurons import field_with_slopes
+from neuprim.core.render.cpu.ray_colours import (
+    ray_colour_gradient,
+    ray_colour_gradient_row,
+    ray_colours,
+    uncomposite_rgb_ray_colours,
+    weigh_ray_colours,
+)
 from neuprim.core.render.cpu.tiles import compact, row_spans
-from neuprim.core.render.cpu.tints import tint_gradient, tint_gradient_row, tints, uncomposite_rgb_tints, weigh_tints
-from neuprim.core.render.cpu.turns import one_minus_exp
+from neuprim.core.render.cpu.trigonometry import one_minus_exp
 
 __all__ = ["backward_tiles", "opacity", "sum_rows"]
 
@@ -162,7 +168,7 @@ def backward_tiles(  # type: ignore[no-untyped-def]
     if net is not None:
         scratch = BACKWARD_SCRATCH + 2 * C * LANES
         waves = np.zeros((net.hidden, NET_SCRATCH), np.float32)
-    S, D = np.zeros(scratch + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
+    S, D = np.zeros(scratch + 1024, np.float32), np.zeros(FLOAT64_SCRATCH, np.float64)
     V = np.zeros((neurons, NEURON_SCRATCH), np.float32)
     state = np.zeros((6 + C) * PIXELS + 2 * TILE, np.float32)
     w, cg, sums = np.zeros(TILE, np.float32), np.zeros(TILE, np.float32), np.zeros((2 + C) * TILE, np.float32)
@@ -214,10 +220,10 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             for k in range(n, n16):
                 S[GRAD + k] = f(0)
             if net is not None:
-                tints(S, D, waves, n16, i, net, slots, colors[i], True)
+                ray_colours(S, D, waves, n16, i, net, slots, colors[i], True)
                 for c in range(C, 2 * C):
                     for k in range(n, n16):
-                        S[TINT + c * LANES + k] = f(0)
+                        S[RAY_COLOUR + c * LANES + k] = f(0)
             for k in range(n16):
                 S[GMID + k] = f(0)
             sums[:] = f(0)
@@ -229,7 +235,7 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                         if net is None:
                             _uncomposite_rgb_row(state, S, y * TILE, at, sums, a, b, rank, colors[i, 0], colors[i, 1], colors[i, 2])
                         else:
-                            uncomposite_rgb_tints(state, S, y * TILE, at, sums, a, b, rank)
+                            uncomposite_rgb_ray_colours(state, S, y * TILE, at, sums, a, b, rank)
                         continue
                     cg[:] = f(0)
                     if net is None:
@@ -238,7 +244,7 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                             for k in range(TILE):
                                 cg[k] += color * st[k]
                     else:
-                        weigh_tints(state, S, y * TILE, at, cg, C)
+                        weigh_ray_colours(state, S, y * TILE, at, cg, C)
                     if with_depth:
                         st = state[GZ + y * TILE :]
                         for k in range(a, b):
@@ -251,7 +257,7 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                             for k in range(TILE):
                                 sums[(2 + c) * TILE + k] += w[k] * st[k]
                     else:
-                        tint_gradient_row(state, S, y * TILE, at, w, a, b, C)
+                        ray_colour_gradient_row(state, S, y * TILE, at, w, a, b, C)
                     if with_depth:
                         st = state[GZ + y * TILE :]
                         for k in range(a, b):
@@ -267,7 +273,7 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             for m in range(0, neurons, 2):
                 two_neurons(S, V[m], V[m + 1], n16, p, m, out)
             if net is not None:
-                tint_gradient(S, waves, n16, i, net, C, out, color_at)
+                ray_colour_gradient(S, waves, n16, i, net, C, out, color_at)
             chord_gradient(S, n16, p, out)
     return evaluated
 

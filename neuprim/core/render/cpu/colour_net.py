@@ -2,7 +2,7 @@
 
 The network sees the chord's middle, x~_m = local (axes q) with q the middle in whitened space, which the density's pixel stage leaves
 in the lanes anyway. So its first layer goes to whitened axes and turns once per primitive, exactly as the density's neurons do, and
-nothing here depends on the camera. The pixel stage is in ``tints``.
+nothing here depends on the camera. The pixel stage is in ``ray_colours``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.render.cpu.layout import NET_OUT, PHASE, WX, net_row_width
-from neuprim.core.render.cpu.prepare import DELICATE_TURNS, rotation, rotation_backward
+from neuprim.core.render.cpu.prepare import FLOAT64_TURNS, rotation, rotation_backward
 
 __all__ = ["Net", "net_backward", "net_rows", "prepare_net"]
 
@@ -61,7 +61,7 @@ def prepare_net(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast
             row[o + PHASE] = phase - np.rint(phase)
             for c in range(C):
                 row[o + NET_OUT + c] = Wout[i, c, j]
-            fast[n] |= square > DELICATE_TURNS**2
+            fast[n] |= square > FLOAT64_TURNS**2
 
 
 def net_rows(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:

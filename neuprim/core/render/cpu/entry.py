@@ -17,7 +17,7 @@ import numpy as np
 
 from neuprim.core.compute.kernels import inline, kernel
 from neuprim.core.render.cpu.backward import opacity
-from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH
+from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.gradients import chord_gradient, field_gradient, two_neurons
 from neuprim.core.render.cpu.layout import (
     ALPHA,
@@ -36,18 +36,18 @@ from neuprim.core.render.cpu.layout import (
     NORM,
     PER_NEURON,
     PIXELS,
+    RAY_COLOUR,
     SLIDE,
     SLOPE,
     TILE,
-    TINT,
     UNCUT,
     UNIT,
     UX,
     UY,
 )
 from neuprim.core.render.cpu.neurons import field_values, field_with_slopes
+from neuprim.core.render.cpu.ray_colours import ray_colour_gradient, ray_colours
 from neuprim.core.render.cpu.tiles import compact, row_spans
-from neuprim.core.render.cpu.tints import tint_gradient, tints
 
 __all__ = ["backward_tiles_by_entry", "composite_tiles_by_entry"]
 
@@ -117,7 +117,7 @@ def _list_hits(  # type: ignore[no-untyped-def]
         field_values(S, D, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, False, True)
         opacity(S, n16, amin, amax)
         if net is not None:
-            tints(S, D, waves, n16, i, net, slots, colors[i], False)
+            ray_colours(S, D, waves, n16, i, net, slots, colors[i], False)
         anchor, unit = p[ANCHOR_Z], p[UNIT]
         for y in range(y0, y1):
             at = offset[y] - bounds[y]
@@ -131,7 +131,7 @@ def _list_hits(  # type: ignore[no-untyped-def]
                     marks[count, H_PIXEL], marks[count, H_LANE], marks[count, H_PAIR] = y * TILE + x, k, q - first
                     if net is not None:
                         for c in range(hues.shape[1]):
-                            hues[count, c] = max(S[TINT + c * LANES + k], f(0))
+                            hues[count, c] = max(S[RAY_COLOUR + c * LANES + k], f(0))
                     count += 1
     starts_of[end - first] = count
     return count, evaluated
@@ -183,7 +183,7 @@ def composite_tiles_by_entry(  # type: ignore[no-untyped-def]
     if net is not None:
         scratch = BACKWARD_SCRATCH + 2 * C * LANES
         waves, hues = np.zeros((net.hidden, NET_SCRATCH), np.float32), np.empty((1, C), np.float32)
-    S, D = np.zeros(scratch + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
+    S, D = np.zeros(scratch + 1024, np.float32), np.zeros(FLOAT64_SCRATCH, np.float64)
     state = np.zeros(NORM + PIXELS + 2 * TILE, np.float32)
     bounds, offset = np.zeros(2 * TILE, np.int32), np.zeros(TILE, np.int32)
     rows_live, color = np.zeros(TILE, np.float32), np.zeros(C, np.float32)
@@ -249,7 +249,7 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
     if net is not None:
         scratch = BACKWARD_SCRATCH + 2 * C * LANES
         waves, hues = np.zeros((net.hidden, NET_SCRATCH), np.float32), np.empty((1, C), np.float32)
-    S, D = np.zeros(scratch + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
+    S, D = np.zeros(scratch + 1024, np.float32), np.zeros(FLOAT64_SCRATCH, np.float64)
     V = np.zeros((neurons, NEURON_SCRATCH), np.float32)
     state = np.zeros(NORM + PIXELS + 2 * TILE, np.float32)
     bounds, offset = np.zeros(2 * TILE, np.int32), np.zeros(TILE, np.int32)
@@ -323,23 +323,23 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
             for k in range(n16):
                 S[GRAD + k], S[GMID + k] = f(0), f(0)
             if net is not None:
-                tints(S, D, waves, n16, i, net, slots, colors[i], True)
+                ray_colours(S, D, waves, n16, i, net, slots, colors[i], True)
                 for c in range(C, 2 * C):
                     for k in range(n16):
-                        S[TINT + c * LANES + k] = f(0)
+                        S[RAY_COLOUR + c * LANES + k] = f(0)
             for s in range(starts_of[q - first], starts_of[q - first + 1]):
                 k, j = marks[s, H_LANE], marks[s, H_PIXEL]
                 S[GRAD + k] = hits[s, H_GRAD]
                 if net is not None:
                     for c in range(C):
-                        if S[TINT + c * LANES + k] >= f(0):
-                            S[TINT + (C + c) * LANES + k] = hits[s, H_WEIGHT] * g_rgb[ty + j // TILE, tx + j % TILE, c]
+                        if S[RAY_COLOUR + c * LANES + k] >= f(0):
+                            S[RAY_COLOUR + (C + c) * LANES + k] = hits[s, H_WEIGHT] * g_rgb[ty + j // TILE, tx + j % TILE, c]
                 if with_depth:
                     S[GMID + k] = hits[s, H_WEIGHT] * g_z[ty + j // TILE, tx + j % TILE] * p[UNIT]
             field_gradient(S, n16, out)
             for m in range(0, neurons, 2):
                 two_neurons(S, V[m], V[m + 1], n16, p, m, out)
             if net is not None:
-                tint_gradient(S, waves, n16, i, net, C, out, color_at)
+                ray_colour_gradient(S, waves, n16, i, net, C, out, color_at)
             chord_gradient(S, n16, p, out)
     return evaluated

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import inline, kernel
-from neuprim.core.render.cpu.delicate import DELICATE_SCRATCH
+from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.layout import (
     ALPHA,
     ANCHOR_Z,
@@ -29,9 +29,9 @@ from neuprim.core.render.cpu.layout import (
     ZSUM,
 )
 from neuprim.core.render.cpu.neurons import field_values
+from neuprim.core.render.cpu.ray_colours import add_ray_colours, composite_rgb_ray_colours, ray_colours
 from neuprim.core.render.cpu.tiles import compact, row_spans
-from neuprim.core.render.cpu.tints import add_tints, composite_rgb_tints, tints
-from neuprim.core.render.cpu.turns import one_minus_exp
+from neuprim.core.render.cpu.trigonometry import one_minus_exp
 
 __all__ = ["composite_tiles"]
 
@@ -101,7 +101,7 @@ def composite_tiles(  # type: ignore[no-untyped-def]
     if net is not None:
         scratch = BACKWARD_SCRATCH + 2 * C * LANES
         waves = np.zeros((net.hidden, NET_SCRATCH), np.float32)
-    S, D = np.zeros(scratch + 1024, np.float32), np.zeros(DELICATE_SCRATCH, np.float64)
+    S, D = np.zeros(scratch + 1024, np.float32), np.zeros(FLOAT64_SCRATCH, np.float64)
     state = np.zeros((4 + C) * PIXELS + 2 * TILE, np.float32)
     w = np.zeros(TILE, np.float32)
     bounds, offset = np.zeros(2 * TILE, np.int32), np.zeros(TILE, np.int32)
@@ -131,7 +131,7 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                 field_values(S, D, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, with_depth, False)
                 _opacity(S, n16, amin, amax)
                 if net is not None:
-                    tints(S, D, waves, n16, i, net, slots, colors[i], False)
+                    ray_colours(S, D, waves, n16, i, net, slots, colors[i], False)
                 rank = f(q - starts[t] + 1)
                 for y in range(y0, y1):
                     a, b = bounds[y], bounds[y + TILE]
@@ -143,7 +143,7 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                                     state, S, y * TILE, ALPHA + at, a, b, tmin, rank, colors[i, 0], colors[i, 1], colors[i, 2]
                                 )
                             else:
-                                composite_rgb_tints(state, S, y * TILE, at, a, b, tmin, rank)
+                                composite_rgb_ray_colours(state, S, y * TILE, at, a, b, tmin, rank)
                         else:
                             _composite_row(state[y * TILE :], S[ALPHA + at :], w, a, b, tmin, rank)
                             if net is None:
@@ -152,7 +152,7 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                                     for k in range(TILE):
                                         st[k] += w[k] * color
                             else:
-                                add_tints(state, S, y * TILE, at, w, C)
+                                add_ray_colours(state, S, y * TILE, at, w, C)
                             if with_depth:
                                 st = state[ZSUM + y * TILE :]
                                 for k in range(a, b):

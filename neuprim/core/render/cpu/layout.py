@@ -95,7 +95,7 @@ SLIDE = lane(32)  # s: MID and TM are measured from a ray origin slid by this mu
 FORWARD_SCRATCH = lane(20)
 BACKWARD_SCRATCH = lane(33)
 # with a colour network also, forward and backward: C arrays of colours before max(0, .), then C of dL/d those
-TINT = BACKWARD_SCRATCH
+RAY_COLOUR = BACKWARD_SCRATCH
 # per neuron in the backward pass: cos sinc, -2 pi sin sinc, cos dsinc
 N_COS, N_SIN, N_DSINC = lane(0), lane(1), lane(2)
 NEURON_SCRATCH = lane(3)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import inline
-from neuprim.core.render.cpu.delicate import delicate_chords, delicate_neurons, delicate_slopes
+from neuprim.core.render.cpu.float64 import chords_float64, neurons_float64, slopes_float64
 from neuprim.core.render.cpu.layout import (
     AMPLITUDE,
     EXL,
@@ -32,7 +32,7 @@ from neuprim.core.render.cpu.layout import (
     WZ,
 )
 from neuprim.core.render.cpu.tiles import chords
-from neuprim.core.render.cpu.turns import (
+from neuprim.core.render.cpu.trigonometry import (
     TAU,
     cos_turns,
     sinc_turns,
@@ -115,8 +115,8 @@ _slopes_slow, _slopes_medium, _slopes_fast = _slopes(slopes_slow), _slopes(slope
 def field_values(S, D, n, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, with_mid, backward):  # type: ignore[no-untyped-def]
     """Chords and FIELD of ``n`` lanes of primitive ``i``, in float64 where float32 is too coarse; see :func:`~tiles.chords`."""
     if slots[i] >= 0:
-        delicate_chords(S, D, bounds, y0, y1, tx, ty, n, wide[slots[i]], floor, with_mid, backward)
-        delicate_neurons(S, D, n, wide[slots[i]], neurons)
+        chords_float64(S, D, bounds, y0, y1, tx, ty, n, wide[slots[i]], floor, with_mid, backward)
+        neurons_float64(S, D, n, wide[slots[i]], neurons)
     else:
         p = rows[i]
         chords(S, n, p, floor, with_mid, backward)
@@ -134,8 +134,8 @@ def field_values(S, D, n, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, n
 def field_with_slopes(S, D, V, n, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor):  # type: ignore[no-untyped-def]
     """The same for the backward pass: also the three products per neuron, in ``V``, that the gradients need."""
     if slots[i] >= 0:
-        delicate_chords(S, D, bounds, y0, y1, tx, ty, n, wide[slots[i]], floor, False, True)
-        delicate_slopes(S, D, V, n, wide[slots[i]], neurons)
+        chords_float64(S, D, bounds, y0, y1, tx, ty, n, wide[slots[i]], floor, False, True)
+        slopes_float64(S, D, V, n, wide[slots[i]], neurons)
     else:
         p = rows[i]
         chords(S, n, p, floor, False, True)

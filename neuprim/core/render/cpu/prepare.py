@@ -54,7 +54,7 @@ from neuprim.core.render.cpu.layout import (
 
 __all__ = [
     "CULLED",
-    "DELICATE_TURNS",
+    "FLOAT64_TURNS",
     "NON_FINITE",
     "VISIBLE",
     "prepare",
@@ -68,12 +68,12 @@ VISIBLE, CULLED, NON_FINITE = 0, 1, 2
 _FLOAT32_MAX = 3.0e38
 
 # Where the pixel stage leaves float32 (bounds found with benchmarks/numerics.py).
-_DELICATE_RADII = 8.0  # terms of a point on the ray this many radii of the thinnest axis long: they cancel
-_DELICATE_ANCHOR = 1.25  # the same of the centre seen from an anchor at the camera: most cameras outside, but near
-DELICATE_TURNS = 4.0  # of a neuron, or a unit of a colour network, over half a chord
-_DELICATE_PIXELS = 16384.0  # from the corner of the image to the anchor
-_DELICATE_RATIO = 256.0  # of the axes; for the gradients
-_DELICATE_RATIO_NEAR = 16.0  # of the axes of a primitive anchored at the camera, which its chords pass closely
+_FLOAT64_RADII = 8.0  # terms of a point on the ray this many radii of the thinnest axis long: they cancel
+_FLOAT64_ANCHOR = 1.25  # the same of the centre seen from an anchor at the camera: most cameras outside, but near
+FLOAT64_TURNS = 4.0  # of a neuron, or a unit of a colour network, over half a chord
+_FLOAT64_PIXELS = 16384.0  # from the corner of the image to the anchor
+_FLOAT64_RATIO = 256.0  # of the axes; for the gradients
+_FLOAT64_RATIO_NEAR = 16.0  # of the axes of a primitive anchored at the camera, which its chords pass closely
 
 strict = njit(error_model="numpy", forceinline=True)
 
@@ -208,13 +208,13 @@ def prepare_wide(start, stop, which, means, log_scales, quats, W1, b1, w2, b2, R
 @exact_kernel
 def prepare(  # type: ignore[no-untyped-def]
     start, stop, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, size, near, turns,
-    rows, spans, kinds, order, boxes, depth, status, delicate,
+    rows, spans, kinds, order, boxes, depth, status, in_float64,
 ):  # fmt: skip
     """Fill kernel rows, silhouette spans, pixel boxes, view depths and status of primitives ``start:stop``.
 
     cam = (fx, fy, cx, cy); size = (width, height); turns = omega0 / 2 pi. Neurons are stored by rising rate: ``order[i, k]`` is the
     model's index of row neuron k, ``kinds[i, m]`` the range of rates (SLOW, MEDIUM, FAST) of row neurons 2m and 2m + 1.
-    ``delicate[i]`` says that float32 is not enough for the primitive's pixels (see :func:`prepare_wide`).
+    ``in_float64[i]`` says that float32 is not enough for the primitive's pixels (see :func:`prepare_wide`).
     """
     K = W1.shape[1]
     work, rate, row = np.empty((10, 3)), np.empty(K), np.zeros(rows.shape[1])
@@ -228,10 +228,10 @@ def prepare(  # type: ignore[no-untyped-def]
         for j in range(row.shape[0]):
             rows[i, j] = row[j]
         tc = row[TC]
-        delicate[i] = (K > 0 and rate[K - 1] > DELICATE_TURNS) or max(abs(row[UX]), abs(row[UY])) > _DELICATE_PIXELS
-        delicate[i] |= _dot(xa, xa) > _DELICATE_ANCHOR**2  # centre far from the anchor, in the thinnest axis
+        in_float64[i] = (K > 0 and rate[K - 1] > FLOAT64_TURNS) or max(abs(row[UX]), abs(row[UY])) > _FLOAT64_PIXELS
+        in_float64[i] |= _dot(xa, xa) > _FLOAT64_ANCHOR**2  # centre far from the anchor, in the thinnest axis
         thinnest = min(axes[0], axes[1], axes[2])
-        delicate[i] |= thinnest * (_DELICATE_RATIO_NEAR if tc == 0.0 else _DELICATE_RATIO) < 1.0
+        in_float64[i] |= thinnest * (_FLOAT64_RATIO_NEAR if tc == 0.0 else _FLOAT64_RATIO) < 1.0
         depth[i] = c[2]
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
         if not finite:
@@ -289,10 +289,10 @@ def prepare(  # type: ignore[no-untyped-def]
                     # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted needle
                     # each is many radii of its thin axis, and they cancel
                     slide = abs(row[TU]) * broad + abs(row[TV]) * tall
-                    delicate[i] |= slide * (np.sqrt(_dot(ex, ex)) * broad + np.sqrt(_dot(ey, ey)) * tall) > _DELICATE_RADII
+                    in_float64[i] |= slide * (np.sqrt(_dot(ex, ex)) * broad + np.sqrt(_dot(ey, ey)) * tall) > _FLOAT64_RADII
                     for a in range(3):
-                        delicate[i] |= abs(row[XU + a]) * broad + abs(row[XV + a]) * tall > _DELICATE_RADII
-        if delicate[i]:  # the float64 rows do not slide
+                        in_float64[i] |= abs(row[XU + a]) * broad + abs(row[XV + a]) * tall > _FLOAT64_RADII
+        if in_float64[i]:  # the float64 rows do not slide
             for a in range(3):
                 rows[i, XU + a], rows[i, XV + a] = tc * ex[a], tc * ey[a]
             rows[i, TU], rows[i, TV] = 0.0, 0.0

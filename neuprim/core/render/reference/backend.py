@@ -17,7 +17,7 @@ from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
-from neuprim.core.render.reference.rays import Rays, pixel_directions, view_of
+from neuprim.core.render.reference.rays import Rays, frame_rays, pixel_directions
 from neuprim.core.settings import RenderSettings
 
 __all__ = ["pixel_directions", "render"]
@@ -59,7 +59,7 @@ class _Tally(torch.autograd.Function):
         return grad, None, None, None
 
 
-class _Frame:
+class _Prepared:
     """Per-primitive quantities of one view, in float64, in camera axes."""
 
     def __init__(self, lowered: Lowered, camera: AnyCamera) -> None:
@@ -82,9 +82,9 @@ class _Frame:
 
 def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
     """Render a lowered model; see :func:`neuprim.core.render.render` for shapes. Computes in float64, returns the model's dtype."""
-    frame = _Frame(lowered, camera)
+    frame = _Prepared(lowered, camera)
     count = lowered.geometry.count
-    seen = view_of(camera, lowered.geometry, frame.center, settings.near)
+    seen = frame_rays(camera, lowered.geometry, frame.center, settings.near)
     channels = lowered.colour.channels
     stats = RenderStats("reference", count)
     rows_of_blocks = []
@@ -110,7 +110,7 @@ def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, setti
 
 def _trace(
     lowered: Lowered,
-    frame: _Frame,
+    frame: _Prepared,
     rays: Rays,
     rows: Tensor,
     pixels: Tensor,

@@ -14,7 +14,7 @@ from neuprim.core.cameras.rays import AnyCamera, RayCamera
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.render.reference.projection import screen_boxes
 
-__all__ = ["Rays", "View", "pixel_directions", "view_of"]
+__all__ = ["Rays", "FrameRays", "pixel_directions", "frame_rays"]
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Rays:
     depth: Tensor
 
 
-class View(ABC):
+class FrameRays(ABC):
     """The rays (H, W) of one frame, and its primitives front to back.
 
     Attributes:
@@ -66,7 +66,7 @@ def pixel_directions(camera: Camera) -> Tensor:
     return d / d.norm(dim=-1, keepdim=True)
 
 
-class _Pinhole(View):
+class _Pinhole(FrameRays):
     """Near is a camera-z plane, depth is camera-z, the order is that of the centres' z, the cull exact screen boxes."""
 
     def __init__(self, camera: Camera, geometry: Geometry, center: Tensor, near: float) -> None:
@@ -81,7 +81,7 @@ class _Pinhole(View):
         return (b[:, 0] < x + w) & (b[:, 2] > x) & (b[:, 1] < y + h) & (b[:, 3] > y)
 
 
-class _Central(View):
+class _Central(FrameRays):
     """Near, depth and the order are distances from the camera; the cull is a cone round each block's rays."""
 
     def __init__(self, camera: RayCamera, geometry: Geometry, center: Tensor, near: float) -> None:
@@ -108,7 +108,7 @@ class _Central(View):
             return (self.toward @ axis).clamp(-1, 1).acos() <= spread + self.angle + slack
 
 
-def view_of(camera: AnyCamera, geometry: Geometry, center: Tensor, near: float) -> View:
+def frame_rays(camera: AnyCamera, geometry: Geometry, center: Tensor, near: float) -> FrameRays:
     """The frame's rays; ``center`` (N, 3) are the primitives' centres in camera axes, float64."""
     make = _Central if isinstance(camera, RayCamera) else _Pinhole
     return make(camera, geometry, center, near)  # type: ignore[arg-type]

@@ -14,7 +14,7 @@ from neuprim.core.volumes.grid import agreement, density_grid, lattice
 from neuprim.tasks.dynamic.volume.medium import Medium
 
 if TYPE_CHECKING:
-    from neuprim.tasks.dynamic.volume.shoot import Shoot
+    from neuprim.tasks.dynamic.volume.capture import Capture
 
 __all__ = ["RESOLUTION", "compare_with_truth", "extinction_on"]
 
@@ -35,21 +35,21 @@ def extinction_on(medium: Medium, scene_from_index: Tensor, shape: tuple[int, in
     return found.reshape(shape).astype(np.float32)
 
 
-def compare_with_truth(model: Primitives, shoot: Shoot, times: list[float], per_third: int = 3) -> dict[str, Any]:
+def compare_with_truth(model: Primitives, capture: Capture, times: list[float], per_third: int = 3) -> dict[str, Any]:
     """Pearson correlation and relative L2 error of sigma over the sequence's box, for the early, middle and late third.
 
     ``sigma_frames`` has every compared frame; the thirds are means over ``per_third`` of them, evenly spaced. Frames without
     any extinction have no correlation and are left out.
     """
-    count = len(shoot.frames)
+    count = len(capture.frames)
     chosen = sorted({int((i + 0.5) * count / (3 * per_third)) for i in range(3 * per_third)})
-    matrix, shape = lattice(shoot.bounds, RESOLUTION)
+    matrix, shape = lattice(capture.bounds, RESOLUTION)
     entries: list[dict[str, Any]] = []
     for t in chosen:
-        truth = extinction_on(shoot.medium(shoot.frames[t]), matrix, shape)
+        truth = extinction_on(capture.medium(capture.frames[t]), matrix, shape)
         numbers = agreement(truth, density_grid(model, {"time": torch.tensor(times[t])}, matrix, shape).numpy())
         if numbers is not None:
-            entries.append({"frame": shoot.frames[t].number, "third": THIRDS[min(3 * t // count, 2)], **numbers})
+            entries.append({"frame": capture.frames[t].number, "third": THIRDS[min(3 * t // count, 2)], **numbers})
     result: dict[str, Any] = {"sigma_frames": entries}
     for key in ("correlation", "relative_l2"):
         for third in THIRDS:

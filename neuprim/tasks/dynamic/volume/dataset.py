@@ -17,9 +17,9 @@ from neuprim.core.errors import DataError
 from neuprim.core.io import images
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.source import Placement
-from neuprim.tasks.dynamic.dead import dead_fraction
+from neuprim.tasks.dynamic.invisible import invisible_fraction
+from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.compare import compare_with_truth
-from neuprim.tasks.dynamic.volume.shoot import Shoot
 from neuprim.tasks.dynamic.volume.source import placement_of
 
 __all__ = ["MEMORY", "MEMORY_TEST", "FrameViews", "VolumeDataset"]
@@ -39,11 +39,13 @@ class FrameViews(ViewSet):
     ``every`` = n leaves out all but every n-th frame; times stay those of the whole sequence.
     """
 
-    def __init__(self, shoot: Shoot, folder: Path, cameras: Sequence[int], exposure: float, every: int = 1, memory: int = MEMORY) -> None:
-        self.shoot, self.folder, self.cameras, self.exposure, self.memory = shoot, folder, list(cameras), exposure, memory
+    def __init__(
+        self, capture: Capture, folder: Path, cameras: Sequence[int], exposure: float, every: int = 1, memory: int = MEMORY
+    ) -> None:
+        self.capture, self.folder, self.cameras, self.exposure, self.memory = capture, folder, list(cameras), exposure, memory
         self._kept: OrderedDict[int, Tensor] = OrderedDict()
-        self.frames = shoot.frames[::every]
-        first, last = shoot.frames[0].number, shoot.frames[-1].number  # numbers are time: a gap in them is one in time
+        self.frames = capture.frames[::every]
+        first, last = capture.frames[0].number, capture.frames[-1].number  # numbers are time: a gap in them is one in time
         self.times = [torch.tensor((frame.number - first) / max(last - first, 1)) for frame in self.frames]
 
     def __len__(self) -> int:
@@ -52,7 +54,7 @@ class FrameViews(ViewSet):
     def view(self, index: int) -> View:
         c, t = divmod(index, len(self.times))
         frame = self.frames[t]
-        return View(f"cam_{self.cameras[c]:02d}_frame_{frame.number:04d}", self.shoot.cameras[self.cameras[c]], {"time": self.times[t]})
+        return View(f"cam_{self.cameras[c]:02d}_frame_{frame.number:04d}", self.capture.cameras[self.cameras[c]], {"time": self.times[t]})
 
     def pixels(self, index: int) -> Pixels:
         rgba = self._decoded(index).float()
@@ -63,8 +65,8 @@ class FrameViews(ViewSet):
             self._kept.move_to_end(index)
             return self._kept[index]
         c, t = divmod(index, len(self.times))
-        camera = self.shoot.cameras[self.cameras[c]]
-        path = self.shoot.image(self.folder, self.frames[t], self.cameras[c])
+        camera = self.capture.cameras[self.cameras[c]]
+        path = self.capture.image(self.folder, self.frames[t], self.cameras[c])
         try:
             rgba = images.read_image(path, (camera.width, camera.height))
         except DataError as error:
@@ -85,24 +87,24 @@ class VolumeDataset(Dataset):
     random_background = True
 
     def __init__(
-        self, name: str, source: DataSource, shoot: Shoot, folder: Path, held_out: Sequence[int], up: Tensor, every: int = 1
+        self, name: str, source: DataSource, capture: Capture, folder: Path, held_out: Sequence[int], up: Tensor, every: int = 1
     ) -> None:
         self.name, self.data_source = name, source
-        self.shoot, self.folder, self.every = shoot, folder, every
-        stored = [_stored(shoot.points(folder, frame)) for frame in shoot.frames]
+        self.capture, self.folder, self.every = capture, folder, every
+        stored = [_stored(capture.points(folder, frame)) for frame in capture.frames]
         self.exposure = max(float(s["brightest"]) for s in stored)
         if not self.exposure > 0:
             raise DataError(f"{name}: every frame is black from every camera; expected light (check scene.look and scene.grids)")
         self.weights = [float(s["weight"]) for s in stored]
-        learned = [c for c in range(len(shoot.cameras)) if c not in held_out]
-        self.train = FrameViews(shoot, folder, learned, self.exposure, every)
-        self.test = FrameViews(shoot, folder, held_out, self.exposure, memory=MEMORY_TEST)
-        self.extent = camera_extent(shoot.cameras)
+        learned = [c for c in range(len(capture.cameras)) if c not in held_out]
+        self.train = FrameViews(capture, folder, learned, self.exposure, every)
+        self.test = FrameViews(capture, folder, held_out, self.exposure, memory=MEMORY_TEST)
+        self.extent = camera_extent(capture.cameras)
         self.background = torch.zeros(3)
-        camera = shoot.cameras[0]
-        self.downsampling = f"rendered at {camera.width}x{camera.height}, {shoot.samples}x{shoot.samples} rays per pixel"
+        camera = capture.cameras[0]
+        self.downsampling = f"rendered at {camera.width}x{camera.height}, {capture.samples}x{capture.samples} rays per pixel"
         self.up, self.center = up, torch.zeros(3, dtype=torch.float64)
-        self.bounds = torch.from_numpy(shoot.bounds)
+        self.bounds = torch.from_numpy(capture.bounds)
         self._masks: dict[int, Tensor] = {}
 
     def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
@@ -119,7 +121,7 @@ class VolumeDataset(Dataset):
         for t, wanted in enumerate(per_frame):
             if not wanted:
                 continue
-            stored = _stored(self.shoot.points(self.folder, self.shoot.frames[t]))
+            stored = _stored(self.capture.points(self.folder, self.capture.frames[t]))
             points = torch.from_numpy(stored["means"])
             rows = torch.randperm(len(points), generator=generator)[torch.arange(wanted) % len(points)]
             place = points[rows]
@@ -132,12 +134,12 @@ class VolumeDataset(Dataset):
         return PointCloud(torch.cat(means), torch.cat(colors), {"time": torch.cat(times)})
 
     def clips(self) -> list[Clip]:
-        frames = len(self.shoot.frames)
+        frames = len(self.capture.frames)
         return [Clip(f"cam_{c:02d}", range(i * frames, (i + 1) * frames), 24.0) for i, c in enumerate(self.test.cameras)]
 
     def mask(self, index: int) -> Tensor:
         """Pixels that show matter in some frame of the view's camera."""
-        frames = len(self.shoot.frames)
+        frames = len(self.capture.frames)
         camera = index // frames
         if camera not in self._masks:
             alphas = (self.test.pixels(i).alpha for i in range(camera * frames, (camera + 1) * frames))
@@ -149,16 +151,16 @@ class VolumeDataset(Dataset):
         return self._masks[camera]
 
     def placement(self) -> Placement:
-        return placement_of(self.shoot)
+        return placement_of(self.capture)
 
     def diagnose(self, model: Primitives) -> dict[str, Any]:
         """The model's extinction against the files', and its size against theirs."""
         return {
             "exposure": self.exposure,
-            "vdb_bytes": sum(frame.path.stat().st_size for frame in self.shoot.frames),
-            "normalisation": self.shoot.normalisation.to_json(),
-            "dead_fraction": dead_fraction(model, self.test.times),
-            **compare_with_truth(model, self.shoot, [float(t) for t in self.test.times]),
+            "vdb_bytes": sum(frame.path.stat().st_size for frame in self.capture.frames),
+            "normalisation": self.capture.normalisation.to_json(),
+            "invisible_fraction": invisible_fraction(model, self.test.times),
+            **compare_with_truth(model, self.capture, [float(t) for t in self.test.times]),
         }
 
 

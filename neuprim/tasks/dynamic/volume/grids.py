@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from neuprim.core.errors import DataError, nearest
-from neuprim.core.io.vdb import Frame, Grid, read_grids, read_header
+from neuprim.core.io.vdb import Grid, VdbFrame, read_grids, read_header
 
 __all__ = ["GridReader", "find_grids"]
 
@@ -49,7 +49,7 @@ class GridReader:
         return dict(zip(wanted, read_grids(path, list(wanted.values())), strict=True))
 
 
-def find_grids(frames: Sequence[Frame], given: Mapping[str, str]) -> GridReader:
+def find_grids(frames: Sequence[VdbFrame], given: Mapping[str, str]) -> GridReader:
     """The grids that some frame has: those the user named, then those with a usual name.
 
     Raises:

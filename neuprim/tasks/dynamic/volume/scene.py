@@ -13,9 +13,10 @@ import torch
 
 from neuprim.core.data import Dataset, DataSource
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb import Frame, sequence
+from neuprim.core.io.vdb import VdbFrame, sequence
 from neuprim.core.task import SceneContext
 from neuprim.tasks.dynamic.simulation import simulate
+from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.dataset import VolumeDataset
 from neuprim.tasks.dynamic.volume.grids import GridReader, find_grids
 from neuprim.tasks.dynamic.volume.looks import changed, named_look
@@ -23,8 +24,7 @@ from neuprim.tasks.dynamic.volume.normalise import Normalisation
 from neuprim.tasks.dynamic.volume.optics import Look
 from neuprim.tasks.dynamic.volume.rig import AXES, rig
 from neuprim.tasks.dynamic.volume.settings import VolumeSettings, choose_frames
-from neuprim.tasks.dynamic.volume.shoot import Shoot
-from neuprim.tasks.dynamic.volume.source import ShootSource
+from neuprim.tasks.dynamic.volume.source import CaptureSource
 
 __all__ = ["load", "load_volume"]
 
@@ -38,18 +38,18 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         ConfigError: unknown setting or impossible value.
         DataError: files that are missing, damaged, or without a usable grid; a cache that cannot be written.
     """
-    asked, name, source, shoot, held_out = _prepare(settings, context)
-    rendered = shoot.take(context.cache_dir, context.progress)
+    asked, name, source, capture, held_out = _prepare(settings, context)
+    rendered = capture.take(context.cache_dir, context.progress)
     up = torch.tensor(AXES[asked.up], dtype=torch.float64)
-    return VolumeDataset(name, source, shoot, rendered, held_out, up, asked.train_every)
+    return VolumeDataset(name, source, capture, rendered, held_out, up, asked.train_every)
 
 
-def load_volume(settings: Mapping[str, Any], context: SceneContext) -> ShootSource:
+def load_volume(settings: Mapping[str, Any], context: SceneContext) -> CaptureSource:
     """The same scene's files without any image. Raises as :func:`load`."""
-    return ShootSource(_prepare(settings, context)[3])
+    return CaptureSource(_prepare(settings, context)[3])
 
 
-def _prepare(settings: Mapping[str, Any], context: SceneContext) -> tuple[VolumeSettings, str, DataSource, Shoot, range]:
+def _prepare(settings: Mapping[str, Any], context: SceneContext) -> tuple[VolumeSettings, str, DataSource, Capture, range]:
     """All that is known before anything is rendered: settings, name, origin, what to render, and the cameras held out."""
     asked = VolumeSettings.parse(settings)
     _look(asked, AUTO[0])  # a typing error shows before anything is simulated
@@ -63,8 +63,8 @@ def _prepare(settings: Mapping[str, Any], context: SceneContext) -> tuple[Volume
         look = dataclasses.replace(look, flame_range=(0.0, hottest)) if hottest > 0 else look
     normalisation = Normalisation.from_bounds(box)
     train, test = rig(asked.size, asked.cameras, up=asked.up, field_of_view=asked.field_of_view)
-    shoot = Shoot(frames, reader, look, [*train, *test], asked.samples, normalisation, normalisation.to_scene(box))
-    return asked, name, source, shoot, range(len(train), len(train) + len(test))
+    capture = Capture(frames, reader, look, [*train, *test], asked.samples, normalisation, normalisation.to_scene(box))
+    return asked, name, source, capture, range(len(train), len(train) + len(test))
 
 
 def _files(asked: VolumeSettings, context: SceneContext) -> tuple[Path, str, DataSource]:
@@ -75,7 +75,7 @@ def _files(asked: VolumeSettings, context: SceneContext) -> tuple[Path, str, Dat
     return folder, f"{asked.simulation} (simulated)", "simulated"
 
 
-def _frames(folder: Path, asked: VolumeSettings) -> list[Frame]:
+def _frames(folder: Path, asked: VolumeSettings) -> list[VdbFrame]:
     found = sequence(folder).frames
     chosen = choose_frames(asked.frames, [f.number for f in found], str(folder))
     return [f for f in found if f.number in set(chosen)]
@@ -94,7 +94,7 @@ def _look(asked: VolumeSettings, automatic: str) -> Look:
     return changed(named_look(automatic if asked.look == "auto" else asked.look, asked.up), asked.optics)
 
 
-def _survey(frames: list[Frame], reader: GridReader, progress: Progress) -> tuple[np.ndarray, float]:
+def _survey(frames: list[VdbFrame], reader: GridReader, progress: Progress) -> tuple[np.ndarray, float]:
     """(2, 3) box around all matter of all frames, world units, and the largest flame.
 
     Raises:

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb import Frame, sequence
+from neuprim.core.io.vdb import VdbFrame, sequence
 from neuprim.core.volumes.truth import DensityTruth, TruthFrame
+from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.compare import RESOLUTION, extinction_on
-from neuprim.tasks.dynamic.volume.shoot import Shoot
 
 __all__ = ["VolumeTruth"]
 
@@ -29,26 +29,26 @@ class VolumeTruth(DensityTruth):
 
     resolution = RESOLUTION
 
-    def __init__(self, shoot: Shoot, path: Path | None = None) -> None:
-        self.shoot, self.bounds = shoot, torch.from_numpy(shoot.bounds).double()
-        first, last = shoot.frames[0].number, shoot.frames[-1].number
+    def __init__(self, capture: Capture, path: Path | None = None) -> None:
+        self.capture, self.bounds = capture, torch.from_numpy(capture.bounds).double()
+        first, last = capture.frames[0].number, capture.frames[-1].number
         if path is None:
-            found = list(shoot.frames)
+            found = list(capture.frames)
         elif path.is_dir():
             found = [frame for frame in sequence(path).frames if first <= frame.number <= last]
             if not found:
                 raise DataError(f"{path}: no frame from {first} to {last}, which are the scene's")
         else:
             number = re.findall(r"[0-9]{1,18}", path.stem)  # as in a folder, the last one counts
-            found = [Frame(int(number[-1]) if number else -1, path)]
+            found = [VdbFrame(int(number[-1]) if number else -1, path)]
         self._files = found
         self.frames = [self._named(frame, first, last) for frame in found]
 
     @staticmethod
-    def _named(frame: Frame, first: int, last: int) -> TruthFrame:
+    def _named(frame: VdbFrame, first: int, last: int) -> TruthFrame:
         inside = first <= frame.number <= last
         times = {"time": torch.tensor((frame.number - first) / max(last - first, 1))} if inside else {}
         return TruthFrame(frame.path.name, times)
 
     def grid(self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int]) -> Tensor:
-        return torch.from_numpy(extinction_on(self.shoot.medium(self._files[frame]), scene_from_index, shape))
+        return torch.from_numpy(extinction_on(self.capture.medium(self._files[frame]), scene_from_index, shape))

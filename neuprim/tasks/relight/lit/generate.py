@@ -34,7 +34,7 @@ from neuprim.core.io.images import write_exr
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.rays import bands, pixel_means
 from neuprim.scenes.settings import check_names, check_whole, settings_key
-from neuprim.tasks.relight.lit.rig import DISTANCE, Shot, splits
+from neuprim.tasks.relight.lit.rig import DISTANCE, LitView, splits
 from neuprim.tasks.relight.lit.scene import RADIUS, solids
 from neuprim.tasks.relight.lit.shading import shade
 from neuprim.tasks.relight.measure import CLASSES
@@ -135,18 +135,18 @@ def picture(scene: Scene, pose: NDArray[np.float64], light: NDArray[np.float64],
     return Picture(rgba, unshadowed, classes)
 
 
-def _files(shot: Shot, folder: Path) -> Iterator[Path]:
-    yield folder / f"{shot.name}.exr"
-    yield folder / f"{shot.name}_unshadowed.exr"
-    yield folder / f"{shot.name}_classes.png"
-    if shot.near_light is not None:
-        yield folder / f"{shot.name}_nearest.exr"
+def _files(view: LitView, folder: Path) -> Iterator[Path]:
+    yield folder / f"{view.name}.exr"
+    yield folder / f"{view.name}_unshadowed.exr"
+    yield folder / f"{view.name}_classes.png"
+    if view.near_light is not None:
+        yield folder / f"{view.name}_nearest.exr"
 
 
 def _complete(folder: Path, settings: LitSettings) -> bool:
-    shots = splits(settings.train_views, settings.test_views)
-    files = (file for split in shots for shot in shots[split] for file in _files(shot, folder / split))
-    return all((folder / f"transforms_{split}.json").is_file() for split in shots) and all(file.is_file() for file in files)
+    views = splits(settings.train_views, settings.test_views)
+    files = (file for split in views for view in views[split] for file in _files(view, folder / split))
+    return all((folder / f"transforms_{split}.json").is_file() for split in views) and all(file.is_file() for file in files)
 
 
 def _write(settings: LitSettings, folder: Path, progress: Progress) -> None:
@@ -155,30 +155,30 @@ def _write(settings: LitSettings, folder: Path, progress: Progress) -> None:
     text = f"lit_solids: drawing {settings.size}x{settings.size} images"
     if scene.engine != "embree":
         text += " (without embreex, which would be faster)"
-    shots = splits(settings.train_views, settings.test_views)
-    for split, mine in shots.items():
+    views = splits(settings.train_views, settings.test_views)
+    for split, mine in views.items():
         (folder / split).mkdir()
         layout = {
             "camera_angle_x": FIELD_OF_VIEW,
             "camera_near": DISTANCE[0] - 1.5,
             "camera_far": DISTANCE[1] + 1.5,
-            "frames": [_frame(split, shot) for shot in mine],
+            "frames": [_frame(split, view) for view in mine],
         }
         (folder / f"transforms_{split}.json").write_text(json.dumps(layout, indent=1), encoding="utf-8")
 
-    def draw(job: tuple[str, Shot]) -> None:
-        split, shot = job
-        pose = camera_to_world(shot.camera)
-        taken = picture(scene, pose, shot.light, settings.size, settings.supersampling)
-        file, unshadowed, classes, *nearest_light = _files(shot, folder / split)
+    def draw(job: tuple[str, LitView]) -> None:
+        split, view = job
+        pose = camera_to_world(view.camera)
+        taken = picture(scene, pose, view.light, settings.size, settings.supersampling)
+        file, unshadowed, classes, *nearest_light = _files(view, folder / split)
         write_exr(file, torch.from_numpy(taken.rgba), half=True)
         write_exr(unshadowed, torch.from_numpy(taken.unshadowed), half=True)
         Image.fromarray(taken.classes).save(classes)
         for path in nearest_light:
-            assert shot.near_light is not None
-            write_exr(path, torch.from_numpy(picture(scene, pose, shot.near_light, settings.size, settings.supersampling).rgba), half=True)
+            assert view.near_light is not None
+            write_exr(path, torch.from_numpy(picture(scene, pose, view.near_light, settings.size, settings.supersampling).rgba), half=True)
 
-    jobs = [(split, shot) for split, mine in shots.items() for shot in mine]
+    jobs = [(split, view) for split, mine in views.items() for view in mine]
     pool = ThreadPoolExecutor(min(4, os.cpu_count() or 1))
     try:
         for done, _ in enumerate(pool.map(draw, jobs), start=1):
@@ -187,11 +187,11 @@ def _write(settings: LitSettings, folder: Path, progress: Progress) -> None:
         pool.shutdown(cancel_futures=True)  # on an interrupt, wait for the running images only
 
 
-def _frame(split: str, shot: Shot) -> dict[str, Any]:
+def _frame(split: str, view: LitView) -> dict[str, Any]:
     return {
-        "file_path": f"./{split}/{shot.name}",
+        "file_path": f"./{split}/{view.name}",
         "file_ext": ".exr",
-        "transform_matrix": camera_to_world(shot.camera).tolist(),
-        "pl_pos": shot.light.tolist(),
+        "transform_matrix": camera_to_world(view.camera).tolist(),
+        "pl_pos": view.light.tolist(),
         "pl_intensity": [INTENSITY] * 3,
     }

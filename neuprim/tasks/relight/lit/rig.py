@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CIRCLE_FRAMES", "DISTANCE", "NEAR_LIGHTS", "PARTS", "Shot", "splits"]
+__all__ = ["CIRCLE_FRAMES", "DISTANCE", "NEAR_LIGHTS", "PARTS", "LitView", "splits"]
 
 DISTANCE = (4.0, 5.0)
 CAMERA_POLAR = math.radians(75.0)
@@ -32,12 +32,12 @@ NEAR_LIGHTS = 25
 
 
 @dataclass(frozen=True)
-class Shot:
+class LitView:
     """One image to take.
 
     Attributes:
         camera, light: (3,) float64 positions, scene units.
-        near_light: (3,) the one of the baseline's lights in the direction nearest to the light's; test shots only.
+        near_light: (3,) the one of the baseline's lights in the direction nearest to the light's; test views only.
     """
 
     name: str
@@ -46,11 +46,11 @@ class Shot:
     near_light: NDArray[np.float64] | None = None
 
 
-def splits(train_views: int, test_views: int) -> dict[str, list[Shot]]:
-    """All shots by split: "train", "test", "circle"."""
+def splits(train_views: int, test_views: int) -> dict[str, list[LitView]]:
+    """All views by split: "train", "test", "circle"."""
     digits = max(4, len(str(train_views)))
     cameras, lights = _draw(1, train_views)
-    train = [Shot(f"r_{i:0{digits}d}", cameras[i], lights[i]) for i in range(train_views)]
+    train = [LitView(f"r_{i:0{digits}d}", cameras[i], lights[i]) for i in range(train_views)]
     known = lights[:NEAR_LIGHTS]
     new_cameras, new_lights = _draw(2, test_views)
     # The baseline's own lights are no test of it, so seen ones come from the rest where there is one.
@@ -63,11 +63,11 @@ def splits(train_views: int, test_views: int) -> dict[str, list[Shot]]:
             seen = first + i * (train_views - first) // max(counts[part], 1)
             camera = cameras[seen] if name == "new_light" else new_cameras[fresh]
             light = lights[seen] if name == "new_view" else new_lights[fresh]
-            test.append(Shot(f"{name}_{i:0{max(2, len(str(test_views)) - 1)}d}", camera, light, _nearest(known, light)))
+            test.append(LitView(f"{name}_{i:0{max(2, len(str(test_views)) - 1)}d}", camera, light, _nearest(known, light)))
     middle = sum(DISTANCE) / 2
     eye = middle * _direction(math.cos(math.radians(58.0)), -1.1)
     turns = [2 * math.pi * i / CIRCLE_FRAMES for i in range(CIRCLE_FRAMES)]
-    circle = [Shot(f"light_{i:02d}", eye, middle * _direction(math.cos(math.radians(45.0)), turn)) for i, turn in enumerate(turns)]
+    circle = [LitView(f"light_{i:02d}", eye, middle * _direction(math.cos(math.radians(45.0)), turn)) for i, turn in enumerate(turns)]
     return {"train": train, "test": test, "circle": circle}
 
 

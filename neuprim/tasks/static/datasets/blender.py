@@ -18,7 +18,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.data.common import every_nth, find_image, missing_files, posed_images, unique_names
 from neuprim.core.data.records import read_json
 from neuprim.core.data.settings import Setting, data_folder, read_settings, text
-from neuprim.core.data.views import Frame
+from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import image_info
 from neuprim.core.task import SceneContext
@@ -55,7 +55,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     return posed_images(str(folder), folder.resolve().name, train, test, values, context, up=torch.tensor([0.0, 0.0, 1.0]))
 
 
-def _read_split(folder: Path, split: str) -> list[Frame]:
+def _read_split(folder: Path, split: str) -> list[ImageFrame]:
     path = folder / f"transforms_{split}.json"
     document = read_json(path)
     records = list(document.objects("frames"))
@@ -64,7 +64,7 @@ def _read_split(folder: Path, split: str) -> list[Frame]:
     absent = [t for t, f in zip(texts, files, strict=True) if f is None]
     if absent:
         raise missing_files(str(path), absent)
-    frames: list[Frame] = []
+    frames: list[ImageFrame] = []
     for record, file, name in zip(records, files, unique_names(texts, str(path)), strict=True):
         assert file is not None  # listed above otherwise
         info = image_info(file)
@@ -76,5 +76,5 @@ def _read_split(folder: Path, split: str) -> list[Frame]:
         focal = 0.5 * info.width / math.tan(0.5 * angle)
         viewmat = opengl_to_viewmat(record.matrix("transform_matrix"))
         camera = Camera(viewmat, focal, focal, 0.5 * info.width, 0.5 * info.height, info.width, info.height)
-        frames.append(Frame(name, file, camera.validate(f"{record.where}.transform_matrix"), info))
+        frames.append(ImageFrame(name, file, camera.validate(f"{record.where}.transform_matrix"), info))
     return frames

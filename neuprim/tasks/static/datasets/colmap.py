@@ -22,7 +22,7 @@ from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.common import every_nth, missing_files, posed_images, unique_names
 from neuprim.core.data.distortion import Distortion
 from neuprim.core.data.settings import count, data_folder, flag, read_settings, text
-from neuprim.core.data.views import Frame
+from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.io.images import ImageInfo, image_info
 from neuprim.core.task import SceneContext
@@ -91,7 +91,7 @@ def _parameter_count(model: int) -> int:
         return -1
 
 
-def _read_frames(model: Path, folder: Path, reconstruction: Any, skip_missing: bool) -> list[Frame]:
+def _read_frames(model: Path, folder: Path, reconstruction: Any, skip_missing: bool) -> list[ImageFrame]:
     images = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
     if not images:
         raise DataError(f"{model}: has no images with a pose; expected at least two")
@@ -109,7 +109,7 @@ def _read_frames(model: Path, folder: Path, reconstruction: Any, skip_missing: b
         camera = _camera(where, image, file, info)
         lens = reconstruction.cameras[image.camera_id]
         distortion = None if lens.model_name in _PINHOLE else _Lens.of(lens, info)
-        frames.append(Frame(name, file, camera.validate(where), info, None, distortion))
+        frames.append(ImageFrame(name, file, camera.validate(where), info, None, distortion))
     return frames
 
 

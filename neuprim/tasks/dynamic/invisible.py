@@ -11,12 +11,12 @@ from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 
-__all__ = ["dead_fraction"]
+__all__ = ["invisible_fraction"]
 
 _FAINT = 1.0 / 255.0
 
 
-def dead_fraction(model: Primitives, times: Sequence[Tensor]) -> float:
+def invisible_fraction(model: Primitives, times: Sequence[Tensor]) -> float:
     """Share of primitives whose opacity along none of their axes reaches 1/255 at any of these times.
 
     The chord along axis j through the centre has half length s_j, so that I = (2 s_j/m) (b2 + sum_k w2_k cos(omega0 b1_k)

@@ -25,14 +25,14 @@ from neuprim.core.cameras import Camera
 from neuprim.core.errors import DataError
 from neuprim.core.io import images
 from neuprim.core.io.files import write_json
-from neuprim.core.io.vdb import Frame
+from neuprim.core.io.vdb import VdbFrame
 from neuprim.tasks.dynamic.volume.grids import GridReader
 from neuprim.tasks.dynamic.volume.march import integrate
 from neuprim.tasks.dynamic.volume.medium import Medium
 from neuprim.tasks.dynamic.volume.normalise import Normalisation
 from neuprim.tasks.dynamic.volume.optics import Look, medium_of
 
-__all__ = ["RENDERER_VERSION", "Shoot"]
+__all__ = ["RENDERER_VERSION", "Capture"]
 
 RENDERER_VERSION = 1
 """Part of the cache's key: to be raised with every change to the march, the optics, the rig or the files' layout."""
@@ -44,7 +44,7 @@ Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class Shoot:
+class Capture:
     """Everything the images depend on.
 
     Attributes:
@@ -54,7 +54,7 @@ class Shoot:
         bounds: (2, 3) box around all matter, scene units.
     """
 
-    frames: Sequence[Frame]
+    frames: Sequence[VdbFrame]
     reader: GridReader
     look: Look
     cameras: Sequence[Camera]
@@ -69,7 +69,7 @@ class Shoot:
         parts = [RENDERER_VERSION, stats, asdict(self.look), dict(self.reader.names), cameras, self.samples, self.normalisation.to_json()]
         return hashlib.sha256(json.dumps(parts, default=_plain).encode()).hexdigest()[:16]
 
-    def medium(self, frame: Frame) -> Medium:
+    def medium(self, frame: VdbFrame) -> Medium:
         """What a frame's file holds, as extinction and radiance; nothing where it lacks the grid that absorbs in the others."""
         grids = self.reader.read(frame.path)
         if self.reader.extinction not in grids:
@@ -79,11 +79,11 @@ class Shoot:
         except DataError as error:
             raise DataError(f"{frame.path}: {error}") from error
 
-    def image(self, folder: Path, frame: Frame, camera: int) -> Path:
+    def image(self, folder: Path, frame: VdbFrame, camera: int) -> Path:
         """File of one image."""
         return folder / f"frame_{frame.number:05d}" / f"cam_{camera:02d}.exr"
 
-    def points(self, folder: Path, frame: Frame) -> Path:
+    def points(self, folder: Path, frame: VdbFrame) -> Path:
         """File of a frame's points: means (M, 3) scene units, colors (M, 3) linear radiance, weight (), the frame's total extinction."""
         return folder / f"frame_{frame.number:05d}" / "points.npz"
 
@@ -118,7 +118,7 @@ class Shoot:
             "normalisation": self.normalisation.to_json(),
         }
 
-    def _take_frame(self, folder: Path, frame: Frame) -> None:
+    def _take_frame(self, folder: Path, frame: VdbFrame) -> None:
         medium = self.medium(frame)
         final = folder / f"frame_{frame.number:05d}"
         folder.mkdir(parents=True, exist_ok=True)
@@ -141,7 +141,7 @@ class Shoot:
         finally:
             shutil.rmtree(draft, ignore_errors=True)
 
-    def _publish(self, draft: Path, final: Path, frame: Frame) -> None:
+    def _publish(self, draft: Path, final: Path, frame: VdbFrame) -> None:
         """Give the draft its name, unless another run was faster: its images are the same, and it may be reading them."""
         done = self.points(final.parent, frame)
         if final.exists() and not done.is_file():  # somebody deleted part of it

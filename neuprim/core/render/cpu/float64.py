@@ -50,20 +50,20 @@ from neuprim.core.render.cpu.layout import (
     XA,
     lane,
 )
-from neuprim.core.render.cpu.turns import TAU, cos_turns, dsinc_turns, sinc_turns
+from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, dsinc_turns, sinc_turns
 
-__all__ = ["DELICATE_SCRATCH", "delicate_chords", "delicate_neurons", "delicate_phase", "delicate_slopes"]
+__all__ = ["FLOAT64_SCRATCH", "chords_float64", "neurons_float64", "phase_float64", "slopes_float64"]
 
 f = np.float32
 # float64 lanes: chord middle and half chord vector in whitened space
 _Q, _V = (lane(0), lane(1), lane(2)), (lane(3), lane(4), lane(5))
 _Q0, _Q1, _Q2 = _Q
 _V0, _V1, _V2 = _V
-DELICATE_SCRATCH = lane(6)
+FLOAT64_SCRATCH = lane(6)
 
 
 @inline
-def delicate_chords(S, X, bounds, y0, y1, tx, ty, n, p, depth_floor, with_mid, backward):  # type: ignore[no-untyped-def]
+def chords_float64(S, X, bounds, y0, y1, tx, ty, n, p, depth_floor, with_mid, backward):  # type: ignore[no-untyped-def]
     """As :func:`~neuprim.core.render.cpu.tiles.chords` from a float64 row ``p``, for the pixels of ``bounds``; lanes n: are padding."""
     at = 0
     for y in range(y0, y1):
@@ -112,7 +112,7 @@ def delicate_chords(S, X, bounds, y0, y1, tx, ty, n, p, depth_floor, with_mid, b
 
 
 @inline
-def delicate_phase(X, k, p, o):  # type: ignore[no-untyped-def]
+def phase_float64(X, k, p, o):  # type: ignore[no-untyped-def]
     """Phase at the chord's middle of the unit at ``o`` of a float64 row, reduced to half a turn."""
     u = X[k + _Q0] * p[o + WX] + X[k + _Q1] * p[o + WY] + X[k + _Q2] * p[o + WZ] + p[o + PHASE]
     return f(u - np.rint(u))
@@ -128,7 +128,7 @@ def _reduced(X, k, p, o):  # type: ignore[no-untyped-def]
 
 
 @inline
-def delicate_neurons(S, X, n, p, neurons):  # type: ignore[no-untyped-def]
+def neurons_float64(S, X, n, p, neurons):  # type: ignore[no-untyped-def]
     """FIELD += w2 cos(phase at the middle) sinc(half its change) of every neuron of a float64 row."""
     for m in range(neurons):
         o = NEURONS + PER_NEURON * m
@@ -141,7 +141,7 @@ def delicate_neurons(S, X, n, p, neurons):  # type: ignore[no-untyped-def]
 
 
 @inline
-def delicate_slopes(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
+def slopes_float64(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
     """The same, and the three products per neuron that the gradients need."""
     for m in range(neurons):
         o = NEURONS + PER_NEURON * m

@@ -70,7 +70,7 @@ def compiling(backend: str | None) -> Iterator[Compiling]:
     process = None
     if backend is not None and not compiled(backend) and sys.executable:
         quiet = subprocess.DEVNULL
-        process = subprocess.Popen([sys.executable, "-m", "neuprim.runs.warm", backend], stdin=quiet, stdout=quiet, stderr=quiet)
+        process = subprocess.Popen([sys.executable, "-m", "neuprim.runs.compile", backend], stdin=quiet, stdout=quiet, stderr=quiet)
     started = Compiling(process)
     try:
         yield started

@@ -1,6 +1,6 @@
 """Colours per lane, for :class:`~neuprim.core.model.forms.RayNet`: the pixel stage of ``colour_net``, forward and backward.
 
-Every function works on the lanes of one (tile, primitive) pair, after the density's chord stage. TINT holds the colours before
+Every function works on the lanes of one (tile, primitive) pair, after the density's chord stage. RAY_COLOUR holds the colours before
 max(0, .), so that forward and backward clamp alike. Three channels have fused loops over constant offsets; other counts, and
 primitives drawn in float64, go unit by unit through ``V``.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import inline
-from neuprim.core.render.cpu.delicate import delicate_phase
+from neuprim.core.render.cpu.float64 import phase_float64
 from neuprim.core.render.cpu.layout import (
     ALPHA,
     BEHIND,
@@ -32,22 +32,30 @@ from neuprim.core.render.cpu.layout import (
     QX,
     QY,
     QZ,
+    RAY_COLOUR,
     SLOPE,
     T_,
     TILE,
-    TINT,
     WX,
     WY,
     WZ,
 )
-from neuprim.core.render.cpu.turns import TAU, cos_turns, sinc_turns
+from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns
 
-__all__ = ["add_tints", "composite_rgb_tints", "tint_gradient", "tint_gradient_row", "tints", "uncomposite_rgb_tints", "weigh_tints"]
+__all__ = [
+    "add_ray_colours",
+    "composite_rgb_ray_colours",
+    "ray_colour_gradient",
+    "ray_colour_gradient_row",
+    "ray_colours",
+    "uncomposite_rgb_ray_colours",
+    "weigh_ray_colours",
+]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(TILE).astype(np.float32)
-_RGB_GRADIENT = TINT + 3 * LANES  # dL/d TINT of three channels; in general it follows the C arrays of TINT
+_RGB_GRADIENT = RAY_COLOUR + 3 * LANES  # dL/d RAY_COLOUR of three channels; in general it follows the C arrays of RAY_COLOUR
 
 
 # ---------------------------------------------------------------- the network
@@ -55,7 +63,7 @@ _RGB_GRADIENT = TINT + 3 * LANES  # dL/d TINT of three channels; in general it f
 
 @inline
 def _rgb(S, n, p, o, o2):  # type: ignore[no-untyped-def]
-    """TINT += output of the two units at ``o`` and ``o2``, three channels."""
+    """RAY_COLOUR += output of the two units at ``o`` and ``o2``, three channels."""
     ax, ay, az, ab, a0, a1, a2 = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + NET_OUT], p[o + NET_OUT + 1], p[o + NET_OUT + 2]
     bx, by, bz, bb, b0, b1, b2 = (
         p[o2 + WX],
@@ -73,9 +81,9 @@ def _rgb(S, n, p, o, o2):  # type: ignore[no-untyped-def]
         u1 = qx * bx + qy * by + qz * bz + bb
         r1 = u1 - np.rint(u1)
         c, c1 = cos_turns(r * r), cos_turns(r1 * r1)
-        S[TINT + k] += c * a0 + c1 * b0
-        S[TINT + LANES + k] += c * a1 + c1 * b1
-        S[TINT + 2 * LANES + k] += c * a2 + c1 * b2
+        S[RAY_COLOUR + k] += c * a0 + c1 * b0
+        S[RAY_COLOUR + LANES + k] += c * a1 + c1 * b1
+        S[RAY_COLOUR + 2 * LANES + k] += c * a2 + c1 * b2
 
 
 @inline
@@ -103,9 +111,9 @@ def _rgb_with_slopes(S, V0, V1, n, p, o, o2):  # type: ignore[no-untyped-def]
         V0[NET_SIN + k] = -TAU * TAU * r * sinc_turns(z)
         V1[NET_COS + k] = c1
         V1[NET_SIN + k] = -TAU * TAU * r1 * sinc_turns(z1)
-        S[TINT + k] += c * a0 + c1 * b0
-        S[TINT + LANES + k] += c * a1 + c1 * b1
-        S[TINT + 2 * LANES + k] += c * a2 + c1 * b2
+        S[RAY_COLOUR + k] += c * a0 + c1 * b0
+        S[RAY_COLOUR + LANES + k] += c * a1 + c1 * b1
+        S[RAY_COLOUR + 2 * LANES + k] += c * a2 + c1 * b2
 
 
 @inline
@@ -121,10 +129,10 @@ def _waves(S, V0, n, p, o):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _delicate_waves(D, V0, n, p, o):  # type: ignore[no-untyped-def]
+def _waves_float64(D, V0, n, p, o):  # type: ignore[no-untyped-def]
     """The same from a float64 row and float64 chord middles."""
     for k in range(n):
-        r = delicate_phase(D, k, p, o)
+        r = phase_float64(D, k, p, o)
         z = r * r
         V0[NET_COS + k] = cos_turns(z)
         V0[NET_SIN + k] = -TAU * TAU * r * sinc_turns(z)
@@ -132,26 +140,26 @@ def _delicate_waves(D, V0, n, p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _mix(S, V, n, p, hidden, C):  # type: ignore[no-untyped-def]
-    """TINT += output of all units, any channels, from their cos in ``V``."""
+    """RAY_COLOUR += output of all units, any channels, from their cos in ``V``."""
     for c in range(C):
-        tint = S[TINT + c * LANES :]
+        colour = S[RAY_COLOUR + c * LANES :]
         for j in range(hidden):
             cosine, weight = V[j, NET_COS:], p[(NET_OUT + C) * j + NET_OUT + c]
             for k in range(n):
-                tint[k] += cosine[k] * weight
+                colour[k] += cosine[k] * weight
 
 
 @inline
-def tints(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-untyped-def]
-    """TINT of ``n`` lanes of primitive ``i``; with ``slopes`` also what :func:`tint_gradient` needs, in ``V``."""
+def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-untyped-def]
+    """RAY_COLOUR of ``n`` lanes of primitive ``i``; with ``slopes`` also what :func:`ray_colour_gradient` needs, in ``V``."""
     C, p = base.shape[0], net.rows[i]
     for c in range(C):
-        tint = S[TINT + c * LANES :]
+        colour = S[RAY_COLOUR + c * LANES :]
         for k in range(n):
-            tint[k] = base[c]
+            colour[k] = base[c]
     if slots[i] >= 0:
         for j in range(net.hidden):
-            _delicate_waves(D, V[j], n, net.wide[slots[i]], (NET_OUT + C) * j)
+            _waves_float64(D, V[j], n, net.wide[slots[i]], (NET_OUT + C) * j)
         _mix(S, V, n, p, net.hidden, C)
     elif C == 3:
         for j in range(0, net.hidden, 2):
@@ -207,14 +215,14 @@ def _unit_gradient(S, V0, n, p, o, C, out):  # type: ignore[no-untyped-def]
     """Gradients of one unit, any channels, and its share of dL/dQ. Uses up the unit's cos in ``V0``."""
     wx, wy, wz = p[o + WX], p[o + WY], p[o + WZ]
     for c in range(C):
-        gradient, total = S[TINT + (C + c) * LANES :], f(0)
+        gradient, total = S[RAY_COLOUR + (C + c) * LANES :], f(0)
         for k in range(n):
             total += gradient[k] * V0[NET_COS + k]
         out[o + NET_OUT + c] = total
     for k in range(n):
         V0[NET_COS + k] = f(0)
     for c in range(C):
-        gradient, weight = S[TINT + (C + c) * LANES :], p[o + NET_OUT + c]
+        gradient, weight = S[RAY_COLOUR + (C + c) * LANES :], p[o + NET_OUT + c]
         for k in range(n):
             V0[NET_COS + k] += gradient[k] * weight
     s0, s1, s2, s3 = f(0), f(0), f(0), f(0)
@@ -231,11 +239,11 @@ def _unit_gradient(S, V0, n, p, o, C, out):  # type: ignore[no-untyped-def]
 
 
 @inline
-def tint_gradient(S, V, n, i, net, C, out, base_at):  # type: ignore[no-untyped-def]
-    """From dL/d TINT of every lane to the gradient row: base at ``base_at``, then the units; adds to dL/dQ."""
+def ray_colour_gradient(S, V, n, i, net, C, out, base_at):  # type: ignore[no-untyped-def]
+    """From dL/d RAY_COLOUR of every lane to the gradient row: base at ``base_at``, then the units; adds to dL/dQ."""
     p, row = net.rows[i], out[base_at + C :]
     for c in range(C):
-        gradient, total = S[TINT + (C + c) * LANES :], f(0)
+        gradient, total = S[RAY_COLOUR + (C + c) * LANES :], f(0)
         for k in range(n):
             total += gradient[k]
         out[base_at + c] = total
@@ -252,8 +260,8 @@ def tint_gradient(S, V, n, i, net, C, out, base_at):  # type: ignore[no-untyped-
 
 
 @inline
-def composite_rgb_tints(state, S, base, at, a, b, tmin, rank):  # type: ignore[no-untyped-def]
-    """Three channels: colour += alpha T max(0, TINT), then T; a pixel is live while T >= T_min."""
+def composite_rgb_ray_colours(state, S, base, at, a, b, tmin, rank):  # type: ignore[no-untyped-def]
+    """Three channels: colour += alpha T max(0, RAY_COLOUR), then T; a pixel is live while T >= T_min."""
     a, b = f(a), f(b)
     for k in range(TILE):
         step, T = _STEPS[k], state[index(base + k + T_)]
@@ -262,23 +270,23 @@ def composite_rgb_tints(state, S, base, at, a, b, tmin, rank):  # type: ignore[n
         weight = alpha * T
         state[index(base + k + T_)] = T - weight
         state[index(base + k + LAST)] = rank if alpha > f(0) else state[index(base + k + LAST)]
-        state[index(base + k + COLOR)] += weight * max(S[index(at + k + TINT)], f(0))
-        state[index(base + k + COLOR + PIXELS)] += weight * max(S[index(at + k + TINT + LANES)], f(0))
-        state[index(base + k + COLOR + 2 * PIXELS)] += weight * max(S[index(at + k + TINT + 2 * LANES)], f(0))
+        state[index(base + k + COLOR)] += weight * max(S[index(at + k + RAY_COLOUR)], f(0))
+        state[index(base + k + COLOR + PIXELS)] += weight * max(S[index(at + k + RAY_COLOUR + LANES)], f(0))
+        state[index(base + k + COLOR + 2 * PIXELS)] += weight * max(S[index(at + k + RAY_COLOUR + 2 * LANES)], f(0))
 
 
 @inline
-def add_tints(state, S, base, at, w, C):  # type: ignore[no-untyped-def]
-    """colour += w max(0, TINT), any channels."""
+def add_ray_colours(state, S, base, at, w, C):  # type: ignore[no-untyped-def]
+    """colour += w max(0, RAY_COLOUR), any channels."""
     for c in range(C):
-        st, tint = state[COLOR + c * PIXELS + base :], S[TINT + c * LANES + at :]
+        st, colour = state[COLOR + c * PIXELS + base :], S[RAY_COLOUR + c * LANES + at :]
         for k in range(TILE):
-            st[k] += w[k] * max(tint[k], f(0))
+            st[k] += w[k] * max(colour[k], f(0))
 
 
 @inline
-def uncomposite_rgb_tints(state, S, base, at, sums, a, b, rank):  # type: ignore[no-untyped-def]
-    """Three channels: recover T before this primitive, dL/d(2 FIELD HALF) and dL/d TINT, and the two tallies."""
+def uncomposite_rgb_ray_colours(state, S, base, at, sums, a, b, rank):  # type: ignore[no-untyped-def]
+    """Three channels: recover T before this primitive, dL/d(2 FIELD HALF) and dL/d RAY_COLOUR, and the two tallies."""
     a, b = f(a), f(b)
     for k in range(TILE):
         step, alpha = _STEPS[k], S[index(at + k + ALPHA)]
@@ -289,7 +297,7 @@ def uncomposite_rgb_tints(state, S, base, at, sums, a, b, rank):  # type: ignore
         g0 = state[index(base + k + G_COLOR)]
         g1 = state[index(base + k + G_COLOR + PIXELS)]
         g2 = state[index(base + k + G_COLOR + 2 * PIXELS)]
-        c0, c1, c2 = S[index(at + k + TINT)], S[index(at + k + TINT + LANES)], S[index(at + k + TINT + 2 * LANES)]
+        c0, c1, c2 = S[index(at + k + RAY_COLOUR)], S[index(at + k + RAY_COLOUR + LANES)], S[index(at + k + RAY_COLOUR + 2 * LANES)]
         cg = g0 * max(c0, f(0)) + g1 * max(c1, f(0)) + g2 * max(c2, f(0))
         behind = state[index(base + k + BEHIND)]
         before = state[index(base + k + T_)] * over
@@ -310,20 +318,24 @@ def uncomposite_rgb_tints(state, S, base, at, sums, a, b, rank):  # type: ignore
 
 
 @inline
-def weigh_tints(state, S, base, at, cg, C):  # type: ignore[no-untyped-def]
-    """cg += sum over channels of max(0, TINT) dL/d colour."""
+def weigh_ray_colours(state, S, base, at, cg, C):  # type: ignore[no-untyped-def]
+    """cg += sum over channels of max(0, RAY_COLOUR) dL/d colour."""
     for c in range(C):
-        st, tint = state[G_COLOR + c * PIXELS + base :], S[TINT + c * LANES + at :]
+        st, colour = state[G_COLOR + c * PIXELS + base :], S[RAY_COLOUR + c * LANES + at :]
         for k in range(TILE):
-            cg[k] += max(tint[k], f(0)) * st[k]
+            cg[k] += max(colour[k], f(0)) * st[k]
 
 
 @inline
-def tint_gradient_row(state, S, base, at, w, a, b, C):  # type: ignore[no-untyped-def]
-    """dL/d TINT = w dL/d colour where the colour is not clamped, any channels; other rows' lanes keep theirs."""
+def ray_colour_gradient_row(state, S, base, at, w, a, b, C):  # type: ignore[no-untyped-def]
+    """dL/d RAY_COLOUR = w dL/d colour where the colour is not clamped, any channels; other rows' lanes keep theirs."""
     a, b = f(a), f(b)
     for c in range(C):
-        st, tint, gradient = state[G_COLOR + c * PIXELS + base :], S[TINT + c * LANES + at :], S[TINT + (C + c) * LANES + at :]
+        st, colour, gradient = (
+            state[G_COLOR + c * PIXELS + base :],
+            S[RAY_COLOUR + c * LANES + at :],
+            S[RAY_COLOUR + (C + c) * LANES + at :],
+        )
         for k in range(TILE):
-            g = w[k] * st[k] if tint[k] >= f(0) else f(0)
+            g = w[k] * st[k] if colour[k] >= f(0) else f(0)
             gradient[k] = g if (_STEPS[k] >= a) & (_STEPS[k] < b) else gradient[k]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, check_viewmat
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, NonFiniteError, nearest
+from neuprim.core.model.densities.cosine import amplified
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
@@ -71,6 +72,8 @@ def rasterize(
     height: int,
     *,
     omega0: float = 30.0,
+    edge: int = 0,
+    log_gain: Tensor | None = None,
     backgrounds: Tensor | None = None,
     **settings: Any,
 ) -> Rasterized:
@@ -78,7 +81,7 @@ def rasterize(
 
     Inside its ellipsoid, of semi-axes ``s = exp(log_scales)``, a primitive has the density (1 / scene unit)
 
-        sigma(x) = f((x - mu) / m) / m,   m = max(s),
+        sigma(x) = g (1 - |y|^2)^p f((x - mu) / m) / m,   m = max(s),   y = diag(1 / s) R^T (x - mu),   g = exp(log_gain),
         f(u) = sum_k w2_k cos(omega0 (W1_k . u + b1_k)) + b2
 
     and outside none. With I the integral of sigma along a pixel's ray, in closed form, and primitives sorted front to back,
@@ -104,10 +107,12 @@ def rasterize(
             not be square, nor the principal point central.
         width, height: size of every image in pixels.
         omega0: factor on the whole phase.
+        edge: p; 0 is the hard edge of the paper's primitive, 1 and 2 are soft (:mod:`neuprim.core.model.edge`).
+        log_gain: (N, 1) or (N,); None: g = 1. Beyond +-20 it counts as that and has no gradient.
         backgrounds: (channels,) or (C, channels); None is black.
         **settings: fields of :class:`neuprim.core.settings.RenderSettings`: ``backend``, ``near``, ``depth``, ``alpha_min``, …
 
-    The eight primitive tensors share one dtype, float32 or float64; images have that dtype too. The cpu backend computes
+    The primitive tensors share one dtype, float32 or float64; images have that dtype too. The cpu backend computes
     pixels in float32 even so, the reference everything in float64. All tensors live on the CPU.
 
     Returns:
@@ -121,8 +126,10 @@ def rasterize(
         BackendUnavailable: ``Ks`` requires a gradient, and the backend, or any that "auto" may choose, does not compute it.
     """
     primitives = {"means": means, "log_scales": log_scales, "quats": quats, "W1": W1, "b1": b1, "w2": w2, "b2": b2, "colors": colors}
+    if log_gain is not None:
+        primitives["log_gain"] = log_gain
     knobs = _settings(settings)
-    count, channels = _check_primitives(primitives, omega0)
+    count, channels = _check_primitives(primitives, omega0, edge)
     cameras = _check_cameras(viewmats, Ks, width, height)
     views = len(viewmats)
     if colors.dim() == 3 and len(colors) != views:
@@ -133,7 +140,8 @@ def rasterize(
         raise BackendUnavailable(
             f'rasterize: Ks requires a gradient, which backend="{knobs.backend}" does not compute; pass {able} or Ks.detach()'
         )
-    geometry, density = Geometry(means, log_scales, quats), Cosine(W1, b1, w2, b2, float(omega0))
+    w2, b2 = amplified(w2, b2, log_gain)
+    geometry, density = Geometry(means, log_scales, quats), Cosine(W1, b1, w2, b2, float(omega0), edge)
     palettes = list(colors.unbind()) if colors.dim() == 3 else [colors] * views
     frames = [
         render_lowered(Lowered(geometry, density, Constant(palette)), camera, knobs, behind)
@@ -180,19 +188,21 @@ def _check_tensor(name: str, value: Any) -> None:
         raise DataError(f"rasterize: {name} has {fault}")
 
 
-def _check_primitives(t: dict[str, Tensor], omega0: float) -> tuple[int, int]:
+def _check_primitives(t: dict[str, Tensor], omega0: float, edge: int) -> tuple[int, int]:
     """(N, channels) of tensors that fit together."""
     for name, value in t.items():
         _check_tensor(name, value)
         if value.dtype != t["means"].dtype:
             raise _wrong(name, f"dtype {value.dtype}", f"{t['means'].dtype}, as means has")
     sizes: Sizes = {}
-    density = Cosine(t["W1"], t["b1"], t["w2"], t["b2"], omega0)
+    density = Cosine(t["W1"], t["b1"], t["w2"], t["b2"], omega0, edge)
     for form in (Geometry(t["means"], t["log_scales"], t["quats"]), density):
         fault = form.fault(sizes)
         if fault is not None:
             raise DataError(f"rasterize: {fault}")
     n, colors = sizes["N"][0], tuple(t["colors"].shape)
+    if "log_gain" in t and tuple(t["log_gain"].shape) not in ((n, 1), (n,)):
+        raise _wrong("log_gain", f"shape {tuple(t['log_gain'].shape)}", f"({n}, 1) or ({n},), as means has N={n}")
     if len(colors) not in (2, 3) or colors[-2] != n or colors[-1] < 1:
         raise _wrong("colors", f"shape {colors}", f"(N, channels) or (C, N, channels) with N={n} as in means and channels >= 1")
     for name, row, numbers in _non_finite(t):

@@ -29,6 +29,21 @@ def test_static_with_a_gaussian_density(check: Check) -> None:
     check()
 
 
+@checks(STATIC, model={"density": {"edge": 1, "gain": True}, "sh_degree": 0})
+def test_static_with_a_soft_edge(check: Check) -> None:
+    check()
+
+
+@checks(STATIC, model={"density": {"edge": 2, "gain": True, "omega0": 12.0}, "neurons": 0, "sh_degree": 0})
+def test_static_close_to_a_gaussian(check: Check) -> None:
+    check()
+
+
+@checks(DYNAMIC, preset="paper", model={"density": {"time": "phase+offset+window+motion", "edge": 2, "gain": True}})
+def test_dynamic_with_a_soft_edge(check: Check) -> None:
+    check()
+
+
 @checks(DYNAMIC)
 def test_dynamic(check: Check) -> None:
     check()

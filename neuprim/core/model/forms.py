@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import FormError
+from neuprim.core.model.edge import EDGES, chord_integral, sinc
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.tensors import MOST_UNITS, Shaped, Shapes, Sizes, function_fault, labelled, number_fault
@@ -31,24 +32,20 @@ __all__ = [
 ]
 
 
-def _sinc(z: Tensor) -> Tensor:
-    small = z.abs() < 1e-3
-    safe = torch.where(small, torch.ones_like(z), z)
-    z2 = z * z
-    series = 1 - z2 / 6 * (1 - z2 / 20 * (1 - z2 / 42))
-    return torch.where(small, series, safe.sin() / safe)
-
-
 # ---------------------------------------------------------------- closed forms of density
 
 
 @dataclass(frozen=True)
 class Cosine(Shaped):
-    """f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2, world density f/m (method: equation 10 of the paper).
+    """f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2, world density (1 - |y|^2)^p f/m inside the ellipsoid |y| < 1.
+
+    p = 0 is equation 10 of the paper; p = 1 and 2 have a soft edge (:mod:`neuprim.core.model.edge`), and p = 2 with K = 0 is close to a
+    Gaussian.
 
     Attributes:
-        W1: (N, K, 3), b1: (N, K), w2: (N, K), b2: (N,) or (N, 1); K = 0 to :data:`MOST_UNITS`, and K = 0 is a constant density.
+        W1: (N, K, 3), b1: (N, K), w2: (N, K), b2: (N,) or (N, 1); K = 0 to :data:`MOST_UNITS`, and K = 0 is a constant f.
         omega0: multiplies the whole phase.
+        edge: p, 0, 1 or 2.
 
     ``first + second`` is the sum of two densities of the same primitives, see :meth:`__add__`.
     """
@@ -60,8 +57,11 @@ class Cosine(Shaped):
     w2: Tensor
     b2: Tensor
     omega0: float = 30.0
+    edge: int = 0
 
     def fault(self, sizes: Sizes) -> str | None:
+        if type(self.edge) is not int or self.edge not in EDGES:
+            return f"edge has value {self.edge!r}; expected 0, 1 or 2"
         return super().fault(sizes) or labelled("omega0", number_fault(self.omega0))
 
     def __add__(self, other: Cosine) -> Cosine:
@@ -70,7 +70,7 @@ class Cosine(Shaped):
         Both have the first one's omega0 (the second one's if that is 0); frequencies and phases of the other are scaled to it.
 
         Raises:
-            FormError: they are not of the same primitives, or have more than :data:`MOST_UNITS` neurons together.
+            FormError: they are not of the same primitives, have different edges, or more than :data:`MOST_UNITS` neurons together.
         """
         if not isinstance(other, Cosine):
             return NotImplemented
@@ -83,16 +83,18 @@ class Cosine(Shaped):
         neurons = (self.W1.shape[1], other.W1.shape[1])
         if sum(neurons) > MOST_UNITS:
             raise FormError(f"sum of two Cosine forms: {neurons[0]} + {neurons[1]} neurons; expected at most {MOST_UNITS}")
+        if self.edge != other.edge:
+            raise FormError(f"sum of two Cosine forms: edges {self.edge} and {other.edge}; expected the same of both")
         omega0 = self.omega0 or other.omega0
         parts = [(f, f.omega0 / omega0 if f.omega0 != omega0 else 1.0) for f in (self, other)]
         W1 = torch.cat([f.W1 * scale for f, scale in parts], 1)
         b1 = torch.cat([f.b1 * scale for f, scale in parts], 1)
-        return Cosine(W1, b1, torch.cat([self.w2, other.w2], 1), self.b2 + other.b2.reshape(self.b2.shape), omega0)
+        return Cosine(W1, b1, torch.cat([self.w2, other.w2], 1), self.b2 + other.b2.reshape(self.b2.shape), omega0, self.edge)
 
     def rows(self, index: Tensor) -> Cosine:
         """Those of some primitives, (M,) int64, without gradient."""
         W1, b1, w2, b2 = (x.detach()[index] for x in (self.W1, self.b1, self.w2, self.b2))
-        return Cosine(W1, b1, w2, b2, self.omega0)
+        return Cosine(W1, b1, w2, b2, self.omega0, self.edge)
 
     def optical_depth(self, pairs: Pairs) -> Tensor:
         """(M,) float64 integrals of sigma along chords: one (cos, sinc) pair per neuron, whatever their length."""
@@ -100,8 +102,11 @@ class Cosine(Shaped):
         W1 = self.W1.double()[prim]
         phase = self.omega0 * ((W1 * pairs.local[:, None, :]).sum(-1) + self.b1.double()[prim])
         rate = self.omega0 * (W1 * pairs.direction[:, None, :]).sum(-1)
-        waves = (self.w2.double()[prim] * phase.cos() * _sinc(rate * pairs.half[:, None])).sum(-1)
-        return 2 * pairs.half * (self.b2.double().reshape(-1)[prim] + waves)
+        w2, b2, z = self.w2.double()[prim], self.b2.double().reshape(-1)[prim], rate * pairs.half[:, None]
+        if self.edge:
+            return 2 * pairs.half * chord_integral(pairs.support, self.edge, phase, z, w2, b2)
+        waves = (w2 * phase.cos() * sinc(z)).sum(-1)
+        return 2 * pairs.half * (b2 + waves)
 
 
 @dataclass(frozen=True)
@@ -112,6 +117,7 @@ class Opaque(Shaped):
     in scene units and the (M,) chord ends in scene units, and returns the (M,) optical depths, the integral of sigma.
     """
 
+    edge: ClassVar[int] = 0
     line_integral: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
 
     def fault(self, sizes: Sizes) -> str | None:

@@ -25,6 +25,8 @@ class Pairs:
         origin: (M, 3) or (3,) starts of the rays, scene units.
         near, far: (M,) ends of the chords, and middle: (M,) their middles, as ray distances in m.
         m: (M,) scene units.
+        whitened: (M, 3) middles of the chords in whitened space, where the ellipsoids are the unit ball; pace: (M, 3) what a ray distance of
+            1 m moves a point there.
 
     What only code of a plugin needs, in scene units, is computed when it is asked for.
     """
@@ -38,6 +40,8 @@ class Pairs:
     far: Tensor
     middle: Tensor
     m: Tensor
+    whitened: Tensor
+    pace: Tensor
 
     @classmethod
     def of(cls, geometry: Geometry, prim: Tensor, origin: Tensor, direction: Tensor, t0: Tensor, t1: Tensor) -> Pairs:
@@ -45,7 +49,10 @@ class Pairs:
         m = geometry.length_scale.double()[prim]
         middle = (t0 + t1) / 2
         local = (origin + middle[:, None] * direction - geometry.means.double()[prim]) / m[:, None]
-        return cls(prim, direction, local, (t1 - t0) / (2 * m), origin, t0 / m, t1 / m, middle / m, m)
+        axes = (geometry.log_scales.double() - geometry.log_length_scale.double()[:, None]).exp()
+        whiten = geometry.rotations.double()[prim].transpose(1, 2) / axes[prim][:, :, None]
+        whitened, pace = ((whiten @ x[:, :, None])[..., 0] for x in (local, direction))
+        return cls(prim, direction, local, (t1 - t0) / (2 * m), origin, t0 / m, t1 / m, middle / m, m, whitened, pace)
 
     def __len__(self) -> int:
         return len(self.prim)
@@ -59,6 +66,12 @@ class Pairs:
     def ends(self) -> tuple[Tensor, Tensor]:
         """(M,) ray distances t0 and t1 at which the chords start and end, scene units."""
         return self.near * self.m, self.far * self.m
+
+    @property
+    def support(self) -> tuple[Tensor, Tensor, Tensor]:
+        """(M,) each: c0, c1, c2 of 1 - |y|^2 = c0 + c1 u + c2 u^2 along the chords, u in [-1, 1] from their starts to their ends."""
+        step = self.half[:, None] * self.pace
+        return 1 - self.whitened.square().sum(-1), -2 * (self.whitened * step).sum(-1), -step.square().sum(-1)
 
     @property
     def points(self) -> Tensor:

@@ -1,4 +1,4 @@
-"""The model's extinction on a regular grid: sigma(x) = sum over primitives of max(0, f(x~)) / m, inside their ellipsoids.
+"""The model's extinction on a regular grid: sigma(x) = sum over primitives of (1 - |y|^2)^p max(0, f(x~)) / m, inside their ellipsoids.
 
 A primitive's f may be negative in places, where it is clamped at 0; a renderer clamps the integral along a ray instead.
 
@@ -81,7 +81,7 @@ def density_grid(
             return torch.from_numpy(grid)
         wide += [x.detach().double().numpy() for x in (form.W1, form.b1, form.w2, form.b2.reshape(-1))]
     arguments = [np.ascontiguousarray(x) for x in (*wide, forward[:3], back[:3])]
-    parallel_for(_fill, shape[0], _SLAB, threads, *arguments, form.omega0, grid)
+    parallel_for(_fill, shape[0], _SLAB, threads, *arguments, form.omega0, form.edge, grid)
     return torch.from_numpy(grid)
 
 
@@ -126,8 +126,9 @@ def _ask(model: Primitives, conditions: Conditions, wide: list[Any], P: np.ndarr
 
 @exact_kernel
 def _fill(
-    start: int, stop: int, means: Any, scales: Any, R: Any, W1: Any, b1: Any, w2: Any, b2: Any, P: Any, Q: Any, omega0: float, grid: Any
-) -> None:
+    start: int, stop: int, means: Any, scales: Any, R: Any, W1: Any, b1: Any, w2: Any, b2: Any, P: Any, Q: Any, omega0: float, edge: int,
+    grid: Any,
+) -> None:  # fmt: skip
     """Planes start:stop. P (3, 4) maps indices to the scene, Q (3, 4) back."""
     K = W1.shape[1]
     longest = max(grid.shape[1], grid.shape[2], stop - start)
@@ -190,6 +191,11 @@ def _fill(
                     cos_k, sin_k = cosines[2, q, first_k:last_k], sines[2, q, first_k:last_k]
                     for k in range(len(f)):
                         f[k] += c * cos_k[k] - s * sin_k[k]
+                if edge > 0:
+                    for k in range(len(f)):
+                        at = first_k + k
+                        fade = max((2.0 * half - square * at) * at - rest, 0.0)  # 1 - |y + k step|^2
+                        f[k] *= fade if edge == 1 else fade * fade
                 sums = grid[low[0] + i, low[1] + j, low[2] + first_k : low[2] + last_k]
                 for k in range(len(f)):
                     if f[k] > 0.0:

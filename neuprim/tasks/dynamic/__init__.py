@@ -8,6 +8,7 @@ from typing import Any
 from neuprim.core.choices import choose
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
+from neuprim.core.model.densities.cosine import DENSITY_OPTIONS
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
@@ -20,7 +21,7 @@ __all__ = ["TASK"]
 
 
 def _check(model: Mapping[str, Any]) -> None:
-    choose(model["density"], "model.density", {"time": str, "divide_above": float})
+    choose(model["density"], "model.density", {"time": str, "divide_above": float, **DENSITY_OPTIONS})
     colour = {key: RENAMED.get(value, value) if key == "frequencies" else value for key, value in model["colour"].items()}
     choose(colour, "model.colour", {"frequencies": tuple(FREQUENCIES), "powers": int, "waves": int})
     try:
@@ -34,7 +35,7 @@ def _check(model: Mapping[str, Any]) -> None:
 
 
 def _density(model: Mapping[str, Any]) -> TimeDensity:
-    return TimeDensity(model["neurons"], model["density"].get("time", "phase"), model["density"].get("divide_above", 0.0))
+    return TimeDensity(model["neurons"], **model["density"])
 
 
 def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:

@@ -18,7 +18,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity, cosine_density, split_cosine
+from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity, amplified, cosine_density, split_cosine, split_scale
+from neuprim.core.model.edge import fade
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
@@ -30,7 +31,7 @@ PARTS = ("phase", "offset", "window", "motion")
 """What may vary in time."""
 
 OFFSET_TERMS = 4
-_TURN = 2 * math.pi / OMEGA0  # of a phase that omega0 multiplies
+WINDOW_EDGE = 2  # the exponent of the window in time, which is to a life what an edge is to a support
 
 
 def time_of(conditions: Conditions) -> Tensor:
@@ -53,19 +54,28 @@ class TimeDensity(DensityField):
 
     init_settings = (*CosineDensity.init_settings, "window", "rate")
 
-    def __init__(self, neurons: int = 8, time: str = "phase", divide_above: float = 0.0) -> None:
+    def __init__(
+        self,
+        neurons: int = 8,
+        time: str = "phase",
+        divide_above: float = 0.0,
+        omega0: float = OMEGA0,
+        edge: int = 0,
+        gain: bool = False,
+    ) -> None:
         parts = time.split("+") if isinstance(time, str) and time != "none" else []
         if not isinstance(time, str) or any(p not in PARTS for p in parts) or len(set(parts)) != len(parts):
             raise ValueError(f"{time!r}: expected none or some of {', '.join(PARTS)} joined by +")
-        self.static, self.divide_above = CosineDensity(neurons), divide_above
+        self.static, self.divide_above = CosineDensity(neurons, omega0, edge, gain), divide_above
+        self.exact_split = self.static.exact_split
         self.time, self.parts = "+".join(p for p in PARTS if p in parts) or "none", frozenset(parts)
 
     def settings(self) -> dict[str, Any]:
-        return {"neurons": self.static.neurons, "time": self.time}
+        return {**self.static.settings(), "time": self.time}
 
     @classmethod
     def every_parameter(cls) -> list[ParameterSpec]:
-        return cls(time="+".join(PARTS)).parameters()
+        return cls(time="+".join(PARTS), gain=True).parameters()
 
     def parameters(self) -> list[ParameterSpec]:
         K = self.static.neurons
@@ -98,17 +108,20 @@ class TimeDensity(DensityField):
 
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Cosine:
         xi = time_of(conditions)
-        b1, w2, b2 = params["b1"], params["w2"], params["b2"]
+        b1 = params["b1"]
         if "phase" in self.parts:
-            b1 = _advance(b1, params["W_t"], xi)
+            b1 = _advance(b1, params["W_t"], xi, 2 * math.pi / self.static.omega0)
+        own = dict(params)
         if "offset" in self.parts:
             angle = math.pi * xi * torch.arange(1, OFFSET_TERMS + 1, dtype=torch.float64, device=xi.device)
-            b2 = b2 + (params["offset_cos"] @ angle.cos().to(b2) + params["offset_sin"] @ angle.sin().to(b2))[:, None]
+            b2 = params["b2"]
+            own["b2"] = b2 + (params["offset_cos"] @ angle.cos().to(b2) + params["offset_sin"] @ angle.sin().to(b2))[:, None]
+        w2, b2 = amplified(own["w2"], own["b2"], own.get("log_gain"))
         if "window" in self.parts:
             u = (xi.to(b2) - params["window_center"]) / params["log_window"].exp()
-            weight = (1 - u.square()).clamp_min(0).square()
+            weight = fade(u.square(), WINDOW_EDGE)
             w2, b2 = w2 * weight, b2 * weight
-        return Cosine(params["W1"], b1, w2, b2, OMEGA0)
+        return Cosine(params["W1"], b1, w2, b2, self.static.omega0, self.static.edge)
 
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
         return cosine_density(self.lower(params, geometry, conditions), self.move(params, geometry, conditions), prim, x)
@@ -121,11 +134,11 @@ class TimeDensity(DensityField):
     # ------------------------------------------------------------ population
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        children = split_cosine(params, old, new)
+        children = split_cosine(params, old, new, self.static.omega0, self.static.edge)
         if "offset" in self.parts:
-            r = (new.log_length_scale.double() - old.log_length_scale.double()).exp().to(params["b2"])[:, None]
+            scale = split_scale(old, new, self.static.edge)
             for name in ("offset_cos", "offset_sin"):
-                children[name] = params[name] * r
+                children[name] = params[name] * scale.to(params["b2"])[:, None]
         return children
 
     def divide(self, params: Params, geometry: Geometry) -> tuple[Tensor, dict[str, Tensor], Geometry] | None:
@@ -156,10 +169,10 @@ class TimeDensity(DensityField):
         return scaled
 
 
-def _advance(b1: Tensor, W_t: Tensor, xi: Tensor) -> Tensor:
-    """b1 + xi W_t less whole turns: exact to float32 however far outside 0..1 the time lies, as only the remainder matters."""
+def _advance(b1: Tensor, W_t: Tensor, xi: Tensor, turn: float) -> Tensor:
+    """b1 + xi W_t less whole turns, 2 pi/omega0 each: exact to float32 however far outside 0..1 the time lies, as only the remainder matters."""
     phase = b1.double() + xi * W_t.double()
-    return (phase - _TURN * torch.round(phase.detach() / _TURN)).to(b1)
+    return (phase - turn * torch.round(phase.detach() / turn)).to(b1)
 
 
 def _zeros(width: int) -> Any:

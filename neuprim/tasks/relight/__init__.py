@@ -8,7 +8,7 @@ from typing import Any
 from neuprim.core.choices import choose
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, CosineDensity
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import l1
@@ -37,7 +37,7 @@ def _colour(model: Mapping[str, Any], channels: int = 3, falloff: bool = False, 
 
 
 def _check(model: Mapping[str, Any]) -> None:
-    choose(model["density"], "model.density", {})
+    choose(model["density"], "model.density", DENSITY_OPTIONS)
     choose(model["colour"], "model.colour", _SETTINGS)
     try:
         _colour(model)
@@ -49,7 +49,7 @@ def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, Co
     if dataset.channels != 3:
         raise ConfigError(f"{dataset.name}: {dataset.channels} colour channels; task relight expects 3, as light_intensity has")
     falloff = getattr(dataset, "falloff", "none") == "inverse_square"
-    return CosineDensity(model["neurons"]), _colour(model, dataset.channels, falloff, typical_light(dataset, falloff))
+    return CosineDensity(model["neurons"], **model["density"]), _colour(model, dataset.channels, falloff, typical_light(dataset, falloff))
 
 
 # Loaders are imported when used: each pulls in modules of its own.

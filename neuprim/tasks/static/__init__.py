@@ -7,7 +7,7 @@ from typing import Any
 
 from neuprim.core.choices import choose
 from neuprim.core.data import Dataset
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
@@ -18,12 +18,14 @@ __all__ = ["TASK"]
 
 
 def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
-    density = GaussianDensity() if model["density"].get("form") == "gaussian" else CosineDensity(model["neurons"])
+    chosen = dict(model["density"])
+    gaussian = chosen.pop("form", "cosine") == "gaussian"
+    density = GaussianDensity() if gaussian else CosineDensity(model["neurons"], **chosen)
     return density, SphericalHarmonics(model["sh_degree"], dataset.channels, model["sh_every"])
 
 
 def _check(model: Mapping[str, Any]) -> None:
-    choose(model["density"], "model.density", {"form": ("cosine", "gaussian")})
+    choose(model["density"], "model.density", {"form": ("cosine", "gaussian"), **DENSITY_OPTIONS})
     choose(model["colour"], "model.colour", {})
 
 

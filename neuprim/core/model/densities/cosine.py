@@ -1,4 +1,9 @@
-"""The density of a neural primitive: one hidden layer of K cosines (equation 10 of the paper; method: "Density")."""
+"""The density of a neural primitive: one hidden layer of K cosines (equation 10 of the paper; method: "Density"), with an edge and a gain.
+
+    sigma(x) = g (1 - |y|^2)^p f(x~)/m inside the ellipsoid |y| < 1,   f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2,   g = exp(log_gain)
+
+p = 0 without gain is the paper's primitive; p = 2 with K = 0 is close to a Gaussian, with a support that ends.
+"""
 
 from __future__ import annotations
 
@@ -8,76 +13,111 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neuprim.core.model.edge import EDGES, NORMS, ball_integral, fade
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.tensors import number_fault
 
-__all__ = ["OMEGA0", "CosineDensity", "cosine_density", "split_cosine"]
+__all__ = ["DENSITY_OPTIONS", "OMEGA0", "CosineDensity", "amplified", "cosine_density", "mass", "split_cosine", "split_scale"]
 
 OMEGA0 = 30.0
 """SIREN boost: multiplies the whole phase."""
 
+GAIN_LIMIT = 20.0
+"""Bound of |log_gain|: beyond, a gain counts as exp(20) or exp(-20), and its gradient is zero. No scene needs densities so far apart, and
+products with the other weights stay far from the ends of float32."""
+
+
+DENSITY_OPTIONS: dict[str, tuple[Any, ...] | type] = {"edge": EDGES, "gain": bool, "omega0": float}
+"""What ``model.density`` may say for it, in every task (:mod:`neuprim.core.choices`)."""
+
 
 class CosineDensity(DensityField):
-    """f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2 with x~ = (x - mu)/m, sigma = f/m; 5K + 1 parameters.
+    """See the module; 5K + 1 parameters, and one for the gain.
 
     Args:
         neurons: K, 0 to 16.
         omega0: a positive number.
+        edge: p, 0, 1 or 2.
+        gain: whether there is a log_gain, of its own learning rate.
 
     ``init.mode`` of the model settings: "opaque" (default) starts every primitive at central opacity ``init.alpha``;
     "paper" draws the offset as the authors do, which leaves half of all chords without a gradient.
+
+    Raises:
+        ValueError: an argument is something else.
     """
 
     init_settings = ("mode", "alpha")
 
-    def __init__(self, neurons: int = 8, omega0: float = OMEGA0) -> None:
+    def __init__(self, neurons: int = 8, omega0: float = OMEGA0, edge: int = 0, gain: bool = False) -> None:
         if not isinstance(neurons, int) or not 0 <= neurons <= 16:
             raise ValueError(f"{neurons!r} neurons; expected 0..16")
         if number_fault(omega0) is not None or omega0 <= 0:
             raise ValueError(f"omega0 {omega0!r}; expected a positive number")
-        self.neurons, self.omega0 = neurons, omega0
+        if type(edge) is not int or edge not in EDGES:
+            raise ValueError(f"edge {edge!r}; expected 0, 1 or 2")
+        if not isinstance(gain, bool):
+            raise ValueError(f"gain {gain!r}; expected true or false")
+        self.neurons, self.omega0, self.edge, self.gain = neurons, omega0, edge, gain
+        self.exact_split = edge == 0
 
     def settings(self) -> dict[str, Any]:
-        own = {"neurons": self.neurons}
-        return own if self.omega0 == OMEGA0 else {**own, "omega0": self.omega0}
+        usual = {"omega0": OMEGA0, "edge": 0, "gain": False}
+        return {"neurons": self.neurons, **{name: getattr(self, name) for name, value in usual.items() if getattr(self, name) != value}}
+
+    @classmethod
+    def every_parameter(cls) -> list[ParameterSpec]:
+        return cls(gain=True).parameters()
 
     def parameters(self) -> list[ParameterSpec]:
         K = self.neurons
         third = 1.0 / 3.0
         amplitude = math.sqrt(6.0 / K) / self.omega0 if K else 0.0
-        return [
+        specs = [
             ParameterSpec("W1", (K, 3), 3e-3, lambda c: c.uniform(K, 3, bound=third)),
             ParameterSpec("b1", (K,), 3e-3, lambda c: c.uniform(K, bound=third)),
             ParameterSpec("w2", (K,), 1e-2, lambda c: c.uniform(K, bound=amplitude)),
-            ParameterSpec("b2", (1,), 1e-2, lambda c: _initial_offset(c, amplitude)),
+            ParameterSpec("b2", (1,), 1e-2, lambda c: _initial_offset(c, amplitude, NORMS[self.edge])),
         ]
+        if self.gain:
+            specs.append(ParameterSpec("log_gain", (1,), 2e-1, lambda c: torch.zeros(c.count, 1)))
+        return specs
 
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Cosine:
-        return Cosine(params["W1"], params["b1"], params["w2"], params["b2"], self.omega0)
+        w2, b2 = amplified(params["w2"], params["b2"], params.get("log_gain"))
+        return Cosine(params["W1"], params["b1"], w2, b2, self.omega0, self.edge)
 
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
         return cosine_density(self.lower(params, geometry, conditions), geometry, prim, x)
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        return split_cosine(params, old, new, self.omega0)
+        return split_cosine(params, old, new, self.omega0, self.edge)
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         return {**params, "w2": params["w2"] * factor[:, None], "b2": params["b2"] * factor[:, None]}
+
+
+def amplified(w2: Tensor, b2: Tensor, log_gain: Tensor | None) -> tuple[Tensor, Tensor]:
+    """(w2, b2) (N, K) and (N, 1) times the gain exp(log_gain), (N, 1) or (N,), so that no renderer needs to know of it."""
+    if log_gain is None:
+        return w2, b2
+    g = log_gain.reshape(-1, 1).clamp(-GAIN_LIMIT, GAIN_LIMIT).exp()
+    return w2 * g, b2.reshape(-1, 1) * g
 
 
 _FAINT, _SOLID = 0.02, 0.98
 """Starting points that say how opaque they are start within these: beyond, little light or little gradient passes."""
 
 
-def _initial_offset(ctx: InitContext, amplitude: float) -> Tensor:
+def _initial_offset(ctx: InitContext, amplitude: float, norm: float) -> Tensor:
     mode, alpha = ctx.choice("mode", "opaque", "paper"), ctx.number("alpha", 0.8, 0, 1)
-    opaque = -math.log1p(-alpha) / 2.0  # a central chord of a sphere has optical depth 2 b2
+    opaque = -math.log1p(-alpha) / norm  # a central chord of a sphere has optical depth N_p b2
     if mode == "paper" and amplitude:
         return ctx.uniform(1, bound=amplitude)
     if ctx.alphas is not None:
-        return -torch.log1p(-ctx.alphas.float().clamp(_FAINT, _SOLID))[:, None] / 2.0
+        return -torch.log1p(-ctx.alphas.float().clamp(_FAINT, _SOLID))[:, None] / norm
     return torch.full((ctx.count, 1), opaque)
 
 
@@ -86,15 +126,41 @@ def cosine_density(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) ->
     m = geometry.length_scale[prim]
     local = (x - geometry.means[prim]) / m[:, None]
     phase = form.omega0 * ((form.W1[prim] * local[:, None, :]).sum(-1) + form.b1[prim])
-    return ((form.w2[prim] * phase.cos()).sum(-1) + form.b2[prim].reshape(-1)) / m
+    sigma = ((form.w2[prim] * phase.cos()).sum(-1) + form.b2[prim].reshape(-1)) / m
+    if form.edge == 0:
+        return sigma
+    whitened = (geometry.rotations[prim].transpose(1, 2) @ local[:, :, None])[..., 0] * (m[:, None] / geometry.scales[prim])
+    return sigma * fade(whitened.square().sum(-1), form.edge)
 
 
-def split_cosine(params: Params, old: Geometry, new: Geometry, omega0: float = OMEGA0) -> dict[str, Tensor]:
-    """Children that carry their parents' sigma unchanged: W1' = r W1, b1' = b1 + W1 (mu'-mu)/m, (w2, b2)' = r (w2, b2), r = m'/m.
+def mass(form: Cosine, geometry: Geometry) -> Tensor:
+    """(N,) float64 integrals of sigma over space, unclamped; scene units squared."""
+    log_m = geometry.log_length_scale.double()
+    axes = geometry.rotations.double() * (geometry.log_scales.double() - log_m[:, None]).exp()[:, None, :]  # whitened -> local
+    omega = form.omega0 * (form.W1.double() @ axes).norm(dim=-1)
+    waves = (form.w2.double() * (form.omega0 * form.b1.double()).cos() * ball_integral(omega, form.edge)).sum(-1)
+    one = ball_integral(torch.zeros(1, dtype=torch.float64), form.edge)
+    return (geometry.log_scales.double().sum(-1) - log_m).exp() * (form.b2.double().reshape(-1) * one + waves)
 
-    ``omega0`` is that of the form which ``params`` lower to. Computed in float64, so the field changes by no more than the final rounding; other tensors pass through.
-    """
+
+def split_scale(old: Geometry, new: Geometry, edge: int = 0) -> Tensor:
+    """(rows,) float64 factor c on a child's (w2, b2), see :func:`split_cosine`."""
     r = (new.log_length_scale.double() - old.log_length_scale.double()).exp()
+    if edge == 0:
+        return r
+    return 0.5 * r * (old.log_scales.double().sum(-1) - new.log_scales.double().sum(-1)).exp()
+
+
+def split_cosine(params: Params, old: Geometry, new: Geometry, omega0: float = OMEGA0, edge: int = 0) -> dict[str, Tensor]:
+    """Children that continue their parents' f: W1' = r W1, b1' = b1 + W1 (mu'-mu)/m, (w2, b2)' = c (w2, b2), r = m'/m.
+
+    With a hard edge c = r, and sigma goes on unchanged inside the children. A soft edge fades within a child where its parent's does not:
+    c = r V/2V' then, V = s_1 s_2 s_3, for which both children have as much of the weight (1 - |y|^2)^p together as their parent.
+
+    ``omega0`` and ``edge`` are those of the form which ``params`` lower to. Computed in float64, so that the field changes by no more than
+    the final rounding; other tensors pass through.
+    """
+    r, c = split_scale(old, new), split_scale(old, new, edge)
     shift = (new.means.double() - old.means.double()) / old.length_scale.double()[:, None]
     W1, b1 = params["W1"].double(), params["b1"].double()
     b1 = b1 + (W1 * shift[:, None, :]).sum(-1)
@@ -104,6 +170,6 @@ def split_cosine(params: Params, old: Geometry, new: Geometry, omega0: float = O
         **params,
         "W1": (W1 * r[:, None, None]).to(params["W1"]),
         "b1": b1.to(params["b1"]),
-        "w2": (params["w2"].double() * r[:, None]).to(params["w2"]),
-        "b2": (params["b2"].double() * r[:, None]).to(params["b2"]),
+        "w2": (params["w2"].double() * c[:, None]).to(params["w2"]),
+        "b2": (params["b2"].double() * c[:, None]).to(params["b2"]),
     }

@@ -141,7 +141,8 @@ def _trace(
     a = (v * v).sum(-1)
     tm = -(p * v).sum(-1) / a
     x = p + tm[:, None] * v
-    h = _FlooredSqrt.apply(1 - (x * x).sum(-1), settings.depth_floor) / a.sqrt()
+    floor = settings.depth_floor if lowered.density.edge == 0 else 0.0  # a soft edge has finite gradients at the silhouette by itself
+    h = _FlooredSqrt.apply(1 - (x * x).sum(-1), floor) / a.sqrt()
     m = frame.m[prim]
     t_near = rays.near[j] / m
     t0 = torch.maximum(tm - h, t_near)
@@ -151,7 +152,7 @@ def _trace(
 
     world_d = dj @ frame.rotation
     local = (frame.local[prim] @ (frame.axes[prim] * xm)[:, :, None])[..., 0]  # (x - mu)/m of the chord middle, scene axes
-    pairs = Pairs(prim, world_d, local, half, frame.origin, t0, t1, mid, m)
+    pairs = Pairs(prim, world_d, local, half, frame.origin, t0, t1, mid, m, xm, v)
     optical_depth = lowered.optical_depth(pairs)
 
     alpha = -torch.expm1(-optical_depth.clamp_min(0))

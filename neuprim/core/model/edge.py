@@ -1,0 +1,112 @@
+"""The edge of a support: how a primitive's density, or its life in time, fades to nothing.
+
+With u the distance from the middle over the distance from the middle to the edge, the weight is (1 - u^2)^p. p = 0 is a hard edge, p = 1 and
+2 soft ones. Along an uncut chord, u in [-1, 1] and D = 1 - |y|^2 at its middle, a support (1 - |y|^2)^p becomes D^p (1 - u^2)^p, and
+
+    1/2 integral of (1 - u^2)^p cos(phase + z u) du = N_p/2 cos(phase) B_p(z),   N = 2, 4/3, 16/15
+    B_0 = sin z / z,   B_1 = 3 (B_0 - cos z)/z^2,   B_2 = 15 (B_1 - B_0)/z^2        (all 1 at z = 0)
+
+which are spherical Bessel functions, B_p = (2p + 1)!! j_p(z)/z^p. Chords that a plane cuts have any quadratic c0 + c1 u + c2 u^2 for
+1 - |y|^2; its p-th power in Legendre polynomials, sum a_n P_n, gives the general case, as 1/2 integral of P_n exp(i z u) du = i^n j_n(z).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+__all__ = ["EDGES", "NORMS", "ball_integral", "chord_integral", "fade", "legendre", "profile", "sinc", "spherical_bessel"]
+
+EDGES = (0, 1, 2)
+"""Exponents p that there are."""
+
+NORMS = (2.0, 4 / 3, 16 / 15)
+"""N_p: the integral of (1 - u^2)^p over [-1, 1]."""
+
+_SERIES_BELOW, _TERMS = 2.0, 14  # upward recursion loses digits as z^-n; the series' last term is below 1e-17 of the first
+
+
+def fade(square: Tensor, edge: int) -> Tensor:
+    """(1 - u^2)^p from u^2, 0 outside the support; 1 everywhere for p = 0."""
+    if edge == 0:
+        return torch.ones_like(square)
+    inner = (1 - square).clamp_min(0)
+    return inner if edge == 1 else inner.square()
+
+
+def sinc(z: Tensor) -> Tensor:
+    """sin z / z, differentiable at 0."""
+    small = z.abs() < 1e-3
+    safe = torch.where(small, torch.ones_like(z), z)
+    z2 = z * z
+    series = 1 - z2 / 6 * (1 - z2 / 20 * (1 - z2 / 42))
+    return torch.where(small, series, safe.sin() / safe)
+
+
+def spherical_bessel(z: Tensor, last: int) -> list[Tensor]:
+    """j_0(z) to j_last(z), float64, differentiable everywhere; good to 1e-15, absolutely."""
+    small = z.abs() < _SERIES_BELOW
+    safe = torch.where(small, torch.full_like(z, _SERIES_BELOW), z)
+    j = [safe.sin() / safe]
+    j.append((j[0] - safe.cos()) / safe)
+    for n in range(1, last):
+        j.append((2 * n + 1) / safe * j[n] - j[n - 1])
+    near = torch.where(small, z, torch.zeros_like(z))
+    half_square, power, found = near * near / 2, torch.ones_like(z), []
+    for n in range(last + 1):
+        term = power
+        total = term
+        for k in range(1, _TERMS):
+            term = -term * half_square / (k * (2 * n + 2 * k + 1))
+            total = total + term
+        found.append(torch.where(small, total, j[n]))
+        power = power * near / (2 * n + 3)
+    return found
+
+
+def legendre(c0: Tensor, c1: Tensor, c2: Tensor, edge: int) -> list[Tensor]:
+    """a_0 to a_2p of (c0 + c1 u + c2 u^2)^p = sum of a_n P_n(u), p = 1 or 2."""
+    if edge == 1:
+        return [c0 + c2 / 3, c1, 2 * c2 / 3]
+    d0, d1, d2, d3, d4 = c0 * c0, 2 * c0 * c1, c1 * c1 + 2 * c0 * c2, 2 * c1 * c2, c2 * c2
+    return [d0 + d2 / 3 + d4 / 5, d1 + 3 * d3 / 5, 2 * d2 / 3 + 4 * d4 / 7, 2 * d3 / 5, 8 * d4 / 35]
+
+
+def chord_integral(
+    quadratic: tuple[Tensor, Tensor, Tensor], edge: int, phase: Tensor, z: Tensor, amplitude: Tensor, offset: Tensor
+) -> Tensor:
+    """(M,) 1/2 integral over u in [-1, 1] of (c0 + c1 u + c2 u^2)^p (offset + sum_k amplitude_k cos(phase_k + z_k u)), p = 1 or 2.
+
+    Args:
+        quadratic: c0, c1, c2, (M,) each; amplitude, phase, z: (M, K); offset: (M,).
+    """
+    a = legendre(*quadratic, edge)
+    total = offset * a[0]
+    if z.shape[1]:
+        j = spherical_bessel(z, 2 * edge)
+        even = a[0][:, None] * j[0] - a[2][:, None] * j[2]
+        odd = a[1][:, None] * j[1]
+        if edge == 2:
+            even, odd = even + a[4][:, None] * j[4], odd - a[3][:, None] * j[3]
+        total = total + (amplitude * (phase.cos() * even - phase.sin() * odd)).sum(-1)
+    return total
+
+
+def profile(z: Tensor, order: int) -> Tensor:
+    """B_order(z) = (2 order + 1)!! j_order(z)/z^order, 1 at 0; float64, differentiable."""
+    if order == 0:
+        return sinc(z)
+    small = z.abs() < 1e-3
+    safe = torch.where(small, torch.ones_like(z), z)
+    series = 1 - z.square() / (2 * (2 * order + 3))
+    return torch.where(small, series, math.prod(range(1, 2 * order + 2, 2)) * spherical_bessel(safe, order)[order] / safe**order)
+
+
+def ball_integral(omega: Tensor, edge: int) -> Tensor:
+    """Integral of (1 - |y|^2)^p cos(omega . y) over the unit ball, |omega| given: V_p B_(p+1)(|omega|), differentiable.
+
+    In three dimensions the profile is one order smoother than along a chord; V_p = pi^(3/2) p!/Gamma(p + 5/2).
+    """
+    return math.pi**1.5 * math.gamma(edge + 1) / math.gamma(edge + 2.5) * profile(omega, edge + 1)

@@ -1,0 +1,175 @@
+"""Soft edges: integrals along chords and over balls against quadrature, thin chords, far phases, gains."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import integrate, special
+from torch import Tensor
+
+from neuprim.core.errors import FormError
+from neuprim.core.model.densities.cosine import CosineDensity, amplified, cosine_density, mass
+from neuprim.core.model.edge import EDGES, NORMS, ball_integral, chord_integral, fade, profile, spherical_bessel
+from neuprim.core.model.fields import Cosine
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.pairs import Pairs
+from neuprim.core.model.schema import InitContext
+from tests import scenes
+
+F64 = torch.float64
+WIDE = torch.cat([torch.logspace(-8, 3, 3000, dtype=F64), torch.tensor([0.0, 1.999999, 2.0, 2.000001], dtype=F64)])
+
+
+def test_bessel_functions_are_scipy_s() -> None:
+    for z in (WIDE, -WIDE):
+        for n, found in enumerate(spherical_bessel(z, 5)):
+            sign = 1 if n % 2 == 0 else torch.sign(z).where(z != 0, torch.ones_like(z)).numpy()
+            assert np.abs(found.numpy() - sign * special.spherical_jn(n, z.abs().numpy())).max() <= 1e-14
+
+
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
+def test_profiles_are_those_of_the_formulas(order: int) -> None:
+    """Against the integral that defines them, whose integrand is (1 - u^2)^order cos(z u)."""
+    x, w = np.polynomial.legendre.leggauss(1200)
+    weight = w * (1 - x * x) ** order
+    z = np.concatenate([np.logspace(-7, 3, 400), [0.0]])
+    exact = (weight * np.cos(z[:, None] * x)).sum(1) / weight.sum()
+    assert np.abs(profile(torch.from_numpy(z), order).numpy() - exact).max() <= 2e-13
+
+
+@pytest.mark.parametrize("edge", [1, 2])
+@pytest.mark.parametrize("reach", [1e-4, 0.5, 3.0, 40.0, 1000.0])
+def test_any_part_of_a_chord(edge: int, reach: float) -> None:
+    """Any quadratic, as a near plane leaves it, any phase, rates up to ``reach``; relative to the largest that the integral could be."""
+    g = torch.Generator().manual_seed(edge)
+    count, neurons = 60, 3
+    middle, half = torch.rand(count, generator=g, dtype=F64) * 1.8 - 0.9, torch.rand(count, generator=g, dtype=F64)
+    half = half * (1 - middle.abs())  # parts [middle - half, middle + half] of the whole chord [-1, 1] of a ball
+    quadratic = (1 - middle**2, -2 * middle * half, -(half**2))
+    phase, z, amplitude = (torch.randn(count, neurons, generator=g, dtype=F64) for _ in range(3))
+    z, offset = z.clamp(-1, 1) * reach, torch.randn(count, generator=g, dtype=F64)
+    found = chord_integral(quadratic, edge, phase, z, amplitude, offset)
+    u, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(1400))
+    f = offset[:, None] + (amplitude[..., None] * (phase[..., None] + z[..., None] * u).cos()).sum(1)
+    weight = (quadratic[0][:, None] + quadratic[1][:, None] * u + quadratic[2][:, None] * u**2) ** edge
+    exact = (w * weight * f).sum(-1) / 2
+    largest = (w * weight).sum(-1) / 2 * (offset.abs() + amplitude.abs().sum(-1))
+    assert ((found - exact).abs() / largest).max() <= 1e-12
+
+
+def test_gradients_of_a_part_of_a_chord() -> None:
+    g = torch.Generator().manual_seed(0)
+
+    def leaf(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g, dtype=F64).requires_grad_()
+
+    for edge in (1, 2):
+        parts = [leaf(5) for _ in range(3)]
+        rest = [leaf(5, 2), leaf(5, 2), leaf(5, 2), leaf(5)]
+        rest[1].data[0, 0], rest[1].data[1, 0] = 0.0, 2.0  # where series and recursion meet
+        assert torch.autograd.gradcheck(
+            lambda a, b, c, *more, p=edge: chord_integral((a, b, c), p, *more), (*parts, *rest), atol=1e-7, rtol=1e-5
+        )
+
+
+@pytest.mark.parametrize("edge", EDGES)
+def test_integrals_over_the_ball(edge: int) -> None:
+    for omega in (0.0, 1e-5, 0.5, 2.0, 9.0, 60.0):
+        # around the axis of omega: 2 pi r sin(theta) with cos(theta) integrated in closed form
+        exact = integrate.quad(lambda r: 4 * math.pi * r * r * (1 - r * r) ** edge * np.sinc(omega * r / math.pi), 0, 1, limit=200)[0]  # noqa: B023
+        assert float(ball_integral(torch.tensor(omega, dtype=F64), edge)) == pytest.approx(exact, abs=1e-10)
+
+
+@pytest.mark.parametrize("edge", EDGES)
+def test_mass_is_the_integral_of_sigma(edge: int) -> None:
+    t = scenes.tensors(6, 3, seed=4, dtype=F64)
+    geometry, form = Geometry(t["means"], t["log_scales"], t["quats"]), Cosine(t["W1"], t["b1"], t["w2"], t["b2"], 9.0, edge)
+    x, w = np.polynomial.legendre.leggauss(60)
+    grid, weight = (
+        torch.from_numpy(np.stack(np.meshgrid(x, x, x), -1).reshape(-1, 3)),
+        torch.from_numpy(np.einsum("i,j,k", w, w, w).ravel()),
+    )
+    inside = grid.square().sum(-1) < 1
+    grid, weight = grid[inside], weight[inside]
+    for n in range(6):
+        points = geometry.means[n] + (grid * geometry.scales[n]) @ geometry.rotations[n].T
+        sigma = cosine_density(form, geometry, torch.full((len(grid),), n), points)
+        exact = (sigma * weight).sum() * geometry.scales[n].prod()
+        largest = (sigma.abs() * weight).sum() * geometry.scales[n].prod()
+        assert abs(float(mass(form, geometry)[n] - exact)) <= (2e-2, 2e-3, 5e-4)[edge] * float(largest)  # a cut lattice: worst at p = 0
+
+
+@pytest.mark.parametrize("edge", EDGES)
+def test_a_chord_is_the_integral_of_the_density(edge: int) -> None:
+    """Whole chords and parts of them, of a lowered form, against quadrature of the density at points."""
+    t = scenes.tensors(8, 4, seed=2, dtype=F64)
+    geometry, form = Geometry(t["means"], t["log_scales"], t["quats"]), Cosine(t["W1"], t["b1"], t["w2"], t["b2"], 20.0, edge)
+    g = torch.Generator().manual_seed(3)
+    prim = torch.arange(8).repeat(10)
+    d = torch.nn.functional.normalize(torch.randn(80, 3, generator=g, dtype=F64), dim=-1)
+    y = torch.nn.functional.normalize(torch.randn(80, 3, generator=g, dtype=F64), dim=-1) * torch.rand(80, 1, generator=g, dtype=F64)
+    start = geometry.means[prim] + (geometry.rotations[prim] @ (geometry.scales[prim] * y)[:, :, None])[..., 0]
+    v = (geometry.rotations[prim].transpose(1, 2) @ d[:, :, None])[..., 0] / geometry.scales[prim]
+    a, b = v.square().sum(-1), (y * v).sum(-1)
+    root = (b * b + a * (1 - y.square().sum(-1))).sqrt()
+    t0, t1 = (-b - root) / a, (-b + root) / a
+    t0[40:] = torch.lerp(t0[40:], t1[40:], torch.rand(40, generator=g, dtype=F64))  # as a near plane cuts
+    found = form.optical_depth(Pairs.of(geometry, prim, start, d, t0, t1))
+    x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(200))
+    at = t0[:, None] + (t1 - t0)[:, None] * (x + 1) / 2
+    sigma = cosine_density(form, geometry, prim.repeat_interleave(200), (start[:, None] + at[..., None] * d[:, None]).reshape(-1, 3))
+    exact = (sigma.reshape(80, 200) * w).sum(-1) * (t1 - t0) / 2
+    largest = (t1 - t0) * (t["b2"].abs()[:, 0] + t["w2"].abs().sum(-1))[prim] / geometry.length_scale[prim]
+    assert ((found - exact).abs() / largest).max() <= 1e-12
+
+
+def test_a_sphere_starts_as_opaque_whatever_its_edge() -> None:
+    for edge in EDGES:
+        spec = next(s for s in CosineDensity(0, edge=edge).parameters() if s.name == "b2")
+        context = InitContext(torch.zeros(3, 3), torch.ones(3), torch.full((3, 3), 0.5), torch.Generator())
+        offset = spec.init(context).double()
+        assert torch.allclose(1 - (-NORMS[edge] * offset).exp(), torch.full_like(offset, 0.8), atol=1e-6)
+
+
+def test_settings_name_only_what_is_unusual() -> None:
+    assert CosineDensity(4).settings() == {"neurons": 4}
+    soft = CosineDensity(2, 12.0, 1, True)
+    again = CosineDensity(**soft.settings())
+    assert (again.omega0, again.edge, again.gain) == (12.0, 1, True) and again.parameters()[-1].name == "log_gain"
+    assert CosineDensity(2).exact_split and not soft.exact_split
+
+
+@pytest.mark.parametrize("wrong", [3, -1, 1.0, True, "1", None])
+def test_the_edge_is_0_1_or_2(wrong: object) -> None:
+    with pytest.raises(ValueError, match=r"^edge .*; expected 0, 1 or 2"):
+        CosineDensity(8, edge=wrong)  # type: ignore[arg-type]
+    t = scenes.tensors(2, 1)
+    assert "; expected 0, 1 or 2" in str(Cosine(t["W1"], t["b1"], t["w2"], t["b2"], 30.0, wrong).fault({}))  # type: ignore[arg-type]
+
+
+def test_sums_keep_their_edge() -> None:
+    t = scenes.tensors(2, 3)
+    first, second = (Cosine(t["W1"], t["b1"], t["w2"], t["b2"], 30.0, edge) for edge in (1, 2))
+    assert (first + first).edge == 1 and first.rows(torch.tensor([1])).edge == 1
+    with pytest.raises(FormError, match="edges 1 and 2; expected the same"):
+        _ = first + second
+
+
+def test_gains_beyond_the_limit_count_as_the_limit() -> None:
+    w2, b2 = torch.ones(5, 2), torch.ones(5, 1)
+    log_gain = torch.tensor([[-80.0], [-20.0], [0.0], [20.0], [80.0]], requires_grad=True)
+    wide, offset = amplified(w2, b2, log_gain)
+    assert torch.isfinite(wide).all() and torch.equal(wide[0], wide[1]) and torch.equal(offset[4], offset[3]) and offset[2].item() == 1
+    offset.log().sum().backward()
+    grad = log_gain.grad
+    assert grad is not None and grad[:, 0].tolist() == pytest.approx([0, 1, 1, 1, 0])
+
+
+def test_fading_ends_at_the_edge() -> None:
+    u = torch.linspace(0, 2, 201, dtype=F64)
+    for edge in (1, 2):
+        weight = fade(u.square(), edge)
+        assert float(weight[0]) == 1 and not bool(weight[u >= 1].any()) and bool((weight.diff()[u[1:] <= 1] < 0).all())

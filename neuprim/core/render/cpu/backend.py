@@ -15,12 +15,12 @@ from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.fields import Constant, Cosine, RayNet
 from neuprim.core.model.primitives import Lowered
+from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.backward import backward_tiles, sum_rows
 from neuprim.core.render.cpu.binning import TileLists, bin_primitives
 from neuprim.core.render.cpu.colour_net import Net, net_backward, net_rows
 from neuprim.core.render.cpu.entry import backward_tiles_by_entry, composite_tiles_by_entry
 from neuprim.core.render.cpu.forward import composite_tiles
-from neuprim.core.render.cpu.layout import G_ERROR, G_NEURONS, G_WEIGHT, PER_NEURON, SPAN_WIDTH, TILE, gradient_width, row_width
 from neuprim.core.render.cpu.prepare import NON_FINITE, VISIBLE, prepare, prepare_backward, prepare_wide
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.settings import RenderSettings
@@ -64,11 +64,11 @@ class _Prepared:
 
     @property
     def tiles(self) -> int:
-        return -(-self.camera.width // TILE) * -(-self.camera.height // TILE)
+        return -(-self.camera.width // L.TILE) * -(-self.camera.height // L.TILE)
 
     @property
     def chunk(self) -> int:
-        return max(2, -(-self.camera.width // TILE) // 2)
+        return max(2, -(-self.camera.width // L.TILE) // 2)
 
 
 def _array(tensor: Tensor) -> Array:
@@ -96,8 +96,8 @@ def _prepare(
 ) -> _Prepared:
     count, K = tensors["W1"].shape[:2]
     neurons = K + K % 2  # the backward kernel takes neurons in pairs; a padded one has amplitude 0
-    rows = np.empty((count, row_width(neurons)), np.float32)
-    spans = np.zeros((count, SPAN_WIDTH), np.float32)
+    rows = np.empty((count, L.row_width(neurons)), np.float32)
+    spans = np.zeros((count, L.SPAN_WIDTH), np.float32)
     kinds, order = np.empty((count, neurons // 2), np.uint8), np.empty((count, K), np.uint8)
     boxes, depth, status = np.empty((count, 4), np.int32), np.empty(count, np.float64), np.empty(count, np.uint8)
     in_float64 = np.empty(count, np.bool_)
@@ -217,7 +217,7 @@ class _Rasterize(torch.autograd.Function):
         gz = np.ascontiguousarray(g_z.numpy(), np.float32)
         watched = frame.stats.watched
         error = np.zeros((h, w), np.float32) if watched is None else np.ascontiguousarray(_array(watched.error), np.float32)
-        width = gradient_width(frame.neurons, C, frame.net.hidden if frame.net else 0)
+        width = L.gradient_width(frame.neurons, C, frame.net.hidden if frame.net else 0)
         pair_rows = np.empty((frame.lists.pairs, width), np.float32)
         tiles = backward_tiles_by_entry if s.sort == "entry" else backward_tiles
         lanes = parallel_for(
@@ -248,7 +248,7 @@ class _Rasterize(torch.autograd.Function):
             frame.R, frame.t, frame.intrinsics, s.near, frame.omega0 / _TURN, frame.rows, frame.order, grads, touched,
             *out, g_b2, g_view, want_view,
         )  # fmt: skip
-        base = G_NEURONS + PER_NEURON * frame.neurons
+        base = L.G_NEURONS + L.PER_NEURON * frame.neurons
         g_net = [np.zeros(t[n].shape, np.float32) for n in ("Wx", "bias", "Wout")] if frame.net else []
         if frame.net:
             parallel_for(
@@ -256,7 +256,7 @@ class _Rasterize(torch.autograd.Function):
                 grads, base + C, touched, out[1], out[2], *g_net,
             )  # fmt: skip
         if watched is not None:
-            watched.fill(torch.from_numpy(grads[:, G_WEIGHT].copy()), torch.from_numpy(grads[:, G_ERROR].copy()))
+            watched.fill(torch.from_numpy(grads[:, L.G_WEIGHT].copy()), torch.from_numpy(grads[:, L.G_ERROR].copy()))
         results = [*out, g_b2, np.ascontiguousarray(grads[:, base : base + C])]
         tensors = [torch.from_numpy(r).to(d) for r, d in zip(results, ctx.dtypes, strict=True)]
         view = None

@@ -9,42 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import exact_kernel, inline, kernel
+from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.gradients import chord_gradient, field_gradient, two_neurons
-from neuprim.core.render.cpu.layout import (
-    ALPHA,
-    ANCHOR_Z,
-    BACKWARD_SCRATCH,
-    BEHIND,
-    ERR,
-    FIELD,
-    G_COLOR,
-    G_ERROR,
-    G_NEURONS,
-    G_WEIGHT,
-    GMID,
-    GRAD,
-    GZ,
-    HALF,
-    LANES,
-    LAST,
-    MID,
-    NET_SCRATCH,
-    NEURON_SCRATCH,
-    NORM,
-    NORM_L,
-    OVER,
-    PER_NEURON,
-    PIXELS,
-    RAY_COLOUR,
-    SLIDE,
-    SLOPE,
-    T_,
-    TILE,
-    UNIT,
-    UX,
-    UY,
-)
 from neuprim.core.render.cpu.neurons import field_with_slopes
 from neuprim.core.render.cpu.ray_colours import (
     ray_colour_gradient,
@@ -60,23 +27,23 @@ __all__ = ["backward_tiles", "opacity", "sum_rows"]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
-_STEPS = np.arange(TILE).astype(np.float32)
+_STEPS = np.arange(L.TILE).astype(np.float32)
 
 
 @inline
 def opacity(S, n, amin, amax):  # type: ignore[no-untyped-def]
     """ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF) of every lane, with exactly the forward pass's clamp and cut."""
     for k in range(n):
-        norm = S[NORM_L + k]
-        depth = S[FIELD + k] * S[HALF + k] * norm * f(2)
+        norm = S[L.NORM_L + k]
+        depth = S[L.FIELD + k] * S[L.HALF + k] * norm * f(2)
         raw = one_minus_exp(depth)
         alpha = min(raw, amax)
         alpha = alpha if alpha >= amin else f(0)
         alpha = alpha if depth > f(0) else f(0)
         slope = (f(1) - raw) * norm
         slope = slope if raw < amax else f(0)
-        S[ALPHA + k], S[OVER + k] = alpha, f(1) / (f(1) - alpha)
-        S[SLOPE + k] = slope if alpha > f(0) else f(0)
+        S[L.ALPHA + k], S[L.OVER + k] = alpha, f(1) / (f(1) - alpha)
+        S[L.SLOPE + k] = slope if alpha > f(0) else f(0)
 
 
 @inline
@@ -86,66 +53,66 @@ def _uncomposite_row(st, lanes, cg, w, a, b, rank):  # type: ignore[no-untyped-d
     ``cg`` holds sum_c color_c dL/drgb_c (+ z dL/dz). ``lanes`` starts at ALPHA of the row's first pixel.
     """
     a, b = f(a), f(b)
-    for k in range(TILE):
+    for k in range(L.TILE):
         step, alpha = _STEPS[k], lanes[k]
         inside = (step >= a) & (step < b)
-        use = inside & (alpha > f(0)) & (st[k + LAST] >= rank)
+        use = inside & (alpha > f(0)) & (st[k + L.LAST] >= rank)
         alpha = alpha if use else f(0)
-        over = lanes[k + OVER - ALPHA] if use else f(1)
-        behind = st[k + BEHIND]
-        before = st[k + T_] * over
+        over = lanes[k + L.OVER - L.ALPHA] if use else f(1)
+        behind = st[k + L.BEHIND]
+        before = st[k + L.T_] * over
         weight = alpha * before
-        g = (before * cg[k] - behind * over) * lanes[k + SLOPE - ALPHA]
+        g = (before * cg[k] - behind * over) * lanes[k + L.SLOPE - L.ALPHA]
         w[k] = weight
-        st[k + BEHIND] = behind + weight * cg[k]
-        st[k + T_] = before
+        st[k + L.BEHIND] = behind + weight * cg[k]
+        st[k + L.T_] = before
         g = g if use else f(0)
-        lanes[k + GRAD - ALPHA] = g if inside else lanes[k + GRAD - ALPHA]
+        lanes[k + L.GRAD - L.ALPHA] = g if inside else lanes[k + L.GRAD - L.ALPHA]
 
 
 @inline
 def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, c0, c1, c2):  # type: ignore[no-untyped-def]
     """:func:`_uncomposite_row` and the tallies of three channels in one pass; ``sums`` are 16 wide and reduced once per pair."""
     a, b = f(a), f(b)
-    for k in range(TILE):
-        step, alpha = _STEPS[k], S[index(at + k + ALPHA)]
+    for k in range(L.TILE):
+        step, alpha = _STEPS[k], S[index(at + k + L.ALPHA)]
         inside = (step >= a) & (step < b)
-        use = inside & (alpha > f(0)) & (state[index(base + k + LAST)] >= rank)
+        use = inside & (alpha > f(0)) & (state[index(base + k + L.LAST)] >= rank)
         alpha = alpha if use else f(0)
-        over = S[index(at + k + OVER)] if use else f(1)
+        over = S[index(at + k + L.OVER)] if use else f(1)
         g0, g1, g2 = (
-            state[index(base + k + G_COLOR)],
-            state[index(base + k + G_COLOR + PIXELS)],
-            state[index(base + k + G_COLOR + 2 * PIXELS)],
+            state[index(base + k + L.G_COLOR)],
+            state[index(base + k + L.G_COLOR + L.PIXELS)],
+            state[index(base + k + L.G_COLOR + 2 * L.PIXELS)],
         )
         cg = g0 * c0 + g1 * c1 + g2 * c2
-        behind = state[index(base + k + BEHIND)]
-        before = state[index(base + k + T_)] * over
+        behind = state[index(base + k + L.BEHIND)]
+        before = state[index(base + k + L.T_)] * over
         weight = alpha * before
-        g = (before * cg - behind * over) * S[index(at + k + SLOPE)]
-        state[index(base + k + BEHIND)] = behind + weight * cg
-        state[index(base + k + T_)] = before
+        g = (before * cg - behind * over) * S[index(at + k + L.SLOPE)]
+        state[index(base + k + L.BEHIND)] = behind + weight * cg
+        state[index(base + k + L.T_)] = before
         g = g if use else f(0)
-        S[index(at + k + GRAD)] = g if inside else S[index(at + k + GRAD)]
+        S[index(at + k + L.GRAD)] = g if inside else S[index(at + k + L.GRAD)]
         sums[k] += weight
-        sums[k + TILE] += weight * state[index(base + k + ERR)]
-        sums[k + 2 * TILE] += weight * g0
-        sums[k + 3 * TILE] += weight * g1
-        sums[k + 4 * TILE] += weight * g2
+        sums[k + L.TILE] += weight * state[index(base + k + L.ERR)]
+        sums[k + 2 * L.TILE] += weight * g0
+        sums[k + 3 * L.TILE] += weight * g1
+        sums[k + 4 * L.TILE] += weight * g2
 
 
 @inline
 def _tally(st, w, sums):  # type: ignore[no-untyped-def]
     """Add w and w x error of one row to the 16-wide sums."""
-    for k in range(TILE):
+    for k in range(L.TILE):
         sums[k] += w[k]
-        sums[k + TILE] += w[k] * st[k + ERR]
+        sums[k + L.TILE] += w[k] * st[k + L.ERR]
 
 
 @inline
 def _total(sums, first):  # type: ignore[no-untyped-def]
     total = f(0)
-    for k in range(TILE):
+    for k in range(L.TILE):
         total += sums[first + k]
     return total
 
@@ -160,39 +127,39 @@ def backward_tiles(  # type: ignore[no-untyped-def]
     ``net``: as for :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
     """
     height, width = norms.shape
-    across = (width + TILE - 1) // TILE
+    across = (width + L.TILE - 1) // L.TILE
     C = colors.shape[1]
-    color_at = G_NEURONS + PER_NEURON * neurons
+    color_at = L.G_NEURONS + L.PER_NEURON * neurons
     amin, amax, floor = limits[0], limits[1], limits[3]
-    scratch = BACKWARD_SCRATCH
+    scratch = L.BACKWARD_SCRATCH
     if net is not None:
-        scratch = BACKWARD_SCRATCH + 2 * C * LANES
-        waves = np.zeros((net.hidden, NET_SCRATCH), np.float32)
+        scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
+        waves = np.zeros((net.hidden, L.NET_SCRATCH), np.float32)
     S, D = np.zeros(scratch + 1024, np.float32), np.zeros(FLOAT64_SCRATCH, np.float64)
-    V = np.zeros((neurons, NEURON_SCRATCH), np.float32)
-    state = np.zeros((6 + C) * PIXELS + 2 * TILE, np.float32)
-    w, cg, sums = np.zeros(TILE, np.float32), np.zeros(TILE, np.float32), np.zeros((2 + C) * TILE, np.float32)
-    bounds, offset = np.zeros(2 * TILE, np.int32), np.zeros(TILE, np.int32)
-    rows_live, reach = np.zeros(TILE, np.float32), np.zeros(TILE, np.float32)
+    V = np.zeros((neurons, L.NEURON_SCRATCH), np.float32)
+    state = np.zeros((6 + C) * L.PIXELS + 2 * L.TILE, np.float32)
+    w, cg, sums = np.zeros(L.TILE, np.float32), np.zeros(L.TILE, np.float32), np.zeros((2 + C) * L.TILE, np.float32)
+    bounds, offset = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32)
+    rows_live, reach = np.zeros(L.TILE, np.float32), np.zeros(L.TILE, np.float32)
     evaluated = 0
     for t in range(start, stop):
-        tx, ty = (t % across) * TILE, (t // across) * TILE
+        tx, ty = (t % across) * L.TILE, (t // across) * L.TILE
         state[:] = f(0)
         deepest = 0
-        for y in range(TILE):
+        for y in range(L.TILE):
             reach[y] = f(0)
-            for x in range(TILE):
-                j, Y, X = y * TILE + x, ty + y, tx + x
-                state[j + T_] = f(1)
+            for x in range(L.TILE):
+                j, Y, X = y * L.TILE + x, ty + y, tx + x
+                state[j + L.T_] = f(1)
                 if X < width and Y < height:
                     T = transmittance[Y, X]
-                    state[j + T_], state[j + NORM] = T, norms[Y, X]
-                    state[j + BEHIND] = T * g_transmittance[Y, X]
-                    state[j + LAST], state[j + ERR] = f(last[Y, X]), error[Y, X]
+                    state[j + L.T_], state[j + L.NORM] = T, norms[Y, X]
+                    state[j + L.BEHIND] = T * g_transmittance[Y, X]
+                    state[j + L.LAST], state[j + L.ERR] = f(last[Y, X]), error[Y, X]
                     if with_depth:
-                        state[j + GZ] = g_z[Y, X]
+                        state[j + L.GZ] = g_z[Y, X]
                     for c in range(C):
-                        state[j + G_COLOR + c * PIXELS] = g_rgb[Y, X, c]
+                        state[j + L.G_COLOR + c * L.PIXELS] = g_rgb[Y, X, c]
                     deepest = max(deepest, last[Y, X])
                     reach[y] = max(reach[y], f(last[Y, X]))
         first = starts[t]
@@ -203,9 +170,9 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             i = ids[q]
             p, out = rows[i], pair_rows[q]
             rank = f(q - first + 1)
-            y0, y1 = max(boxes[i, 1] - ty, 0), min(boxes[i, 3] - ty, TILE)
-            x0, x1 = max(boxes[i, 0] - tx, 0), min(boxes[i, 2] - tx, TILE)
-            fx0, fy0 = f(tx) + f(0.5) - p[UX], f(ty) + f(0.5) - p[UY]
+            y0, y1 = max(boxes[i, 1] - ty, 0), min(boxes[i, 3] - ty, L.TILE)
+            x0, x1 = max(boxes[i, 0] - tx, 0), min(boxes[i, 2] - tx, L.TILE)
+            fx0, fy0 = f(tx) + f(0.5) - p[L.UX], f(ty) + f(0.5) - p[L.UY]
             row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, bounds)
             for y in range(y0, y1):
                 rows_live[y] = f(1) if reach[y] >= rank else f(0)
@@ -218,57 +185,57 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor)
             opacity(S, n16, amin, amax)
             for k in range(n, n16):
-                S[GRAD + k] = f(0)
+                S[L.GRAD + k] = f(0)
             if net is not None:
                 ray_colours(S, D, waves, n16, i, net, slots, colors[i], True)
                 for c in range(C, 2 * C):
                     for k in range(n, n16):
-                        S[RAY_COLOUR + c * LANES + k] = f(0)
+                        S[L.RAY_COLOUR + c * L.LANES + k] = f(0)
             for k in range(n16):
-                S[GMID + k] = f(0)
+                S[L.GMID + k] = f(0)
             sums[:] = f(0)
             for y in range(y0, y1):
-                a, b = bounds[y], bounds[y + TILE]
+                a, b = bounds[y], bounds[y + L.TILE]
                 if b > a:
                     at = offset[y] - a
                     if C == 3 and not with_depth:
                         if net is None:
-                            _uncomposite_rgb_row(state, S, y * TILE, at, sums, a, b, rank, colors[i, 0], colors[i, 1], colors[i, 2])
+                            _uncomposite_rgb_row(state, S, y * L.TILE, at, sums, a, b, rank, colors[i, 0], colors[i, 1], colors[i, 2])
                         else:
-                            uncomposite_rgb_ray_colours(state, S, y * TILE, at, sums, a, b, rank)
+                            uncomposite_rgb_ray_colours(state, S, y * L.TILE, at, sums, a, b, rank)
                         continue
                     cg[:] = f(0)
                     if net is None:
                         for c in range(C):
-                            st, color = state[G_COLOR + c * PIXELS + y * TILE :], colors[i, c]
-                            for k in range(TILE):
+                            st, color = state[L.G_COLOR + c * L.PIXELS + y * L.TILE :], colors[i, c]
+                            for k in range(L.TILE):
                                 cg[k] += color * st[k]
                     else:
-                        weigh_ray_colours(state, S, y * TILE, at, cg, C)
+                        weigh_ray_colours(state, S, y * L.TILE, at, cg, C)
                     if with_depth:
-                        st = state[GZ + y * TILE :]
+                        st = state[L.GZ + y * L.TILE :]
                         for k in range(a, b):
-                            cg[k] += st[k] * (p[ANCHOR_Z] + p[UNIT] * (S[MID + at + k] + S[SLIDE + at + k]))
-                    _uncomposite_row(state[y * TILE :], S[ALPHA + at :], cg, w, a, b, rank)
-                    _tally(state[y * TILE :], w, sums)
+                            cg[k] += st[k] * (p[L.ANCHOR_Z] + p[L.UNIT] * (S[L.MID + at + k] + S[L.SLIDE + at + k]))
+                    _uncomposite_row(state[y * L.TILE :], S[L.ALPHA + at :], cg, w, a, b, rank)
+                    _tally(state[y * L.TILE :], w, sums)
                     if net is None:
                         for c in range(C):
-                            st = state[G_COLOR + c * PIXELS + y * TILE :]
-                            for k in range(TILE):
-                                sums[(2 + c) * TILE + k] += w[k] * st[k]
+                            st = state[L.G_COLOR + c * L.PIXELS + y * L.TILE :]
+                            for k in range(L.TILE):
+                                sums[(2 + c) * L.TILE + k] += w[k] * st[k]
                     else:
-                        ray_colour_gradient_row(state, S, y * TILE, at, w, a, b, C)
+                        ray_colour_gradient_row(state, S, y * L.TILE, at, w, a, b, C)
                     if with_depth:
-                        st = state[GZ + y * TILE :]
+                        st = state[L.GZ + y * L.TILE :]
                         for k in range(a, b):
-                            S[GMID + at + k] = w[k] * st[k] * p[UNIT]
+                            S[L.GMID + at + k] = w[k] * st[k] * p[L.UNIT]
             weight = _total(sums, 0)
             if weight == f(0):
                 continue  # hidden or below the cut everywhere: every gradient is zero
-            out[G_WEIGHT], out[G_ERROR] = weight, _total(sums, TILE)
+            out[L.G_WEIGHT], out[L.G_ERROR] = weight, _total(sums, L.TILE)
             if net is None:
                 for c in range(C):
-                    out[color_at + c] = _total(sums, (2 + c) * TILE)
+                    out[color_at + c] = _total(sums, (2 + c) * L.TILE)
             field_gradient(S, n16, out)
             for m in range(0, neurons, 2):
                 two_neurons(S, V[m], V[m + 1], n16, p, m, out)
@@ -287,7 +254,7 @@ def sum_rows(start, stop, order, first, slots, pair_rows, grads, touched):  # ty
         g[:] = np.float32(0)
         for k in range(first[r], first[r + 1]):
             row = pair_rows[slots[k]]
-            if row[G_WEIGHT] > np.float32(0):
+            if row[L.G_WEIGHT] > np.float32(0):
                 for c in range(g.shape[0]):
                     g[c] += row[c]
-        touched[i] = g[G_WEIGHT] > np.float32(0)
+        touched[i] = g[L.G_WEIGHT] > np.float32(0)

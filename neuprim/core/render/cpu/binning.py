@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.threads import parallel_for
-from neuprim.core.render.cpu.layout import HX, HY, SKEW, TILE, UNBOUNDED, UX, UY, XC, YC
+from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.prepare import VISIBLE
 
 __all__ = ["TileLists", "bin_primitives", "depth_order"]
@@ -58,24 +58,24 @@ def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
 @njit(error_model="numpy", forceinline=True)
 def _tile_range(span, ux, uy, box, ty):  # type: ignore[no-untyped-def]
     """Tiles [lo, hi) of tile row ``ty`` that the silhouette reaches (exact for ellipses, up to a 1e-3 pixel margin)."""
-    lo, hi = box[0] // TILE, (box[2] - 1) // TILE + 1
-    if span[HY] < UNBOUNDED:
-        hx, hy, skew = np.float64(span[HX]), np.float64(span[HY]), np.float64(span[SKEW])
-        base = 0.5 - uy - span[YC]
-        d0 = max(ty * TILE, box[1]) + base
-        d1 = min(ty * TILE + TILE, box[3]) - 1 + base
+    lo, hi = box[0] // L.TILE, (box[2] - 1) // L.TILE + 1
+    if span[L.HY] < L.UNBOUNDED:
+        hx, hy, skew = np.float64(span[L.HX]), np.float64(span[L.HY]), np.float64(span[L.SKEW])
+        base = 0.5 - uy - span[L.YC]
+        d0 = max(ty * L.TILE, box[1]) + base
+        d1 = min(ty * L.TILE + L.TILE, box[3]) - 1 + base
         d0, d1 = max(d0, -hy), min(d1, hy)
         if d1 < d0:
             return lo, lo
         peak = skew * hy * hy / np.sqrt(hx * hx + skew * skew * hy * hy)  # where the ellipse is furthest right
         a, b = min(max(peak, d0), d1), min(max(-peak, d0), d1)
-        right = skew * a + hx * np.sqrt(max(1 - (a / hy) ** 2, 0.0)) + span[XC] + ux
-        left = skew * b - hx * np.sqrt(max(1 - (b / hy) ** 2, 0.0)) + span[XC] + ux
+        right = skew * a + hx * np.sqrt(max(1 - (a / hy) ** 2, 0.0)) + span[L.XC] + ux
+        left = skew * b - hx * np.sqrt(max(1 - (b / hy) ** 2, 0.0)) + span[L.XC] + ux
         first = max(np.ceil(left - 0.501), np.float64(box[0]))
         last = min(np.floor(right - 0.499), np.float64(box[2] - 1))
         if last < first:
             return lo, lo
-        lo, hi = int(first) // TILE, int(last) // TILE + 1
+        lo, hi = int(first) // L.TILE, int(last) // L.TILE + 1
     return lo, hi
 
 
@@ -86,8 +86,8 @@ def _count(start, stop, order, rows, spans, boxes, status, counts):  # type: ign
         total = 0
         if status[i] == VISIBLE:
             box = boxes[i]
-            for ty in range(box[1] // TILE, (box[3] - 1) // TILE + 1):
-                lo, hi = _tile_range(spans[i], np.float64(rows[i, UX]), np.float64(rows[i, UY]), box, ty)
+            for ty in range(box[1] // L.TILE, (box[3] - 1) // L.TILE + 1):
+                lo, hi = _tile_range(spans[i], np.float64(rows[i, L.UX]), np.float64(rows[i, L.UY]), box, ty)
                 total += hi - lo
         counts[r] = total
 
@@ -99,8 +99,8 @@ def _list(start, stop, order, rows, spans, boxes, first, across, tiles):  # type
         if end > n:
             i = order[r]
             box = boxes[i]
-            for ty in range(box[1] // TILE, (box[3] - 1) // TILE + 1):
-                lo, hi = _tile_range(spans[i], np.float64(rows[i, UX]), np.float64(rows[i, UY]), box, ty)
+            for ty in range(box[1] // L.TILE, (box[3] - 1) // L.TILE + 1):
+                lo, hi = _tile_range(spans[i], np.float64(rows[i, L.UX]), np.float64(rows[i, L.UY]), box, ty)
                 for tx in range(lo, hi):
                     tiles[n] = ty * across + tx
                     n += 1
@@ -131,7 +131,7 @@ def bin_primitives(rows: Any, spans: Any, boxes: Any, depth: Any, status: Any, w
     first = np.zeros(count + 1, np.int64)
     np.cumsum(counts, out=first[1:])
     pairs = int(first[-1])
-    across, down = -(-width // TILE), -(-height // TILE)
+    across, down = -(-width // L.TILE), -(-height // L.TILE)
     tiles = np.empty(pairs, np.int32)
     parallel_for(_list, count, 512, threads, order, rows, spans, boxes, first, across, tiles)
     starts = np.zeros(across * down + 1, np.int64)

@@ -13,7 +13,7 @@ import numpy as np
 
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.threads import parallel_for
-from neuprim.core.render.cpu.layout import NET_OUT, PHASE, WX, net_row_width
+from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.prepare import FLOAT64_TURNS, rotation, rotation_backward
 
 __all__ = ["Net", "net_backward", "net_rows", "prepare_net"]
@@ -52,22 +52,22 @@ def prepare_net(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast
         for a in range(3):
             axes[a] = np.exp(np.float64(log_scales[i, a]) - top)
         for j in range(H):
-            o, square = (NET_OUT + C) * j, 0.0
+            o, square = (L.NET_OUT + C) * j, 0.0
             for a in range(3):
                 w = _TURNS * axes[a] * (Wx[i, j, 0] * local[0, a] + Wx[i, j, 1] * local[1, a] + Wx[i, j, 2] * local[2, a])
-                row[o + WX + a] = w
+                row[o + L.WX + a] = w
                 square += w * w
             phase = _TURNS * np.float64(bias[i, j])
-            row[o + PHASE] = phase - np.rint(phase)
+            row[o + L.PHASE] = phase - np.rint(phase)
             for c in range(C):
-                row[o + NET_OUT + c] = Wout[i, c, j]
+                row[o + L.NET_OUT + c] = Wout[i, c, j]
             fast[n] |= square > FLOAT64_TURNS**2
 
 
 def net_rows(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:
     """Network rows of primitives ``which``, float64 if ``wide``, and which of them have a fast unit."""
     H, C = t["Wx"].shape[1], t["Wout"].shape[1]
-    out = np.empty((len(which), net_row_width(H + H % 2, C)), np.float64 if wide else np.float32)
+    out = np.empty((len(which), L.net_row_width(H + H % 2, C)), np.float64 if wide else np.float32)
     fast = np.empty(len(which), np.bool_)
     parallel_for(
         prepare_net,
@@ -112,21 +112,23 @@ def net_backward(  # type: ignore[no-untyped-def]
             for b in range(3):
                 gL[a, b] = 0.0
         for j in range(H):
-            o = (NET_OUT + C) * j
+            o = (L.NET_OUT + C) * j
             og = first + o
             for b in range(3):
                 g_Wx[i, j, b] = _TURNS * (
-                    g[og + WX] * axes[0] * local[b, 0] + g[og + WX + 1] * axes[1] * local[b, 1] + g[og + WX + 2] * axes[2] * local[b, 2]
+                    g[og + L.WX] * axes[0] * local[b, 0]
+                    + g[og + L.WX + 1] * axes[1] * local[b, 1]
+                    + g[og + L.WX + 2] * axes[2] * local[b, 2]
                 )
             for a in range(3):
-                gw = np.float64(g[og + WX + a])
-                gl[a] += gw * rows[i, o + WX + a]  # scales with s_a/m
-                gl[longest] -= gw * rows[i, o + WX + a]
+                gw = np.float64(g[og + L.WX + a])
+                gl[a] += gw * rows[i, o + L.WX + a]  # scales with s_a/m
+                gl[longest] -= gw * rows[i, o + L.WX + a]
                 for b in range(3):
                     gL[b, a] += _TURNS * axes[a] * Wx[i, j, b] * gw
-            g_bias[i, j] = _TURNS * g[og + PHASE]
+            g_bias[i, j] = _TURNS * g[og + L.PHASE]
             for c in range(C):
-                g_Wout[i, c, j] = g[og + NET_OUT + c]
+                g_Wout[i, c, j] = g[og + L.NET_OUT + c]
         for a in range(4):
             q[a] = quats[i, a]
         rotation_backward(q, inverse, gL, gq)

@@ -16,35 +16,10 @@ from typing import Any
 import numpy as np
 
 from neuprim.core.compute.kernels import inline, kernel
+from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.backward import opacity
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.gradients import chord_gradient, field_gradient, two_neurons
-from neuprim.core.render.cpu.layout import (
-    ALPHA,
-    ANCHOR_Z,
-    BACKWARD_SCRATCH,
-    G_ERROR,
-    G_NEURONS,
-    G_WEIGHT,
-    GMID,
-    GRAD,
-    HALF,
-    LANES,
-    MID,
-    NET_SCRATCH,
-    NEURON_SCRATCH,
-    NORM,
-    PER_NEURON,
-    PIXELS,
-    RAY_COLOUR,
-    SLIDE,
-    SLOPE,
-    TILE,
-    UNCUT,
-    UNIT,
-    UX,
-    UY,
-)
 from neuprim.core.render.cpu.neurons import field_values, field_with_slopes
 from neuprim.core.render.cpu.ray_colours import ray_colour_gradient, ray_colours
 from neuprim.core.render.cpu.tiles import compact, row_spans
@@ -64,9 +39,9 @@ _CUT = f(-1e30)  # entry of every chord that the near plane cuts: in front of al
 @inline
 def _lanes_of(S, state, offset, bounds, rows_live, span, box, p, tx, ty):  # type: ignore[no-untyped-def]
     """Compact the pixels of one pair into lanes; returns (lanes, first row, row after the last)."""
-    y0, y1 = max(box[1] - ty, 0), min(box[3] - ty, TILE)
-    x0, x1 = max(box[0] - tx, 0), min(box[2] - tx, TILE)
-    fx0, fy0 = f(tx) + f(0.5) - p[UX], f(ty) + f(0.5) - p[UY]
+    y0, y1 = max(box[1] - ty, 0), min(box[3] - ty, L.TILE)
+    x0, x1 = max(box[0] - tx, 0), min(box[2] - tx, L.TILE)
+    fx0, fy0 = f(tx) + f(0.5) - p[L.UX], f(ty) + f(0.5) - p[L.UY]
     row_spans(span, fx0, fy0, y0, y1, x0, x1, bounds)
     return compact(S, state, offset, bounds, y0, y1, rows_live, fx0, fy0), y0, y1
 
@@ -75,11 +50,11 @@ def _lanes_of(S, state, offset, bounds, rows_live, span, box, p, tx, ty):  # typ
 def _load_tile(state, rows_live, norms, tx, ty):  # type: ignore[no-untyped-def]
     """Ray norms of a tile's pixels, and which of its rows lie in the image."""
     height, width = norms.shape
-    for y in range(TILE):
+    for y in range(L.TILE):
         rows_live[y] = f(1) if ty + y < height else f(0)
-        for x in range(TILE):
+        for x in range(L.TILE):
             inside = tx + x < width and ty + y < height
-            state[NORM + y * TILE + x] = norms[ty + y, tx + x] if inside else f(0)
+            state[L.NORM + y * L.TILE + x] = norms[ty + y, tx + x] if inside else f(0)
 
 
 @inline
@@ -88,8 +63,8 @@ def _room(first, end, ids, boxes, tx, ty):  # type: ignore[no-untyped-def]
     room = 1
     for q in range(first, end):
         box = boxes[ids[q]]
-        x = min(box[2] - tx, TILE) - max(box[0] - tx, 0)
-        y = min(box[3] - ty, TILE) - max(box[1] - ty, 0)
+        x = min(box[2] - tx, L.TILE) - max(box[0] - tx, 0)
+        y = min(box[3] - ty, L.TILE) - max(box[1] - ty, 0)
         room += max(x, 0) * max(y, 0)
     return room
 
@@ -118,20 +93,20 @@ def _list_hits(  # type: ignore[no-untyped-def]
         opacity(S, n16, amin, amax)
         if net is not None:
             ray_colours(S, D, waves, n16, i, net, slots, colors[i], False)
-        anchor, unit = p[ANCHOR_Z], p[UNIT]
+        anchor, unit = p[L.ANCHOR_Z], p[L.UNIT]
         for y in range(y0, y1):
             at = offset[y] - bounds[y]
-            for x in range(bounds[y], bounds[y + TILE]):
+            for x in range(bounds[y], bounds[y + L.TILE]):
                 k = at + x
-                if S[ALPHA + k] > f(0):
-                    middle = S[MID + k] + S[SLIDE + k]
-                    hits[count, H_ENTRY] = anchor + unit * (middle - S[HALF + k]) if S[UNCUT + k] > f(0) else _CUT
-                    hits[count, H_ALPHA], hits[count, H_SLOPE] = S[ALPHA + k], S[SLOPE + k]
+                if S[L.ALPHA + k] > f(0):
+                    middle = S[L.MID + k] + S[L.SLIDE + k]
+                    hits[count, H_ENTRY] = anchor + unit * (middle - S[L.HALF + k]) if S[L.UNCUT + k] > f(0) else _CUT
+                    hits[count, H_ALPHA], hits[count, H_SLOPE] = S[L.ALPHA + k], S[L.SLOPE + k]
                     hits[count, H_DEPTH] = anchor + unit * middle
-                    marks[count, H_PIXEL], marks[count, H_LANE], marks[count, H_PAIR] = y * TILE + x, k, q - first
+                    marks[count, H_PIXEL], marks[count, H_LANE], marks[count, H_PAIR] = y * L.TILE + x, k, q - first
                     if net is not None:
                         for c in range(hues.shape[1]):
-                            hues[count, c] = max(S[RAY_COLOUR + c * LANES + k], f(0))
+                            hues[count, c] = max(S[L.RAY_COLOUR + c * L.LANES + k], f(0))
                     count += 1
     starts_of[end - first] = count
     return count, evaluated
@@ -147,16 +122,16 @@ def _sort_hits(count, hits, marks, begin, listing):  # type: ignore[no-untyped-d
     begin[:] = 0
     for s in range(count):
         begin[marks[s, H_PIXEL] + 1] += 1
-    for j in range(PIXELS):
+    for j in range(L.PIXELS):
         begin[j + 1] += begin[j]
     for s in range(count):
         j = marks[s, H_PIXEL]
         listing[begin[j]] = s
         begin[j] += 1
-    for j in range(PIXELS):  # every begin has moved to its end: move them back
-        begin[PIXELS - j] = begin[PIXELS - j - 1]
+    for j in range(L.PIXELS):  # every begin has moved to its end: move them back
+        begin[L.PIXELS - j] = begin[L.PIXELS - j - 1]
     begin[0] = 0
-    for j in range(PIXELS):
+    for j in range(L.PIXELS):
         first = begin[j]
         for e in range(first + 1, begin[j + 1]):
             s = listing[e]
@@ -174,24 +149,24 @@ def composite_tiles_by_entry(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """As :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``last`` receives how many hits each pixel composited."""
     height, width = norms.shape
-    across = (width + TILE - 1) // TILE
+    across = (width + L.TILE - 1) // L.TILE
     C = colors.shape[1]
     tmin = limits[2]
-    scratch = BACKWARD_SCRATCH
+    scratch = L.BACKWARD_SCRATCH
     waves: Any = None
     hues: Any = None
     if net is not None:
-        scratch = BACKWARD_SCRATCH + 2 * C * LANES
-        waves, hues = np.zeros((net.hidden, NET_SCRATCH), np.float32), np.empty((1, C), np.float32)
+        scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
+        waves, hues = np.zeros((net.hidden, L.NET_SCRATCH), np.float32), np.empty((1, C), np.float32)
     S, D = np.zeros(scratch + 1024, np.float32), np.zeros(FLOAT64_SCRATCH, np.float64)
-    state = np.zeros(NORM + PIXELS + 2 * TILE, np.float32)
-    bounds, offset = np.zeros(2 * TILE, np.int32), np.zeros(TILE, np.int32)
-    rows_live, color = np.zeros(TILE, np.float32), np.zeros(C, np.float32)
+    state = np.zeros(L.NORM + L.PIXELS + 2 * L.TILE, np.float32)
+    bounds, offset = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32)
+    rows_live, color = np.zeros(L.TILE, np.float32), np.zeros(C, np.float32)
     hits, marks, listing = np.empty((1, H_FLOATS), np.float32), np.empty((1, H_INTS), np.int32), np.empty(1, np.int32)
-    starts_of, begin = np.empty(1, np.int32), np.empty(PIXELS + 1, np.int32)
+    starts_of, begin = np.empty(1, np.int32), np.empty(L.PIXELS + 1, np.int32)
     evaluated = 0
     for t in range(start, stop):
-        tx, ty = (t % across) * TILE, (t // across) * TILE
+        tx, ty = (t % across) * L.TILE, (t // across) * L.TILE
         first, end = starts[t], starts[t + 1]
         _load_tile(state, rows_live, norms, tx, ty)
         room = _room(first, end, ids, boxes, tx, ty)
@@ -207,9 +182,9 @@ def composite_tiles_by_entry(  # type: ignore[no-untyped-def]
         )  # fmt: skip
         evaluated += lanes
         _sort_hits(count, hits, marks, begin, listing)
-        for y in range(min(TILE, height - ty)):
-            for x in range(min(TILE, width - tx)):
-                j = y * TILE + x
+        for y in range(min(L.TILE, height - ty)):
+            for x in range(min(L.TILE, width - tx)):
+                j = y * L.TILE + x
                 T, z, drawn = f(1), f(0), 0
                 color[:] = f(0)
                 for e in range(begin[j], begin[j + 1]):
@@ -239,26 +214,26 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """As :func:`~neuprim.core.render.cpu.backward.backward_tiles`. Composites anew, so ``transmittance`` and ``last`` are not read."""
     height, width = norms.shape
-    across = (width + TILE - 1) // TILE
+    across = (width + L.TILE - 1) // L.TILE
     C = colors.shape[1]
-    color_at = G_NEURONS + PER_NEURON * neurons
+    color_at = L.G_NEURONS + L.PER_NEURON * neurons
     tmin, floor = limits[2], limits[3]
-    scratch = BACKWARD_SCRATCH
+    scratch = L.BACKWARD_SCRATCH
     waves: Any = None
     hues: Any = None
     if net is not None:
-        scratch = BACKWARD_SCRATCH + 2 * C * LANES
-        waves, hues = np.zeros((net.hidden, NET_SCRATCH), np.float32), np.empty((1, C), np.float32)
+        scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
+        waves, hues = np.zeros((net.hidden, L.NET_SCRATCH), np.float32), np.empty((1, C), np.float32)
     S, D = np.zeros(scratch + 1024, np.float32), np.zeros(FLOAT64_SCRATCH, np.float64)
-    V = np.zeros((neurons, NEURON_SCRATCH), np.float32)
-    state = np.zeros(NORM + PIXELS + 2 * TILE, np.float32)
-    bounds, offset = np.zeros(2 * TILE, np.int32), np.zeros(TILE, np.int32)
-    rows_live = np.zeros(TILE, np.float32)
+    V = np.zeros((neurons, L.NEURON_SCRATCH), np.float32)
+    state = np.zeros(L.NORM + L.PIXELS + 2 * L.TILE, np.float32)
+    bounds, offset = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32)
+    rows_live = np.zeros(L.TILE, np.float32)
     hits, marks, listing = np.empty((1, H_FLOATS), np.float32), np.empty((1, H_INTS), np.int32), np.empty(1, np.int32)
-    starts_of, begin = np.empty(1, np.int32), np.empty(PIXELS + 1, np.int32)
+    starts_of, begin = np.empty(1, np.int32), np.empty(L.PIXELS + 1, np.int32)
     evaluated = 0
     for t in range(start, stop):
-        tx, ty = (t % across) * TILE, (t // across) * TILE
+        tx, ty = (t % across) * L.TILE, (t // across) * L.TILE
         first, end = starts[t], starts[t + 1]
         _load_tile(state, rows_live, norms, tx, ty)
         room = _room(first, end, ids, boxes, tx, ty)
@@ -275,9 +250,9 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
         evaluated += lanes
         _sort_hits(count, hits, marks, begin, listing)
 
-        for y in range(min(TILE, height - ty)):
-            for x in range(min(TILE, width - tx)):
-                j, Y, X = y * TILE + x, ty + y, tx + x
+        for y in range(min(L.TILE, height - ty)):
+            for x in range(min(L.TILE, width - tx)):
+                j, Y, X = y * L.TILE + x, ty + y, tx + x
                 T, stopped = f(1), begin[j]
                 for e in range(begin[j], begin[j + 1]):
                     s = listing[e]
@@ -307,7 +282,7 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
             weight, wrong = f(0), f(0)
             for s in range(starts_of[q - first], starts_of[q - first + 1]):
                 j, w = marks[s, H_PIXEL], hits[s, H_WEIGHT]
-                Y, X = ty + j // TILE, tx + j % TILE
+                Y, X = ty + j // L.TILE, tx + j % L.TILE
                 weight += w
                 wrong += w * error[Y, X]
                 if net is None:
@@ -315,27 +290,27 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
                         out[color_at + c] += w * g_rgb[Y, X, c]
             if weight == f(0):
                 continue  # hidden or below the cut everywhere: every gradient is zero
-            out[G_WEIGHT], out[G_ERROR] = weight, wrong
+            out[L.G_WEIGHT], out[L.G_ERROR] = weight, wrong
             n, y0, y1 = _lanes_of(S, state, offset, bounds, rows_live, spans[i], boxes[i], p, tx, ty)
             n16 = ((n + 15) // 16) * 16
             evaluated += n16
             field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor)
             for k in range(n16):
-                S[GRAD + k], S[GMID + k] = f(0), f(0)
+                S[L.GRAD + k], S[L.GMID + k] = f(0), f(0)
             if net is not None:
                 ray_colours(S, D, waves, n16, i, net, slots, colors[i], True)
                 for c in range(C, 2 * C):
                     for k in range(n16):
-                        S[RAY_COLOUR + c * LANES + k] = f(0)
+                        S[L.RAY_COLOUR + c * L.LANES + k] = f(0)
             for s in range(starts_of[q - first], starts_of[q - first + 1]):
                 k, j = marks[s, H_LANE], marks[s, H_PIXEL]
-                S[GRAD + k] = hits[s, H_GRAD]
+                S[L.GRAD + k] = hits[s, H_GRAD]
                 if net is not None:
                     for c in range(C):
-                        if S[RAY_COLOUR + c * LANES + k] >= f(0):
-                            S[RAY_COLOUR + (C + c) * LANES + k] = hits[s, H_WEIGHT] * g_rgb[ty + j // TILE, tx + j % TILE, c]
+                        if S[L.RAY_COLOUR + c * L.LANES + k] >= f(0):
+                            S[L.RAY_COLOUR + (C + c) * L.LANES + k] = hits[s, H_WEIGHT] * g_rgb[ty + j // L.TILE, tx + j % L.TILE, c]
                 if with_depth:
-                    S[GMID + k] = hits[s, H_WEIGHT] * g_z[ty + j // TILE, tx + j % TILE] * p[UNIT]
+                    S[L.GMID + k] = hits[s, H_WEIGHT] * g_z[ty + j // L.TILE, tx + j % L.TILE] * p[L.UNIT]
             field_gradient(S, n16, out)
             for m in range(0, neurons, 2):
                 two_neurons(S, V[m], V[m + 1], n16, p, m, out)

@@ -9,57 +9,17 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import inline
-from neuprim.core.render.cpu.layout import (
-    AMPLITUDE,
-    DH,
-    E0,
-    EX,
-    EXL,
-    EY,
-    EYL,
-    EZL,
-    FIELD,
-    HALF,
-    HEIGHT,
-    IA,
-    MID,
-    N_COS,
-    N_DSINC,
-    N_SIN,
-    NEAR,
-    NEURONS,
-    OFFSET,
-    PER_NEURON,
-    PHASE,
-    PX,
-    PY,
-    PZ,
-    QX,
-    QY,
-    QZ,
-    SLIDE,
-    TC,
-    TILE,
-    TM,
-    UNCUT,
-    UX,
-    UY,
-    WX,
-    WY,
-    WZ,
-    XA,
-    lane,
-)
+from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, dsinc_turns, sinc_turns
 
 __all__ = ["FLOAT64_SCRATCH", "chords_float64", "neurons_float64", "phase_float64", "slopes_float64"]
 
 f = np.float32
 # float64 lanes: chord middle and half chord vector in whitened space
-_Q, _V = (lane(0), lane(1), lane(2)), (lane(3), lane(4), lane(5))
+_Q, _V = (L.lane(0), L.lane(1), L.lane(2)), (L.lane(3), L.lane(4), L.lane(5))
 _Q0, _Q1, _Q2 = _Q
 _V0, _V1, _V2 = _V
-FLOAT64_SCRATCH = lane(6)
+FLOAT64_SCRATCH = L.lane(6)
 
 
 @inline
@@ -67,62 +27,62 @@ def chords_float64(S, X, bounds, y0, y1, tx, ty, n, p, depth_floor, with_mid, ba
     """As :func:`~neuprim.core.render.cpu.tiles.chords` from a float64 row ``p``, for the pixels of ``bounds``; lanes n: are padding."""
     at = 0
     for y in range(y0, y1):
-        dv = ty + y + 0.5 - p[UY]
-        for x in range(bounds[y], bounds[y + TILE]):
-            du = tx + x + 0.5 - p[UX]
-            gx, gy, gz = du * p[EX] + dv * p[EY], du * p[EX + 1] + dv * p[EY + 1], du * p[EX + 2] + dv * p[EY + 2]
-            ex, ey, ez = p[E0] + gx, p[E0 + 1] + gy, p[E0 + 2] + gz
-            mx, my, mz = p[XA] + p[TC] * gx, p[XA + 1] + p[TC] * gy, p[XA + 2] + p[TC] * gz
+        dv = ty + y + 0.5 - p[L.UY]
+        for x in range(bounds[y], bounds[y + L.TILE]):
+            du = tx + x + 0.5 - p[L.UX]
+            gx, gy, gz = du * p[L.EX] + dv * p[L.EY], du * p[L.EX + 1] + dv * p[L.EY + 1], du * p[L.EX + 2] + dv * p[L.EY + 2]
+            ex, ey, ez = p[L.E0] + gx, p[L.E0 + 1] + gy, p[L.E0 + 2] + gz
+            mx, my, mz = p[L.XA] + p[L.TC] * gx, p[L.XA + 1] + p[L.TC] * gy, p[L.XA + 2] + p[L.TC] * gz
             ia = 1.0 / (ex * ex + ey * ey + ez * ez)
             tm = -(mx * ex + my * ey + mz * ez) * ia
             px, py, pz = mx + tm * ex, my + tm * ey, mz + tm * ez
             D = 1.0 - (px * px + py * py + pz * pz)
             h = np.sqrt(max(D, 0.0) * ia)
             t0, t1 = tm - h, tm + h
-            uncut = f(1) if t0 > p[NEAR] else f(0)
-            t0 = max(t0, p[NEAR])
+            uncut = f(1) if t0 > p[L.NEAR] else f(0)
+            t0 = max(t0, p[L.NEAR])
             mid = 0.5 * (t0 + t1)
             half = max(0.5 * (t1 - t0), 0.0)
             shift = mid - tm
             qx, qy, qz = px + shift * ex, py + shift * ey, pz + shift * ez
             X[at + _Q0], X[at + _Q1], X[at + _Q2] = qx, qy, qz
             X[at + _V0], X[at + _V1], X[at + _V2] = ex * half, ey * half, ez * half
-            S[QX + at], S[QY + at], S[QZ + at] = f(qx), f(qy), f(qz)
-            S[EXL + at], S[EYL + at], S[EZL + at] = f(ex), f(ey), f(ez)
-            S[HALF + at] = f(half)
-            S[FIELD + at] = f(p[OFFSET])
+            S[L.QX + at], S[L.QY + at], S[L.QZ + at] = f(qx), f(qy), f(qz)
+            S[L.EXL + at], S[L.EYL + at], S[L.EZL + at] = f(ex), f(ey), f(ez)
+            S[L.HALF + at] = f(half)
+            S[L.FIELD + at] = f(p[L.OFFSET])
             if with_mid:
-                S[MID + at] = f(mid)
+                S[L.MID + at] = f(mid)
             if backward:
-                S[PX + at], S[PY + at], S[PZ + at] = f(px), f(py), f(pz)
-                S[MID + at], S[TM + at], S[IA + at], S[UNCUT + at] = f(mid), f(tm), f(ia), uncut
-                S[HEIGHT + at], S[SLIDE + at] = f(h), f(0)
-                S[DH + at] = f(0.5 * ia / np.sqrt(max(D, np.float64(depth_floor)) * ia))
+                S[L.PX + at], S[L.PY + at], S[L.PZ + at] = f(px), f(py), f(pz)
+                S[L.MID + at], S[L.TM + at], S[L.IA + at], S[L.UNCUT + at] = f(mid), f(tm), f(ia), uncut
+                S[L.HEIGHT + at], S[L.SLIDE + at] = f(h), f(0)
+                S[L.DH + at] = f(0.5 * ia / np.sqrt(max(D, np.float64(depth_floor)) * ia))
             at += 1
     for k in range(at, n):  # padding: a chord of length zero, finite everywhere
-        for a in (QX, QY, QZ, EXL, EYL, EZL, HALF, FIELD):
+        for a in (L.QX, L.QY, L.QZ, L.EXL, L.EYL, L.EZL, L.HALF, L.FIELD):
             S[a + k] = f(0)
         for a in _Q + _V:
             X[a + k] = 0.0
         if with_mid or backward:
-            S[MID + k] = f(0)
+            S[L.MID + k] = f(0)
         if backward:
-            for a in (PX, PY, PZ, TM, IA, UNCUT, HEIGHT, SLIDE, DH):
+            for a in (L.PX, L.PY, L.PZ, L.TM, L.IA, L.UNCUT, L.HEIGHT, L.SLIDE, L.DH):
                 S[a + k] = f(0)
 
 
 @inline
 def phase_float64(X, k, p, o):  # type: ignore[no-untyped-def]
     """Phase at the chord's middle of the unit at ``o`` of a float64 row, reduced to half a turn."""
-    u = X[k + _Q0] * p[o + WX] + X[k + _Q1] * p[o + WY] + X[k + _Q2] * p[o + WZ] + p[o + PHASE]
+    u = X[k + _Q0] * p[o + L.WX] + X[k + _Q1] * p[o + L.WY] + X[k + _Q2] * p[o + L.WZ] + p[o + L.PHASE]
     return f(u - np.rint(u))
 
 
 @inline
 def _reduced(X, k, p, o):  # type: ignore[no-untyped-def]
     """Phase at the chord's middle and half its change, in turns: both reduced to half a turn, and the second whole."""
-    wx, wy, wz = p[o + WX], p[o + WY], p[o + WZ]
-    u = X[k + _Q0] * wx + X[k + _Q1] * wy + X[k + _Q2] * wz + p[o + PHASE]
+    wx, wy, wz = p[o + L.WX], p[o + L.WY], p[o + L.WZ]
+    u = X[k + _Q0] * wx + X[k + _Q1] * wy + X[k + _Q2] * wz + p[o + L.PHASE]
     v = X[k + _V0] * wx + X[k + _V1] * wy + X[k + _V2] * wz
     return f(u - np.rint(u)), f(v - np.rint(v)), v
 
@@ -131,20 +91,20 @@ def _reduced(X, k, p, o):  # type: ignore[no-untyped-def]
 def neurons_float64(S, X, n, p, neurons):  # type: ignore[no-untyped-def]
     """FIELD += w2 cos(phase at the middle) sinc(half its change) of every neuron of a float64 row."""
     for m in range(neurons):
-        o = NEURONS + PER_NEURON * m
+        o = L.NEURONS + L.PER_NEURON * m
         for k in range(n):
             r, s, v = _reduced(X, k, p, o)
             sinc = sinc_turns(s * s)
             if abs(v) > 0.5:
                 sinc *= f(s / v)
-            S[FIELD + k] += f(p[o + AMPLITUDE]) * cos_turns(r * r) * sinc
+            S[L.FIELD + k] += f(p[o + L.AMPLITUDE]) * cos_turns(r * r) * sinc
 
 
 @inline
 def slopes_float64(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
     """The same, and the three products per neuron that the gradients need."""
     for m in range(neurons):
-        o = NEURONS + PER_NEURON * m
+        o = L.NEURONS + L.PER_NEURON * m
         for k in range(n):
             r, s, v = _reduced(X, k, p, o)
             sinc, slope = sinc_turns(s * s), dsinc_turns(s * s) * f(2) * s
@@ -152,7 +112,7 @@ def slopes_float64(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
                 sinc *= f(s / v)
                 slope = (cos_turns(s * s) - sinc) * f(1.0 / v)
             c = cos_turns(r * r)
-            V[m, N_COS + k] = c * sinc
-            V[m, N_SIN + k] = -TAU * TAU * r * sinc_turns(r * r) * sinc
-            V[m, N_DSINC + k] = c * slope
-            S[FIELD + k] += f(p[o + AMPLITUDE]) * c * sinc
+            V[m, L.N_COS + k] = c * sinc
+            V[m, L.N_SIN + k] = -TAU * TAU * r * sinc_turns(r * r) * sinc
+            V[m, L.N_DSINC + k] = c * slope
+            S[L.FIELD + k] += f(p[o + L.AMPLITUDE]) * c * sinc

@@ -5,29 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import inline, kernel
+from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
-from neuprim.core.render.cpu.layout import (
-    ALPHA,
-    ANCHOR_Z,
-    BACKWARD_SCRATCH,
-    COLOR,
-    FIELD,
-    FORWARD_SCRATCH,
-    HALF,
-    LANES,
-    LAST,
-    MID,
-    NET_SCRATCH,
-    NORM,
-    NORM_L,
-    PIXELS,
-    T_,
-    TILE,
-    UNIT,
-    UX,
-    UY,
-    ZSUM,
-)
 from neuprim.core.render.cpu.neurons import field_values
 from neuprim.core.render.cpu.ray_colours import add_ray_colours, composite_rgb_ray_colours, ray_colours
 from neuprim.core.render.cpu.tiles import compact, row_spans
@@ -37,7 +16,7 @@ __all__ = ["composite_tiles"]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
-_STEPS = np.arange(TILE).astype(np.float32)
+_STEPS = np.arange(L.TILE).astype(np.float32)
 _LIVE_EVERY = 4  # pairs between two counts of live pixels: a dead row costs a few lanes, a count costs a reduction per row
 
 
@@ -45,40 +24,40 @@ _LIVE_EVERY = 4  # pairs between two counts of live pixels: a dead row costs a f
 def _opacity(S, n, amin, amax):  # type: ignore[no-untyped-def]
     """ALPHA of every lane: 0 below alpha_min and where the integral is not positive, at most alpha_max."""
     for k in range(n):
-        depth = S[FIELD + k] * S[HALF + k] * S[NORM_L + k] * f(2)
+        depth = S[L.FIELD + k] * S[L.HALF + k] * S[L.NORM_L + k] * f(2)
         alpha = min(one_minus_exp(depth), amax)
         alpha = alpha if alpha >= amin else f(0)
-        S[ALPHA + k] = alpha if depth > f(0) else f(0)
+        S[L.ALPHA + k] = alpha if depth > f(0) else f(0)
 
 
 @inline
 def _composite_rgb_row(state, S, base, at, a, b, tmin, rank, c0, c1, c2):  # type: ignore[no-untyped-def]
     """One pixel row of three channels: colour += alpha T c, then T; a pixel is live while T >= T_min."""
     a, b = f(a), f(b)
-    for k in range(TILE):
-        step, T = _STEPS[k], state[index(base + k + T_)]
+    for k in range(L.TILE):
+        step, T = _STEPS[k], state[index(base + k + L.T_)]
         use = (step >= a) & (step < b) & (T >= tmin)
         alpha = S[index(at + k)] if use else f(0)
         weight = alpha * T
-        state[index(base + k + T_)] = T - weight
-        state[index(base + k + LAST)] = rank if alpha > f(0) else state[index(base + k + LAST)]
-        state[index(base + k + COLOR)] += weight * c0
-        state[index(base + k + COLOR + PIXELS)] += weight * c1
-        state[index(base + k + COLOR + 2 * PIXELS)] += weight * c2
+        state[index(base + k + L.T_)] = T - weight
+        state[index(base + k + L.LAST)] = rank if alpha > f(0) else state[index(base + k + L.LAST)]
+        state[index(base + k + L.COLOR)] += weight * c0
+        state[index(base + k + L.COLOR + L.PIXELS)] += weight * c1
+        state[index(base + k + L.COLOR + 2 * L.PIXELS)] += weight * c2
 
 
 @inline
 def _composite_row(st, lanes, w, a, b, tmin, rank):  # type: ignore[no-untyped-def]
     """The same for any channels and depth: leaves the weights in ``w``."""
     a, b = f(a), f(b)
-    for k in range(TILE):
-        step, T = _STEPS[k], st[k + T_]
+    for k in range(L.TILE):
+        step, T = _STEPS[k], st[k + L.T_]
         use = (step >= a) & (step < b) & (T >= tmin)
         alpha = lanes[k] if use else f(0)
         weight = alpha * T
         w[k] = weight
-        st[k + T_] = T - weight
-        st[k + LAST] = rank if alpha > f(0) else st[k + LAST]
+        st[k + L.T_] = T - weight
+        st[k + L.LAST] = rank if alpha > f(0) else st[k + L.LAST]
 
 
 @kernel
@@ -94,35 +73,35 @@ def composite_tiles(  # type: ignore[no-untyped-def]
     colour, which leaves no trace of it in the compiled kernel, or the :class:`~neuprim.core.render.cpu.colour_net.Net` on that base.
     """
     height, width = norms.shape
-    across = (width + TILE - 1) // TILE
+    across = (width + L.TILE - 1) // L.TILE
     C = colors.shape[1]
     amin, amax, tmin, floor = limits[0], limits[1], limits[2], limits[3]
-    scratch = FORWARD_SCRATCH
+    scratch = L.FORWARD_SCRATCH
     if net is not None:
-        scratch = BACKWARD_SCRATCH + 2 * C * LANES
-        waves = np.zeros((net.hidden, NET_SCRATCH), np.float32)
+        scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
+        waves = np.zeros((net.hidden, L.NET_SCRATCH), np.float32)
     S, D = np.zeros(scratch + 1024, np.float32), np.zeros(FLOAT64_SCRATCH, np.float64)
-    state = np.zeros((4 + C) * PIXELS + 2 * TILE, np.float32)
-    w = np.zeros(TILE, np.float32)
-    bounds, offset = np.zeros(2 * TILE, np.int32), np.zeros(TILE, np.int32)
-    rows_live = np.zeros(TILE, np.float32)
+    state = np.zeros((4 + C) * L.PIXELS + 2 * L.TILE, np.float32)
+    w = np.zeros(L.TILE, np.float32)
+    bounds, offset = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32)
+    rows_live = np.zeros(L.TILE, np.float32)
     evaluated = 0
     for t in range(start, stop):
-        tx, ty = (t % across) * TILE, (t // across) * TILE
+        tx, ty = (t % across) * L.TILE, (t // across) * L.TILE
         state[:] = f(0)
-        for y in range(TILE):
+        for y in range(L.TILE):
             rows_live[y] = f(1) if ty + y < height else f(0)
-            for x in range(TILE):
-                j = y * TILE + x
-                state[j + T_] = f(-1)  # outside the image: never live
+            for x in range(L.TILE):
+                j = y * L.TILE + x
+                state[j + L.T_] = f(-1)  # outside the image: never live
                 if tx + x < width and ty + y < height:
-                    state[j + T_], state[j + NORM] = f(1), norms[ty + y, tx + x]
+                    state[j + L.T_], state[j + L.NORM] = f(1), norms[ty + y, tx + x]
         for q in range(starts[t], starts[t + 1]):
             i = ids[q]
             p = rows[i]
-            y0, y1 = max(boxes[i, 1] - ty, 0), min(boxes[i, 3] - ty, TILE)
-            x0, x1 = max(boxes[i, 0] - tx, 0), min(boxes[i, 2] - tx, TILE)
-            fx0, fy0 = f(tx) + f(0.5) - p[UX], f(ty) + f(0.5) - p[UY]
+            y0, y1 = max(boxes[i, 1] - ty, 0), min(boxes[i, 3] - ty, L.TILE)
+            x0, x1 = max(boxes[i, 0] - tx, 0), min(boxes[i, 2] - tx, L.TILE)
+            fx0, fy0 = f(tx) + f(0.5) - p[L.UX], f(ty) + f(0.5) - p[L.UY]
             row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, bounds)
             n = compact(S, state, offset, bounds, y0, y1, rows_live, fx0, fy0)
             if n > 0:
@@ -134,47 +113,47 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                     ray_colours(S, D, waves, n16, i, net, slots, colors[i], False)
                 rank = f(q - starts[t] + 1)
                 for y in range(y0, y1):
-                    a, b = bounds[y], bounds[y + TILE]
+                    a, b = bounds[y], bounds[y + L.TILE]
                     if b > a:
                         at = offset[y] - a  # the row's lanes start at offset[y], its pixels at a: shift so that both run with k
                         if C == 3 and not with_depth:
                             if net is None:
                                 _composite_rgb_row(
-                                    state, S, y * TILE, ALPHA + at, a, b, tmin, rank, colors[i, 0], colors[i, 1], colors[i, 2]
+                                    state, S, y * L.TILE, L.ALPHA + at, a, b, tmin, rank, colors[i, 0], colors[i, 1], colors[i, 2]
                                 )
                             else:
-                                composite_rgb_ray_colours(state, S, y * TILE, at, a, b, tmin, rank)
+                                composite_rgb_ray_colours(state, S, y * L.TILE, at, a, b, tmin, rank)
                         else:
-                            _composite_row(state[y * TILE :], S[ALPHA + at :], w, a, b, tmin, rank)
+                            _composite_row(state[y * L.TILE :], S[L.ALPHA + at :], w, a, b, tmin, rank)
                             if net is None:
                                 for c in range(C):
-                                    st, color = state[COLOR + c * PIXELS + y * TILE :], colors[i, c]
-                                    for k in range(TILE):
+                                    st, color = state[L.COLOR + c * L.PIXELS + y * L.TILE :], colors[i, c]
+                                    for k in range(L.TILE):
                                         st[k] += w[k] * color
                             else:
-                                add_ray_colours(state, S, y * TILE, at, w, C)
+                                add_ray_colours(state, S, y * L.TILE, at, w, C)
                             if with_depth:
-                                st = state[ZSUM + y * TILE :]
+                                st = state[L.ZSUM + y * L.TILE :]
                                 for k in range(a, b):
-                                    st[k] += w[k] * (p[ANCHOR_Z] + p[UNIT] * S[MID + at + k])
+                                    st[k] += w[k] * (p[L.ANCHOR_Z] + p[L.UNIT] * S[L.MID + at + k])
             if (q - starts[t]) % _LIVE_EVERY == _LIVE_EVERY - 1:
                 any_live = f(0)
-                for y in range(TILE):
+                for y in range(L.TILE):
                     if rows_live[y] > f(0):
                         top = f(-1)
-                        for k in range(TILE):
-                            top = max(top, state[T_ + y * TILE + k])
+                        for k in range(L.TILE):
+                            top = max(top, state[L.T_ + y * L.TILE + k])
                         rows_live[y] = f(1) if top >= tmin else f(0)
                         any_live += rows_live[y]
                 if any_live == f(0):
                     break
-        for y in range(min(TILE, height - ty)):
-            for x in range(min(TILE, width - tx)):
-                j = y * TILE + x
+        for y in range(min(L.TILE, height - ty)):
+            for x in range(min(L.TILE, width - tx)):
+                j = y * L.TILE + x
                 for c in range(C):
-                    rgb[ty + y, tx + x, c] = state[j + COLOR + c * PIXELS] + state[j + T_] * background[c]
-                transmittance[ty + y, tx + x] = state[j + T_]
-                last[ty + y, tx + x] = np.int32(state[j + LAST])
+                    rgb[ty + y, tx + x, c] = state[j + L.COLOR + c * L.PIXELS] + state[j + L.T_] * background[c]
+                transmittance[ty + y, tx + x] = state[j + L.T_]
+                last[ty + y, tx + x] = np.int32(state[j + L.LAST])
                 if with_depth:
-                    zsum[ty + y, tx + x] = state[j + ZSUM]
+                    zsum[ty + y, tx + x] = state[j + L.ZSUM]
     return evaluated

@@ -5,55 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import inline
-from neuprim.core.render.cpu.layout import (
-    AMPLITUDE,
-    DH,
-    DU,
-    DV,
-    E0,
-    EX,
-    EXL,
-    EY,
-    EYL,
-    EZL,
-    FIELD,
-    G_LOG_M,
-    G_NEURONS,
-    G_OFFSET,
-    GEX,
-    GEY,
-    GEZ,
-    GF,
-    GMID,
-    GQX,
-    GQY,
-    GQZ,
-    GRAD,
-    HALF,
-    HEIGHT,
-    IA,
-    MID,
-    N_COS,
-    N_DSINC,
-    N_SIN,
-    NEURONS,
-    PER_NEURON,
-    PHASE,
-    PX,
-    PY,
-    PZ,
-    QX,
-    QY,
-    QZ,
-    SLIDE,
-    TC,
-    TM,
-    UNCUT,
-    WX,
-    WY,
-    WZ,
-    XA,
-)
+from neuprim.core.render.cpu import layout as L
 
 __all__ = ["chord_gradient", "field_gradient", "two_neurons"]
 
@@ -65,69 +17,69 @@ def field_gradient(S, n, out):  # type: ignore[no-untyped-def]
     """From dL/d(2 FIELD HALF) to dL/d FIELD, and the sums for b2 and log m."""
     offset, log_m = f(0), f(0)
     for k in range(n):
-        g = f(2) * S[GRAD + k]
-        gf = g * S[HALF + k]
-        S[GRAD + k], S[GF + k] = g, gf
+        g = f(2) * S[L.GRAD + k]
+        gf = g * S[L.HALF + k]
+        S[L.GRAD + k], S[L.GF + k] = g, gf
         offset += gf
-        log_m += gf * S[FIELD + k]
-        S[GQX + k], S[GQY + k], S[GQZ + k] = f(0), f(0), f(0)
-        S[GEX + k], S[GEY + k], S[GEZ + k] = f(0), f(0), f(0)
-    out[G_OFFSET], out[G_LOG_M] = offset, log_m
+        log_m += gf * S[L.FIELD + k]
+        S[L.GQX + k], S[L.GQY + k], S[L.GQZ + k] = f(0), f(0), f(0)
+        S[L.GEX + k], S[L.GEY + k], S[L.GEZ + k] = f(0), f(0), f(0)
+    out[L.G_OFFSET], out[L.G_LOG_M] = offset, log_m
 
 
 @inline
 def two_neurons(S, V0, V1, n, p, m, out):  # type: ignore[no-untyped-def]
     """Gradients of neurons m and m + 1, and their share of dL/dQ and dL/d(half e); two at a time to share the loads."""
-    o = NEURONS + PER_NEURON * m
-    ax, ay, az, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + AMPLITUDE]
-    o2 = o + PER_NEURON
-    bx, by, bz, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + AMPLITUDE]
+    o = L.NEURONS + L.PER_NEURON * m
+    ax, ay, az, aa = p[o + L.WX], p[o + L.WY], p[o + L.WZ], p[o + L.AMPLITUDE]
+    o2 = o + L.PER_NEURON
+    bx, by, bz, ba = p[o2 + L.WX], p[o2 + L.WY], p[o2 + L.WZ], p[o2 + L.AMPLITUDE]
     s0, s1, s2, s3, s4 = f(0), f(0), f(0), f(0), f(0)
     r0, r1, r2, r3, r4 = f(0), f(0), f(0), f(0), f(0)
     for k in range(n):
-        gf, half = S[GF + k], S[HALF + k]
-        qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
-        ex, ey, ez = S[EXL + k] * half, S[EYL + k] * half, S[EZL + k] * half
-        s0 += gf * V0[N_COS + k]
-        u = gf * aa * V0[N_SIN + k]
-        v = gf * aa * V0[N_DSINC + k]
+        gf, half = S[L.GF + k], S[L.HALF + k]
+        qx, qy, qz = S[L.QX + k], S[L.QY + k], S[L.QZ + k]
+        ex, ey, ez = S[L.EXL + k] * half, S[L.EYL + k] * half, S[L.EZL + k] * half
+        s0 += gf * V0[L.N_COS + k]
+        u = gf * aa * V0[L.N_SIN + k]
+        v = gf * aa * V0[L.N_DSINC + k]
         s1 += u
         s2 += u * qx + v * ex
         s3 += u * qy + v * ey
         s4 += u * qz + v * ez
-        r0 += gf * V1[N_COS + k]
-        u1 = gf * ba * V1[N_SIN + k]
-        v1 = gf * ba * V1[N_DSINC + k]
+        r0 += gf * V1[L.N_COS + k]
+        u1 = gf * ba * V1[L.N_SIN + k]
+        v1 = gf * ba * V1[L.N_DSINC + k]
         r1 += u1
         r2 += u1 * qx + v1 * ex
         r3 += u1 * qy + v1 * ey
         r4 += u1 * qz + v1 * ez
-        S[GQX + k] += u * ax + u1 * bx
-        S[GQY + k] += u * ay + u1 * by
-        S[GQZ + k] += u * az + u1 * bz
-        S[GEX + k] += v * ax + v1 * bx
-        S[GEY + k] += v * ay + v1 * by
-        S[GEZ + k] += v * az + v1 * bz
-    o, o2 = G_NEURONS + PER_NEURON * m, G_NEURONS + PER_NEURON * (m + 1)
-    out[o + AMPLITUDE], out[o + PHASE], out[o + WX], out[o + WY], out[o + WZ] = s0, s1, s2, s3, s4
-    out[o2 + AMPLITUDE], out[o2 + PHASE], out[o2 + WX], out[o2 + WY], out[o2 + WZ] = r0, r1, r2, r3, r4
+        S[L.GQX + k] += u * ax + u1 * bx
+        S[L.GQY + k] += u * ay + u1 * by
+        S[L.GQZ + k] += u * az + u1 * bz
+        S[L.GEX + k] += v * ax + v1 * bx
+        S[L.GEY + k] += v * ay + v1 * by
+        S[L.GEZ + k] += v * az + v1 * bz
+    o, o2 = L.G_NEURONS + L.PER_NEURON * m, L.G_NEURONS + L.PER_NEURON * (m + 1)
+    out[o + L.AMPLITUDE], out[o + L.PHASE], out[o + L.WX], out[o + L.WY], out[o + L.WZ] = s0, s1, s2, s3, s4
+    out[o2 + L.AMPLITUDE], out[o2 + L.PHASE], out[o2 + L.WX], out[o2 + L.WY], out[o2 + L.WZ] = r0, r1, r2, r3, r4
 
 
 @inline
 def chord_gradient(S, n, p, out):  # type: ignore[no-untyped-def]
     """From chord middle, half chord and direction back to the affine ray (E0, EX, EY, XA)."""
-    tc = p[TC]
+    tc = p[L.TC]
     a0, a1, a2, a3, a4, a5 = f(0), f(0), f(0), f(0), f(0), f(0)
     a6, a7, a8, a9, b0, b1 = f(0), f(0), f(0), f(0), f(0), f(0)
     for k in range(n):
-        half, ex, ey, ez = S[HALF + k], S[EXL + k], S[EYL + k], S[EZL + k]
-        mid, tm, ia, uncut, dh = S[MID + k], S[TM + k], S[IA + k], S[UNCUT + k], S[DH + k]
-        px, py, pz, h, slide = S[PX + k], S[PY + k], S[PZ + k], S[HEIGHT + k], S[SLIDE + k]
-        gqx, gqy, gqz = S[GQX + k], S[GQY + k], S[GQZ + k]
-        vx, vy, vz = S[GEX + k], S[GEY + k], S[GEZ + k]
-        g_half = vx * ex + vy * ey + vz * ez + S[GRAD + k] * S[FIELD + k]
+        half, ex, ey, ez = S[L.HALF + k], S[L.EXL + k], S[L.EYL + k], S[L.EZL + k]
+        mid, tm, ia, uncut, dh = S[L.MID + k], S[L.TM + k], S[L.IA + k], S[L.UNCUT + k], S[L.DH + k]
+        px, py, pz, h, slide = S[L.PX + k], S[L.PY + k], S[L.PZ + k], S[L.HEIGHT + k], S[L.SLIDE + k]
+        gqx, gqy, gqz = S[L.GQX + k], S[L.GQY + k], S[L.GQZ + k]
+        vx, vy, vz = S[L.GEX + k], S[L.GEY + k], S[L.GEZ + k]
+        g_half = vx * ex + vy * ey + vz * ez + S[L.GRAD + k] * S[L.FIELD + k]
         gex, gey, gez = vx * half + mid * gqx, vy * half + mid * gqy, vz * half + mid * gqz
-        g_mid = gqx * ex + gqy * ey + gqz * ez + S[GMID + k]
+        g_mid = gqx * ex + gqy * ey + gqz * ez + S[L.GMID + k]
         gt1 = (g_mid + g_half) * f(0.5)
         gt0 = (g_mid - g_half) * f(0.5) * uncut
         g_tm, g_h = gt0 + gt1, gt1 - gt0  # t0 = tm - h, t1 = tm + h
@@ -142,7 +94,7 @@ def chord_gradient(S, n, p, out):  # type: ignore[no-untyped-def]
         gex += gp * px + gA2 * ex
         gey += gp * py + gA2 * ey
         gez += gp * pz + gA2 * ez
-        du, dv, reach = S[DU + k], S[DV + k], tc + slide
+        du, dv, reach = S[L.DU + k], S[L.DV + k], tc + slide
         hx, hy, hz = gex + reach * gmx, gey + reach * gmy, gez + reach * gmz
         a0 += gex + slide * gmx
         a1 += gey + slide * gmy
@@ -156,7 +108,7 @@ def chord_gradient(S, n, p, out):  # type: ignore[no-untyped-def]
         a9 += gmx
         b0 += gmy
         b1 += gmz
-    out[E0], out[E0 + 1], out[E0 + 2] = a0, a1, a2
-    out[EX], out[EX + 1], out[EX + 2] = a3, a4, a5
-    out[EY], out[EY + 1], out[EY + 2] = a6, a7, a8
-    out[XA], out[XA + 1], out[XA + 2] = a9, b0, b1
+    out[L.E0], out[L.E0 + 1], out[L.E0 + 2] = a0, a1, a2
+    out[L.EX], out[L.EX + 1], out[L.EX + 2] = a3, a4, a5
+    out[L.EY], out[L.EY + 1], out[L.EY + 2] = a6, a7, a8
+    out[L.XA], out[L.XA + 1], out[L.XA + 2] = a9, b0, b1

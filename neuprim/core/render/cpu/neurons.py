@@ -8,29 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import inline
+from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import chords_float64, neurons_float64, slopes_float64
-from neuprim.core.render.cpu.layout import (
-    AMPLITUDE,
-    EXL,
-    EYL,
-    EZL,
-    FIELD,
-    HALF,
-    MEDIUM,
-    N_COS,
-    N_DSINC,
-    N_SIN,
-    NEURONS,
-    PER_NEURON,
-    PHASE,
-    QX,
-    QY,
-    QZ,
-    SLOW,
-    WX,
-    WY,
-    WZ,
-)
 from neuprim.core.render.cpu.tiles import chords
 from neuprim.core.render.cpu.trigonometry import (
     TAU,
@@ -54,13 +33,13 @@ def _values(sincs):  # type: ignore[no-untyped-def]
 
     @inline
     def add(S, n, p, o):  # type: ignore[no-untyped-def]
-        ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
-        o2 = o + PER_NEURON
-        bx, by, bz, bb, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + PHASE], p[o2 + AMPLITUDE]
+        ax, ay, az, ab, aa = p[o + L.WX], p[o + L.WY], p[o + L.WZ], p[o + L.PHASE], p[o + L.AMPLITUDE]
+        o2 = o + L.PER_NEURON
+        bx, by, bz, bb, ba = p[o2 + L.WX], p[o2 + L.WY], p[o2 + L.WZ], p[o2 + L.PHASE], p[o2 + L.AMPLITUDE]
         for k in range(n):
-            half = S[HALF + k]
-            ex, ey, ez = S[EXL + k], S[EYL + k], S[EZL + k]
-            qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
+            half = S[L.HALF + k]
+            ex, ey, ez = S[L.EXL + k], S[L.EYL + k], S[L.EZL + k]
+            qx, qy, qz = S[L.QX + k], S[L.QY + k], S[L.QZ + k]
             v = (ex * ax + ey * ay + ez * az) * half
             u = qx * ax + qy * ay + qz * az + ab
             r = u - np.rint(u)
@@ -68,7 +47,7 @@ def _values(sincs):  # type: ignore[no-untyped-def]
             u1 = qx * bx + qy * by + qz * bz + bb
             r1 = u1 - np.rint(u1)
             sinc, sinc1 = sincs(v, v1)
-            S[FIELD + k] += cos_turns(r * r) * sinc * aa + cos_turns(r1 * r1) * sinc1 * ba
+            S[L.FIELD + k] += cos_turns(r * r) * sinc * aa + cos_turns(r1 * r1) * sinc1 * ba
 
     return add
 
@@ -81,13 +60,13 @@ def _slopes(slopes):  # type: ignore[no-untyped-def]
 
     @inline
     def add(S, V0, V1, n, p, o):  # type: ignore[no-untyped-def]
-        ax, ay, az, ab, aa = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + AMPLITUDE]
-        o2 = o + PER_NEURON
-        bx, by, bz, bb, ba = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + PHASE], p[o2 + AMPLITUDE]
+        ax, ay, az, ab, aa = p[o + L.WX], p[o + L.WY], p[o + L.WZ], p[o + L.PHASE], p[o + L.AMPLITUDE]
+        o2 = o + L.PER_NEURON
+        bx, by, bz, bb, ba = p[o2 + L.WX], p[o2 + L.WY], p[o2 + L.WZ], p[o2 + L.PHASE], p[o2 + L.AMPLITUDE]
         for k in range(n):
-            half = S[HALF + k]
-            ex, ey, ez = S[EXL + k], S[EYL + k], S[EZL + k]
-            qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
+            half = S[L.HALF + k]
+            ex, ey, ez = S[L.EXL + k], S[L.EYL + k], S[L.EZL + k]
+            qx, qy, qz = S[L.QX + k], S[L.QY + k], S[L.QZ + k]
             v = (ex * ax + ey * ay + ez * az) * half
             u = qx * ax + qy * ay + qz * az + ab
             r = u - np.rint(u)
@@ -97,13 +76,13 @@ def _slopes(slopes):  # type: ignore[no-untyped-def]
             sinc, slope, sinc1, slope1 = slopes(v, v1)
             z, z1 = r * r, r1 * r1
             c, c1 = cos_turns(z), cos_turns(z1)
-            V0[N_COS + k] = c * sinc
-            V0[N_SIN + k] = -TAU * TAU * r * sinc_turns(z) * sinc
-            V0[N_DSINC + k] = c * slope
-            V1[N_COS + k] = c1 * sinc1
-            V1[N_SIN + k] = -TAU * TAU * r1 * sinc_turns(z1) * sinc1
-            V1[N_DSINC + k] = c1 * slope1
-            S[FIELD + k] += c * sinc * aa + c1 * sinc1 * ba
+            V0[L.N_COS + k] = c * sinc
+            V0[L.N_SIN + k] = -TAU * TAU * r * sinc_turns(z) * sinc
+            V0[L.N_DSINC + k] = c * slope
+            V1[L.N_COS + k] = c1 * sinc1
+            V1[L.N_SIN + k] = -TAU * TAU * r1 * sinc_turns(z1) * sinc1
+            V1[L.N_DSINC + k] = c1 * slope1
+            S[L.FIELD + k] += c * sinc * aa + c1 * sinc1 * ba
 
     return add
 
@@ -121,10 +100,10 @@ def field_values(S, D, n, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, n
         p = rows[i]
         chords(S, n, p, floor, with_mid, backward)
         for m in range(0, neurons, 2):
-            o = NEURONS + PER_NEURON * m
-            if kinds[i, m // 2] == MEDIUM:
+            o = L.NEURONS + L.PER_NEURON * m
+            if kinds[i, m // 2] == L.MEDIUM:
                 _values_medium(S, n, p, o)
-            elif kinds[i, m // 2] == SLOW:
+            elif kinds[i, m // 2] == L.SLOW:
                 _values_slow(S, n, p, o)
             else:
                 _values_fast(S, n, p, o)
@@ -140,10 +119,10 @@ def field_with_slopes(S, D, V, n, bounds, y0, y1, tx, ty, i, rows, wide, slots, 
         p = rows[i]
         chords(S, n, p, floor, False, True)
         for m in range(0, neurons, 2):
-            o = NEURONS + PER_NEURON * m
-            if kinds[i, m // 2] == MEDIUM:
+            o = L.NEURONS + L.PER_NEURON * m
+            if kinds[i, m // 2] == L.MEDIUM:
                 _slopes_medium(S, V[m], V[m + 1], n, p, o)
-            elif kinds[i, m // 2] == SLOW:
+            elif kinds[i, m // 2] == L.SLOW:
                 _slopes_slow(S, V[m], V[m + 1], n, p, o)
             else:
                 _slopes_fast(S, V[m], V[m + 1], n, p, o)

@@ -13,44 +13,7 @@ import numpy as np
 from numba import njit
 
 from neuprim.core.compute.kernels import exact_kernel
-from neuprim.core.render.cpu.layout import (
-    AMPLITUDE,
-    ANCHOR_Z,
-    E0,
-    EX,
-    EY,
-    FAST,
-    G_LOG_M,
-    G_NEURONS,
-    G_OFFSET,
-    HX,
-    HY,
-    MEDIUM,
-    MEDIUM_TURNS,
-    NEAR,
-    NEURONS,
-    OFFSET,
-    PER_NEURON,
-    PHASE,
-    SKEW,
-    SLOW,
-    SLOW_TURNS,
-    TC,
-    TU,
-    TV,
-    UNBOUNDED,
-    UNIT,
-    UX,
-    UY,
-    WX,
-    WY,
-    WZ,
-    XA,
-    XC,
-    XU,
-    XV,
-    YC,
-)  # fmt: skip
+from neuprim.core.render.cpu import layout as L
 
 __all__ = [
     "CULLED",
@@ -165,17 +128,17 @@ def _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turn
     for a in range(3):
         A0, A1, A2 = B[0, a] / axes[a], B[1, a] / axes[a], B[2, a] / axes[a]  # m S^-1 B^T
         e0, ex, ey, xa = A0 * u + A1 * v + A2, A0 / fx, A1 / fy, A0 * w[0] + A1 * w[1] + A2 * w[2]
-        row[E0 + a], row[EX + a], row[EY + a], row[XA + a] = e0, ex, ey, xa
+        row[L.E0 + a], row[L.EX + a], row[L.EY + a], row[L.XA + a] = e0, ex, ey, xa
         aa, xe, ye = aa + e0 * e0, xe + ex * e0, ye + ey * e0
         biggest = max(biggest, abs(xa), abs(e0))
         total += e0 + ex + ey + xa
     tu, tv = -tc * xe / aa, -tc * ye / aa
     for a in range(3):
-        row[XU + a], row[XV + a] = tc * row[EX + a] + tu * row[E0 + a], tc * row[EY + a] + tv * row[E0 + a]
-    row[TC], row[TU], row[TV], row[UX], row[UY] = tc, tu, tv, anchor[1], anchor[2]
-    row[NEAR], row[OFFSET], row[UNIT], row[ANCHOR_Z] = (near - anchor[0]) / m, b2[i], m, anchor[0]
-    biggest = max(biggest, tc, abs(row[NEAR]), m, abs(row[OFFSET]))
-    total += tc + row[NEAR] + m + row[OFFSET]
+        row[L.XU + a], row[L.XV + a] = tc * row[L.EX + a] + tu * row[L.E0 + a], tc * row[L.EY + a] + tv * row[L.E0 + a]
+    row[L.TC], row[L.TU], row[L.TV], row[L.UX], row[L.UY] = tc, tu, tv, anchor[1], anchor[2]
+    row[L.NEAR], row[L.OFFSET], row[L.UNIT], row[L.ANCHOR_Z] = (near - anchor[0]) / m, b2[i], m, anchor[0]
+    biggest = max(biggest, tc, abs(row[L.NEAR]), m, abs(row[L.OFFSET]))
+    total += tc + row[L.NEAR] + m + row[L.OFFSET]
     for k in range(K):
         w0 = turns * axes[0] * (W1[i, k, 0] * local[0, 0] + W1[i, k, 1] * local[1, 0] + W1[i, k, 2] * local[2, 0])
         w1 = turns * axes[1] * (W1[i, k, 0] * local[0, 1] + W1[i, k, 1] * local[1, 1] + W1[i, k, 2] * local[2, 1])
@@ -187,12 +150,12 @@ def _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turn
         at = k  # insertion sort
         while at > 0 and rate[at - 1] > speed:
             rate[at], order[i, at] = rate[at - 1], order[i, at - 1]
-            for j in range(NEURONS + PER_NEURON * at, NEURONS + PER_NEURON * (at + 1)):
-                row[j] = row[j - PER_NEURON]
+            for j in range(L.NEURONS + L.PER_NEURON * at, L.NEURONS + L.PER_NEURON * (at + 1)):
+                row[j] = row[j - L.PER_NEURON]
             at -= 1
-        o = NEURONS + PER_NEURON * at
+        o = L.NEURONS + L.PER_NEURON * at
         rate[at], order[i, at] = speed, k
-        row[o + WX], row[o + WY], row[o + WZ], row[o + PHASE], row[o + AMPLITUDE] = w0, w1, w2_, phase - np.rint(phase), w2[i, k]
+        row[o + L.WX], row[o + L.WY], row[o + L.WZ], row[o + L.PHASE], row[o + L.AMPLITUDE] = w0, w1, w2_, phase - np.rint(phase), w2[i, k]
     return m, np.isfinite(total), biggest
 
 
@@ -218,17 +181,17 @@ def prepare(  # type: ignore[no-untyped-def]
     """
     K = W1.shape[1]
     work, rate, row = np.empty((10, 3)), np.empty(K), np.zeros(rows.shape[1])
-    B, axes, c, e0, ex, ey, xa = work[0:3], work[3], work[4], row[E0:EX], row[EX:EY], row[EY:XA], row[XA:XU]
+    B, axes, c, e0, ex, ey, xa = work[0:3], work[3], work[4], row[L.E0 : L.EX], row[L.EX : L.EY], row[L.EY : L.XA], row[L.XA : L.XU]
     k0, ka, kb, tmp = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(start, stop):
         m, finite, biggest = _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, rate, order, row)
         for n in range(kinds.shape[1]):
             fastest = rate[min(2 * n + 1, K - 1)]
-            kinds[i, n] = SLOW if fastest < SLOW_TURNS else (MEDIUM if fastest < MEDIUM_TURNS else FAST)
+            kinds[i, n] = L.SLOW if fastest < L.SLOW_TURNS else (L.MEDIUM if fastest < L.MEDIUM_TURNS else L.FAST)
         for j in range(row.shape[0]):
             rows[i, j] = row[j]
-        tc = row[TC]
-        in_float64[i] = (K > 0 and rate[K - 1] > FLOAT64_TURNS) or max(abs(row[UX]), abs(row[UY])) > _FLOAT64_PIXELS
+        tc = row[L.TC]
+        in_float64[i] = (K > 0 and rate[K - 1] > FLOAT64_TURNS) or max(abs(row[L.UX]), abs(row[L.UY])) > _FLOAT64_PIXELS
         in_float64[i] |= _dot(xa, xa) > _FLOAT64_ANCHOR**2  # centre far from the anchor, in the thinnest axis
         thinnest = min(axes[0], axes[1], axes[2])
         in_float64[i] |= thinnest * (_FLOAT64_RATIO_NEAR if tc == 0.0 else _FLOAT64_RATIO) < 1.0
@@ -247,7 +210,7 @@ def prepare(  # type: ignore[no-untyped-def]
                 status[i] = NON_FINITE  # a scale or weight beyond float32
             continue  # so small against its distance that no pixel centre can hit it
         span = spans[i]
-        span[SKEW], span[XC], span[YC], span[HX], span[HY] = 0.0, 0.0, 0.0, UNBOUNDED, UNBOUNDED
+        span[L.SKEW], span[L.XC], span[L.YC], span[L.HX], span[L.HY] = 0.0, 0.0, 0.0, L.UNBOUNDED, L.UNBOUNDED
         x0, x1, y0, y1 = 0.0, float(size[0]), 0.0, float(size[1])
         if c[2] - reach > 1e-3 * reach:  # wholly in front of the camera plane: the silhouette is an ellipse
             # in units of m: tangents (k +- sqrt(D))/(z^2 - S_zz), see projection.screen_boxes
@@ -280,22 +243,22 @@ def prepare(  # type: ignore[no-untyped-def]
                 yc = -d1 / d2
                 peak = d0 + d1 * yc
                 if peak > 0.0:
-                    span[SKEW], span[XC], span[YC] = -q4 / q3, -(q1 + q4 * yc) / q3, yc
-                    span[HX], span[HY] = np.sqrt(peak) / -q3, np.sqrt(-peak / d2)
+                    span[L.SKEW], span[L.XC], span[L.YC] = -q4 / q3, -(q1 + q4 * yc) / q3, yc
+                    span[L.HX], span[L.HY] = np.sqrt(peak) / -q3, np.sqrt(-peak / d2)
                     # the pixel offsets that meet the silhouette on the screen
-                    tall = min(abs(yc) + span[HY], max(abs(0.5 - row[UY]), abs(size[1] - 0.5 - row[UY])))
-                    broad = abs(span[XC]) + abs(span[SKEW]) * (abs(yc) + span[HY]) + span[HX]
-                    broad = min(broad, max(abs(0.5 - row[UX]), abs(size[0] - 0.5 - row[UX])))
+                    tall = min(abs(yc) + span[L.HY], max(abs(0.5 - row[L.UY]), abs(size[1] - 0.5 - row[L.UY])))
+                    broad = abs(span[L.XC]) + abs(span[L.SKEW]) * (abs(yc) + span[L.HY]) + span[L.HX]
+                    broad = min(broad, max(abs(0.5 - row[L.UX]), abs(size[0] - 0.5 - row[L.UX])))
                     # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted needle
                     # each is many radii of its thin axis, and they cancel
-                    slide = abs(row[TU]) * broad + abs(row[TV]) * tall
+                    slide = abs(row[L.TU]) * broad + abs(row[L.TV]) * tall
                     in_float64[i] |= slide * (np.sqrt(_dot(ex, ex)) * broad + np.sqrt(_dot(ey, ey)) * tall) > _FLOAT64_RADII
                     for a in range(3):
-                        in_float64[i] |= abs(row[XU + a]) * broad + abs(row[XV + a]) * tall > _FLOAT64_RADII
+                        in_float64[i] |= abs(row[L.XU + a]) * broad + abs(row[L.XV + a]) * tall > _FLOAT64_RADII
         if in_float64[i]:  # the float64 rows do not slide
             for a in range(3):
-                rows[i, XU + a], rows[i, XV + a] = tc * ex[a], tc * ey[a]
-            rows[i, TU], rows[i, TV] = 0.0, 0.0
+                rows[i, L.XU + a], rows[i, L.XV + a] = tc * ex[a], tc * ey[a]
+            rows[i, L.TU], rows[i, L.TV] = 0.0, 0.0
         if x1 > x0 and y1 > y0:
             boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = int(x0), int(y0), int(x1), int(y1)
             status[i] = VISIBLE
@@ -327,37 +290,39 @@ def prepare_backward(  # type: ignore[no-untyped-def]
             w[j] = tc * ref[j] - c[j] / m
             gc[j] = 0.0
         for a in range(3):
-            gx = np.float64(g[XA + a])
+            gx = np.float64(g[L.XA + a])
             row_sum = 0.0
             for j in range(3):
                 A[a, j] = B[j, a] / axes[a]
-                gA[a, j] = g[E0 + a] * ref[j] + gx * w[j]
-            gA[a, 0] += g[EX + a] / fx
-            gA[a, 1] += g[EY + a] / fy
+                gA[a, j] = g[L.E0 + a] * ref[j] + gx * w[j]
+            gA[a, 0] += g[L.EX + a] / fx
+            gA[a, 1] += g[L.EY + a] / fy
             for j in range(3):
                 gB[j, a] = gA[a, j] / axes[a]
                 row_sum += gA[a, j] * A[a, j]
                 gc[j] -= A[a, j] * gx / m
             gl[a] = -row_sum  # A scales with 1/s_a
-        log_m = -np.float64(g[G_LOG_M])  # the density's own 1/m
+        log_m = -np.float64(g[L.G_LOG_M])  # the density's own 1/m
         for a in range(3):
             for j in range(3):
                 gL[a, j] = 0.0
         for n in range(K):
-            k, o, og = order[i, n], NEURONS + PER_NEURON * n, G_NEURONS + PER_NEURON * n
+            k, o, og = order[i, n], L.NEURONS + L.PER_NEURON * n, L.G_NEURONS + L.PER_NEURON * n
             for j in range(3):
-                gw = np.float64(g[og + WX + j])
-                gl[j] += gw * rows[i, o + WX + j]  # W on whitened axes scales with s_j/m
-                log_m -= gw * rows[i, o + WX + j]
+                gw = np.float64(g[og + L.WX + j])
+                gl[j] += gw * rows[i, o + L.WX + j]  # W on whitened axes scales with s_j/m
+                log_m -= gw * rows[i, o + L.WX + j]
                 for a in range(3):
                     gL[a, j] += turns * axes[j] * W1[i, k, a] * gw
             for a in range(3):
                 g_W1[i, k, a] = turns * (
-                    g[og + WX] * axes[0] * local[a, 0] + g[og + WX + 1] * axes[1] * local[a, 1] + g[og + WX + 2] * axes[2] * local[a, 2]
+                    g[og + L.WX] * axes[0] * local[a, 0]
+                    + g[og + L.WX + 1] * axes[1] * local[a, 1]
+                    + g[og + L.WX + 2] * axes[2] * local[a, 2]
                 )
-            g_b1[i, k] = turns * g[og + PHASE]
-            g_w2[i, k] = g[og + AMPLITUDE]
-        g_b2[i] = g[G_OFFSET]
+            g_b1[i, k] = turns * g[og + L.PHASE]
+            g_w2[i, k] = g[og + L.AMPLITUDE]
+        g_b2[i] = g[L.G_OFFSET]
         first = 0
         for j in range(1, 3):
             if log_scales[i, j] > log_scales[i, first]:

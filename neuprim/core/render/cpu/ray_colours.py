@@ -10,36 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import inline
+from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import phase_float64
-from neuprim.core.render.cpu.layout import (
-    ALPHA,
-    BEHIND,
-    COLOR,
-    ERR,
-    G_COLOR,
-    GQX,
-    GQY,
-    GQZ,
-    GRAD,
-    LANES,
-    LAST,
-    NET_COS,
-    NET_OUT,
-    NET_SIN,
-    OVER,
-    PHASE,
-    PIXELS,
-    QX,
-    QY,
-    QZ,
-    RAY_COLOUR,
-    SLOPE,
-    T_,
-    TILE,
-    WX,
-    WY,
-    WZ,
-)
 from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns
 
 __all__ = [
@@ -54,8 +26,8 @@ __all__ = [
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
-_STEPS = np.arange(TILE).astype(np.float32)
-_RGB_GRADIENT = RAY_COLOUR + 3 * LANES  # dL/d RAY_COLOUR of three channels; in general it follows the C arrays of RAY_COLOUR
+_STEPS = np.arange(L.TILE).astype(np.float32)
+_RGB_GRADIENT = L.RAY_COLOUR + 3 * L.LANES  # dL/d RAY_COLOUR of three channels; in general it follows the C arrays of RAY_COLOUR
 
 
 # ---------------------------------------------------------------- the network
@@ -64,68 +36,84 @@ _RGB_GRADIENT = RAY_COLOUR + 3 * LANES  # dL/d RAY_COLOUR of three channels; in 
 @inline
 def _rgb(S, n, p, o, o2):  # type: ignore[no-untyped-def]
     """RAY_COLOUR += output of the two units at ``o`` and ``o2``, three channels."""
-    ax, ay, az, ab, a0, a1, a2 = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + NET_OUT], p[o + NET_OUT + 1], p[o + NET_OUT + 2]
+    ax, ay, az, ab, a0, a1, a2 = (
+        p[o + L.WX],
+        p[o + L.WY],
+        p[o + L.WZ],
+        p[o + L.PHASE],
+        p[o + L.NET_OUT],
+        p[o + L.NET_OUT + 1],
+        p[o + L.NET_OUT + 2],
+    )
     bx, by, bz, bb, b0, b1, b2 = (
-        p[o2 + WX],
-        p[o2 + WY],
-        p[o2 + WZ],
-        p[o2 + PHASE],
-        p[o2 + NET_OUT],
-        p[o2 + NET_OUT + 1],
-        p[o2 + NET_OUT + 2],
+        p[o2 + L.WX],
+        p[o2 + L.WY],
+        p[o2 + L.WZ],
+        p[o2 + L.PHASE],
+        p[o2 + L.NET_OUT],
+        p[o2 + L.NET_OUT + 1],
+        p[o2 + L.NET_OUT + 2],
     )
     for k in range(n):
-        qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
+        qx, qy, qz = S[L.QX + k], S[L.QY + k], S[L.QZ + k]
         u = qx * ax + qy * ay + qz * az + ab
         r = u - np.rint(u)
         u1 = qx * bx + qy * by + qz * bz + bb
         r1 = u1 - np.rint(u1)
         c, c1 = cos_turns(r * r), cos_turns(r1 * r1)
-        S[RAY_COLOUR + k] += c * a0 + c1 * b0
-        S[RAY_COLOUR + LANES + k] += c * a1 + c1 * b1
-        S[RAY_COLOUR + 2 * LANES + k] += c * a2 + c1 * b2
+        S[L.RAY_COLOUR + k] += c * a0 + c1 * b0
+        S[L.RAY_COLOUR + L.LANES + k] += c * a1 + c1 * b1
+        S[L.RAY_COLOUR + 2 * L.LANES + k] += c * a2 + c1 * b2
 
 
 @inline
 def _rgb_with_slopes(S, V0, V1, n, p, o, o2):  # type: ignore[no-untyped-def]
     """The same, and both units' cos and d cos/d turn for the backward pass."""
-    ax, ay, az, ab, a0, a1, a2 = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE], p[o + NET_OUT], p[o + NET_OUT + 1], p[o + NET_OUT + 2]
+    ax, ay, az, ab, a0, a1, a2 = (
+        p[o + L.WX],
+        p[o + L.WY],
+        p[o + L.WZ],
+        p[o + L.PHASE],
+        p[o + L.NET_OUT],
+        p[o + L.NET_OUT + 1],
+        p[o + L.NET_OUT + 2],
+    )
     bx, by, bz, bb, b0, b1, b2 = (
-        p[o2 + WX],
-        p[o2 + WY],
-        p[o2 + WZ],
-        p[o2 + PHASE],
-        p[o2 + NET_OUT],
-        p[o2 + NET_OUT + 1],
-        p[o2 + NET_OUT + 2],
+        p[o2 + L.WX],
+        p[o2 + L.WY],
+        p[o2 + L.WZ],
+        p[o2 + L.PHASE],
+        p[o2 + L.NET_OUT],
+        p[o2 + L.NET_OUT + 1],
+        p[o2 + L.NET_OUT + 2],
     )
     for k in range(n):
-        qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
+        qx, qy, qz = S[L.QX + k], S[L.QY + k], S[L.QZ + k]
         u = qx * ax + qy * ay + qz * az + ab
         r = u - np.rint(u)
         u1 = qx * bx + qy * by + qz * bz + bb
         r1 = u1 - np.rint(u1)
         z, z1 = r * r, r1 * r1
         c, c1 = cos_turns(z), cos_turns(z1)
-        V0[NET_COS + k] = c
-        V0[NET_SIN + k] = -TAU * TAU * r * sinc_turns(z)
-        V1[NET_COS + k] = c1
-        V1[NET_SIN + k] = -TAU * TAU * r1 * sinc_turns(z1)
-        S[RAY_COLOUR + k] += c * a0 + c1 * b0
-        S[RAY_COLOUR + LANES + k] += c * a1 + c1 * b1
-        S[RAY_COLOUR + 2 * LANES + k] += c * a2 + c1 * b2
+        V0[L.NET_COS + k] = c
+        V0[L.NET_SIN + k] = -TAU * TAU * r * sinc_turns(z)
+        V1[L.NET_COS + k] = c1
+        V1[L.NET_SIN + k] = -TAU * TAU * r1 * sinc_turns(z1)
+        S[L.RAY_COLOUR + k] += c * a0 + c1 * b0
+        S[L.RAY_COLOUR + L.LANES + k] += c * a1 + c1 * b1
+        S[L.RAY_COLOUR + 2 * L.LANES + k] += c * a2 + c1 * b2
 
 
 @inline
 def _waves(S, V0, n, p, o):  # type: ignore[no-untyped-def]
     """cos and d cos/d turn of one unit."""
-    wx, wy, wz, b = p[o + WX], p[o + WY], p[o + WZ], p[o + PHASE]
+    wx, wy, wz, b = p[o + L.WX], p[o + L.WY], p[o + L.WZ], p[o + L.PHASE]
     for k in range(n):
-        u = S[QX + k] * wx + S[QY + k] * wy + S[QZ + k] * wz + b
+        u = S[L.QX + k] * wx + S[L.QY + k] * wy + S[L.QZ + k] * wz + b
         r = u - np.rint(u)
         z = r * r
-        V0[NET_COS + k] = cos_turns(z)
-        V0[NET_SIN + k] = -TAU * TAU * r * sinc_turns(z)
+        V0[L.NET_COS + k] = cos_turns(z)
+        V0[L.NET_SIN + k] = -TAU * TAU * r * sinc_turns(z)
 
 
 @inline
@@ -134,17 +122,17 @@ def _waves_float64(D, V0, n, p, o):  # type: ignore[no-untyped-def]
     for k in range(n):
         r = phase_float64(D, k, p, o)
         z = r * r
-        V0[NET_COS + k] = cos_turns(z)
-        V0[NET_SIN + k] = -TAU * TAU * r * sinc_turns(z)
+        V0[L.NET_COS + k] = cos_turns(z)
+        V0[L.NET_SIN + k] = -TAU * TAU * r * sinc_turns(z)
 
 
 @inline
 def _mix(S, V, n, p, hidden, C):  # type: ignore[no-untyped-def]
     """RAY_COLOUR += output of all units, any channels, from their cos in ``V``."""
     for c in range(C):
-        colour = S[RAY_COLOUR + c * LANES :]
+        colour = S[L.RAY_COLOUR + c * L.LANES :]
         for j in range(hidden):
-            cosine, weight = V[j, NET_COS:], p[(NET_OUT + C) * j + NET_OUT + c]
+            cosine, weight = V[j, L.NET_COS :], p[(L.NET_OUT + C) * j + L.NET_OUT + c]
             for k in range(n):
                 colour[k] += cosine[k] * weight
 
@@ -154,39 +142,39 @@ def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-unt
     """RAY_COLOUR of ``n`` lanes of primitive ``i``; with ``slopes`` also what :func:`ray_colour_gradient` needs, in ``V``."""
     C, p = base.shape[0], net.rows[i]
     for c in range(C):
-        colour = S[RAY_COLOUR + c * LANES :]
+        colour = S[L.RAY_COLOUR + c * L.LANES :]
         for k in range(n):
             colour[k] = base[c]
     if slots[i] >= 0:
         for j in range(net.hidden):
-            _waves_float64(D, V[j], n, net.wide[slots[i]], (NET_OUT + C) * j)
+            _waves_float64(D, V[j], n, net.wide[slots[i]], (L.NET_OUT + C) * j)
         _mix(S, V, n, p, net.hidden, C)
     elif C == 3:
         for j in range(0, net.hidden, 2):
-            o = (NET_OUT + 3) * j
+            o = (L.NET_OUT + 3) * j
             if slopes:
-                _rgb_with_slopes(S, V[j], V[j + 1], n, p, o, o + NET_OUT + 3)
+                _rgb_with_slopes(S, V[j], V[j + 1], n, p, o, o + L.NET_OUT + 3)
             else:
-                _rgb(S, n, p, o, o + NET_OUT + 3)
+                _rgb(S, n, p, o, o + L.NET_OUT + 3)
     else:
         for j in range(net.hidden):
-            _waves(S, V[j], n, p, (NET_OUT + C) * j)
+            _waves(S, V[j], n, p, (L.NET_OUT + C) * j)
         _mix(S, V, n, p, net.hidden, C)
 
 
 @inline
 def _rgb_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped-def]
     """Gradients of two units, three channels, and their share of dL/dQ."""
-    ax, ay, az, a0, a1, a2 = p[o + WX], p[o + WY], p[o + WZ], p[o + NET_OUT], p[o + NET_OUT + 1], p[o + NET_OUT + 2]
-    bx, by, bz, b0, b1, b2 = p[o2 + WX], p[o2 + WY], p[o2 + WZ], p[o2 + NET_OUT], p[o2 + NET_OUT + 1], p[o2 + NET_OUT + 2]
+    ax, ay, az, a0, a1, a2 = p[o + L.WX], p[o + L.WY], p[o + L.WZ], p[o + L.NET_OUT], p[o + L.NET_OUT + 1], p[o + L.NET_OUT + 2]
+    bx, by, bz, b0, b1, b2 = p[o2 + L.WX], p[o2 + L.WY], p[o2 + L.WZ], p[o2 + L.NET_OUT], p[o2 + L.NET_OUT + 1], p[o2 + L.NET_OUT + 2]
     s0, s1, s2, s3, s4, s5, s6 = f(0), f(0), f(0), f(0), f(0), f(0), f(0)
     r0, r1, r2, r3, r4, r5, r6 = f(0), f(0), f(0), f(0), f(0), f(0), f(0)
     for k in range(n):
-        g0, g1, g2 = S[_RGB_GRADIENT + k], S[_RGB_GRADIENT + LANES + k], S[_RGB_GRADIENT + 2 * LANES + k]
-        qx, qy, qz = S[QX + k], S[QY + k], S[QZ + k]
-        c, c1 = V0[NET_COS + k], V1[NET_COS + k]
-        u = (g0 * a0 + g1 * a1 + g2 * a2) * V0[NET_SIN + k]
-        u1 = (g0 * b0 + g1 * b1 + g2 * b2) * V1[NET_SIN + k]
+        g0, g1, g2 = S[_RGB_GRADIENT + k], S[_RGB_GRADIENT + L.LANES + k], S[_RGB_GRADIENT + 2 * L.LANES + k]
+        qx, qy, qz = S[L.QX + k], S[L.QY + k], S[L.QZ + k]
+        c, c1 = V0[L.NET_COS + k], V1[L.NET_COS + k]
+        u = (g0 * a0 + g1 * a1 + g2 * a2) * V0[L.NET_SIN + k]
+        u1 = (g0 * b0 + g1 * b1 + g2 * b2) * V1[L.NET_SIN + k]
         s0 += u * qx
         s1 += u * qy
         s2 += u * qz
@@ -201,41 +189,41 @@ def _rgb_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped-def]
         r4 += g0 * c1
         r5 += g1 * c1
         r6 += g2 * c1
-        S[GQX + k] += u * ax + u1 * bx
-        S[GQY + k] += u * ay + u1 * by
-        S[GQZ + k] += u * az + u1 * bz
-    out[o + WX], out[o + WY], out[o + WZ], out[o + PHASE] = s0, s1, s2, s3
-    out[o + NET_OUT], out[o + NET_OUT + 1], out[o + NET_OUT + 2] = s4, s5, s6
-    out[o2 + WX], out[o2 + WY], out[o2 + WZ], out[o2 + PHASE] = r0, r1, r2, r3
-    out[o2 + NET_OUT], out[o2 + NET_OUT + 1], out[o2 + NET_OUT + 2] = r4, r5, r6
+        S[L.GQX + k] += u * ax + u1 * bx
+        S[L.GQY + k] += u * ay + u1 * by
+        S[L.GQZ + k] += u * az + u1 * bz
+    out[o + L.WX], out[o + L.WY], out[o + L.WZ], out[o + L.PHASE] = s0, s1, s2, s3
+    out[o + L.NET_OUT], out[o + L.NET_OUT + 1], out[o + L.NET_OUT + 2] = s4, s5, s6
+    out[o2 + L.WX], out[o2 + L.WY], out[o2 + L.WZ], out[o2 + L.PHASE] = r0, r1, r2, r3
+    out[o2 + L.NET_OUT], out[o2 + L.NET_OUT + 1], out[o2 + L.NET_OUT + 2] = r4, r5, r6
 
 
 @inline
 def _unit_gradient(S, V0, n, p, o, C, out):  # type: ignore[no-untyped-def]
     """Gradients of one unit, any channels, and its share of dL/dQ. Uses up the unit's cos in ``V0``."""
-    wx, wy, wz = p[o + WX], p[o + WY], p[o + WZ]
+    wx, wy, wz = p[o + L.WX], p[o + L.WY], p[o + L.WZ]
     for c in range(C):
-        gradient, total = S[RAY_COLOUR + (C + c) * LANES :], f(0)
+        gradient, total = S[L.RAY_COLOUR + (C + c) * L.LANES :], f(0)
         for k in range(n):
-            total += gradient[k] * V0[NET_COS + k]
-        out[o + NET_OUT + c] = total
+            total += gradient[k] * V0[L.NET_COS + k]
+        out[o + L.NET_OUT + c] = total
     for k in range(n):
-        V0[NET_COS + k] = f(0)
+        V0[L.NET_COS + k] = f(0)
     for c in range(C):
-        gradient, weight = S[RAY_COLOUR + (C + c) * LANES :], p[o + NET_OUT + c]
+        gradient, weight = S[L.RAY_COLOUR + (C + c) * L.LANES :], p[o + L.NET_OUT + c]
         for k in range(n):
-            V0[NET_COS + k] += gradient[k] * weight
+            V0[L.NET_COS + k] += gradient[k] * weight
     s0, s1, s2, s3 = f(0), f(0), f(0), f(0)
     for k in range(n):
-        u = V0[NET_COS + k] * V0[NET_SIN + k]
-        s0 += u * S[QX + k]
-        s1 += u * S[QY + k]
-        s2 += u * S[QZ + k]
+        u = V0[L.NET_COS + k] * V0[L.NET_SIN + k]
+        s0 += u * S[L.QX + k]
+        s1 += u * S[L.QY + k]
+        s2 += u * S[L.QZ + k]
         s3 += u
-        S[GQX + k] += u * wx
-        S[GQY + k] += u * wy
-        S[GQZ + k] += u * wz
-    out[o + WX], out[o + WY], out[o + WZ], out[o + PHASE] = s0, s1, s2, s3
+        S[L.GQX + k] += u * wx
+        S[L.GQY + k] += u * wy
+        S[L.GQZ + k] += u * wz
+    out[o + L.WX], out[o + L.WY], out[o + L.WZ], out[o + L.PHASE] = s0, s1, s2, s3
 
 
 @inline
@@ -243,17 +231,17 @@ def ray_colour_gradient(S, V, n, i, net, C, out, base_at):  # type: ignore[no-un
     """From dL/d RAY_COLOUR of every lane to the gradient row: base at ``base_at``, then the units; adds to dL/dQ."""
     p, row = net.rows[i], out[base_at + C :]
     for c in range(C):
-        gradient, total = S[RAY_COLOUR + (C + c) * LANES :], f(0)
+        gradient, total = S[L.RAY_COLOUR + (C + c) * L.LANES :], f(0)
         for k in range(n):
             total += gradient[k]
         out[base_at + c] = total
     if C == 3:
         for j in range(0, net.hidden, 2):
-            o = (NET_OUT + 3) * j
-            _rgb_gradient(S, V[j], V[j + 1], n, p, o, o + NET_OUT + 3, row)
+            o = (L.NET_OUT + 3) * j
+            _rgb_gradient(S, V[j], V[j + 1], n, p, o, o + L.NET_OUT + 3, row)
     else:
         for j in range(net.hidden):
-            _unit_gradient(S, V[j], n, p, (NET_OUT + C) * j, C, row)
+            _unit_gradient(S, V[j], n, p, (L.NET_OUT + C) * j, C, row)
 
 
 # ---------------------------------------------------------------- compositing one pixel row; ``at`` is the lane of the row's pixel 0
@@ -263,24 +251,24 @@ def ray_colour_gradient(S, V, n, i, net, C, out, base_at):  # type: ignore[no-un
 def composite_rgb_ray_colours(state, S, base, at, a, b, tmin, rank):  # type: ignore[no-untyped-def]
     """Three channels: colour += alpha T max(0, RAY_COLOUR), then T; a pixel is live while T >= T_min."""
     a, b = f(a), f(b)
-    for k in range(TILE):
-        step, T = _STEPS[k], state[index(base + k + T_)]
+    for k in range(L.TILE):
+        step, T = _STEPS[k], state[index(base + k + L.T_)]
         use = (step >= a) & (step < b) & (T >= tmin)
-        alpha = S[index(at + k + ALPHA)] if use else f(0)
+        alpha = S[index(at + k + L.ALPHA)] if use else f(0)
         weight = alpha * T
-        state[index(base + k + T_)] = T - weight
-        state[index(base + k + LAST)] = rank if alpha > f(0) else state[index(base + k + LAST)]
-        state[index(base + k + COLOR)] += weight * max(S[index(at + k + RAY_COLOUR)], f(0))
-        state[index(base + k + COLOR + PIXELS)] += weight * max(S[index(at + k + RAY_COLOUR + LANES)], f(0))
-        state[index(base + k + COLOR + 2 * PIXELS)] += weight * max(S[index(at + k + RAY_COLOUR + 2 * LANES)], f(0))
+        state[index(base + k + L.T_)] = T - weight
+        state[index(base + k + L.LAST)] = rank if alpha > f(0) else state[index(base + k + L.LAST)]
+        state[index(base + k + L.COLOR)] += weight * max(S[index(at + k + L.RAY_COLOUR)], f(0))
+        state[index(base + k + L.COLOR + L.PIXELS)] += weight * max(S[index(at + k + L.RAY_COLOUR + L.LANES)], f(0))
+        state[index(base + k + L.COLOR + 2 * L.PIXELS)] += weight * max(S[index(at + k + L.RAY_COLOUR + 2 * L.LANES)], f(0))
 
 
 @inline
 def add_ray_colours(state, S, base, at, w, C):  # type: ignore[no-untyped-def]
     """colour += w max(0, RAY_COLOUR), any channels."""
     for c in range(C):
-        st, colour = state[COLOR + c * PIXELS + base :], S[RAY_COLOUR + c * LANES + at :]
-        for k in range(TILE):
+        st, colour = state[L.COLOR + c * L.PIXELS + base :], S[L.RAY_COLOUR + c * L.LANES + at :]
+        for k in range(L.TILE):
             st[k] += w[k] * max(colour[k], f(0))
 
 
@@ -288,41 +276,45 @@ def add_ray_colours(state, S, base, at, w, C):  # type: ignore[no-untyped-def]
 def uncomposite_rgb_ray_colours(state, S, base, at, sums, a, b, rank):  # type: ignore[no-untyped-def]
     """Three channels: recover T before this primitive, dL/d(2 FIELD HALF) and dL/d RAY_COLOUR, and the two tallies."""
     a, b = f(a), f(b)
-    for k in range(TILE):
-        step, alpha = _STEPS[k], S[index(at + k + ALPHA)]
+    for k in range(L.TILE):
+        step, alpha = _STEPS[k], S[index(at + k + L.ALPHA)]
         inside = (step >= a) & (step < b)
-        use = inside & (alpha > f(0)) & (state[index(base + k + LAST)] >= rank)
+        use = inside & (alpha > f(0)) & (state[index(base + k + L.LAST)] >= rank)
         alpha = alpha if use else f(0)
-        over = S[index(at + k + OVER)] if use else f(1)
-        g0 = state[index(base + k + G_COLOR)]
-        g1 = state[index(base + k + G_COLOR + PIXELS)]
-        g2 = state[index(base + k + G_COLOR + 2 * PIXELS)]
-        c0, c1, c2 = S[index(at + k + RAY_COLOUR)], S[index(at + k + RAY_COLOUR + LANES)], S[index(at + k + RAY_COLOUR + 2 * LANES)]
+        over = S[index(at + k + L.OVER)] if use else f(1)
+        g0 = state[index(base + k + L.G_COLOR)]
+        g1 = state[index(base + k + L.G_COLOR + L.PIXELS)]
+        g2 = state[index(base + k + L.G_COLOR + 2 * L.PIXELS)]
+        c0, c1, c2 = (
+            S[index(at + k + L.RAY_COLOUR)],
+            S[index(at + k + L.RAY_COLOUR + L.LANES)],
+            S[index(at + k + L.RAY_COLOUR + 2 * L.LANES)],
+        )
         cg = g0 * max(c0, f(0)) + g1 * max(c1, f(0)) + g2 * max(c2, f(0))
-        behind = state[index(base + k + BEHIND)]
-        before = state[index(base + k + T_)] * over
+        behind = state[index(base + k + L.BEHIND)]
+        before = state[index(base + k + L.T_)] * over
         weight = alpha * before
-        g = (before * cg - behind * over) * S[index(at + k + SLOPE)]
-        state[index(base + k + BEHIND)] = behind + weight * cg
-        state[index(base + k + T_)] = before
+        g = (before * cg - behind * over) * S[index(at + k + L.SLOPE)]
+        state[index(base + k + L.BEHIND)] = behind + weight * cg
+        state[index(base + k + L.T_)] = before
         g = g if use else f(0)
-        S[index(at + k + GRAD)] = g if inside else S[index(at + k + GRAD)]
+        S[index(at + k + L.GRAD)] = g if inside else S[index(at + k + L.GRAD)]
         sums[k] += weight
-        sums[k + TILE] += weight * state[index(base + k + ERR)]
+        sums[k + L.TILE] += weight * state[index(base + k + L.ERR)]
         h0 = weight * g0 if c0 >= f(0) else f(0)
         h1 = weight * g1 if c1 >= f(0) else f(0)
         h2 = weight * g2 if c2 >= f(0) else f(0)
         S[index(at + k + _RGB_GRADIENT)] = h0 if inside else S[index(at + k + _RGB_GRADIENT)]
-        S[index(at + k + _RGB_GRADIENT + LANES)] = h1 if inside else S[index(at + k + _RGB_GRADIENT + LANES)]
-        S[index(at + k + _RGB_GRADIENT + 2 * LANES)] = h2 if inside else S[index(at + k + _RGB_GRADIENT + 2 * LANES)]
+        S[index(at + k + _RGB_GRADIENT + L.LANES)] = h1 if inside else S[index(at + k + _RGB_GRADIENT + L.LANES)]
+        S[index(at + k + _RGB_GRADIENT + 2 * L.LANES)] = h2 if inside else S[index(at + k + _RGB_GRADIENT + 2 * L.LANES)]
 
 
 @inline
 def weigh_ray_colours(state, S, base, at, cg, C):  # type: ignore[no-untyped-def]
     """cg += sum over channels of max(0, RAY_COLOUR) dL/d colour."""
     for c in range(C):
-        st, colour = state[G_COLOR + c * PIXELS + base :], S[RAY_COLOUR + c * LANES + at :]
-        for k in range(TILE):
+        st, colour = state[L.G_COLOR + c * L.PIXELS + base :], S[L.RAY_COLOUR + c * L.LANES + at :]
+        for k in range(L.TILE):
             cg[k] += max(colour[k], f(0)) * st[k]
 
 
@@ -332,10 +324,10 @@ def ray_colour_gradient_row(state, S, base, at, w, a, b, C):  # type: ignore[no-
     a, b = f(a), f(b)
     for c in range(C):
         st, colour, gradient = (
-            state[G_COLOR + c * PIXELS + base :],
-            S[RAY_COLOUR + c * LANES + at :],
-            S[RAY_COLOUR + (C + c) * LANES + at :],
+            state[L.G_COLOR + c * L.PIXELS + base :],
+            S[L.RAY_COLOUR + c * L.LANES + at :],
+            S[L.RAY_COLOUR + (C + c) * L.LANES + at :],
         )
-        for k in range(TILE):
+        for k in range(L.TILE):
             g = w[k] * st[k] if colour[k] >= f(0) else f(0)
             gradient[k] = g if (_STEPS[k] >= a) & (_STEPS[k] < b) else gradient[k]

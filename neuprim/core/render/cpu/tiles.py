@@ -9,52 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import inline
-from neuprim.core.render.cpu.layout import (
-    DH,
-    DU,
-    DV,
-    E0,
-    EX,
-    EXL,
-    EY,
-    EYL,
-    EZL,
-    FIELD,
-    HALF,
-    HEIGHT,
-    HX,
-    HY,
-    IA,
-    MID,
-    NEAR,
-    NORM,
-    NORM_L,
-    OFFSET,
-    PX,
-    PY,
-    PZ,
-    QX,
-    QY,
-    QZ,
-    SKEW,
-    SLIDE,
-    TILE,
-    TM,
-    TU,
-    TV,
-    UNCUT,
-    XA,
-    XC,
-    XU,
-    XV,
-    YC,
-)
+from neuprim.core.render.cpu import layout as L
 
 __all__ = ["chords", "compact", "row_spans"]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
-_STEPS = np.arange(TILE).astype(np.float32)
+_STEPS = np.arange(L.TILE).astype(np.float32)
 _MARGIN, _ROUNDING = f(2e-3), f(4e-7)  # pixels, and per pixel of the ellipse; a lane too many is rejected by its own D
 
 
@@ -64,10 +25,10 @@ def row_spans(span, fx0, fy0, y0, y1, x0, x1, bounds):  # type: ignore[no-untype
 
     fx0, fy0: the tile corner's pixel centre from the anchor. All 16 rows at once: one vector.
     """
-    skew, xc, yc, hx = span[SKEW], span[XC] - fx0, span[YC] - fy0, span[HX]
-    ihy = f(1) / span[HY]
+    skew, xc, yc, hx = span[L.SKEW], span[L.XC] - fx0, span[L.YC] - fy0, span[L.HX]
+    ihy = f(1) / span[L.HY]
     low, high, top, bottom = f(x0), f(x1), f(y0), f(y1)
-    for y in range(TILE):
+    for y in range(L.TILE):
         row = _STEPS[y]
         dv = row - yc
         k = dv * ihy
@@ -79,7 +40,7 @@ def row_spans(span, fx0, fy0, y0, y1, x0, x1, bounds):  # type: ignore[no-untype
         hi = min(np.floor(mid + half) + f(1), high)
         inside = (s > f(-1e-2)) & (row >= top) & (row < bottom)
         bounds[y] = np.int32(lo if inside else f(0))
-        bounds[y + TILE] = np.int32(hi if inside else f(0))
+        bounds[y + L.TILE] = np.int32(hi if inside else f(0))
 
 
 @inline
@@ -93,36 +54,36 @@ def compact(S, state, offset, bounds, y0, y1, rows_live, fx0, fy0):  # type: ign
     for y in range(y0, y1):
         offset[y] = n
         a = bounds[y]
-        m = bounds[y + TILE] - a
+        m = bounds[y + L.TILE] - a
         if m > 0 and rows_live[y] > f(0):
             x0, dv = fx0 + f(a), fy0 + f(y)
-            j = NORM + y * TILE + a
-            for k in range(TILE):
-                S[index(DU + n + k)] = x0 + _STEPS[k]
-                S[index(DV + n + k)] = dv
-                S[index(NORM_L + n + k)] = state[index(j + k)]
+            j = L.NORM + y * L.TILE + a
+            for k in range(L.TILE):
+                S[index(L.DU + n + k)] = x0 + _STEPS[k]
+                S[index(L.DV + n + k)] = dv
+                S[index(L.NORM_L + n + k)] = state[index(j + k)]
             n += m
         else:
-            bounds[y + TILE] = a
-    for k in range(TILE):
-        S[index(DU + n + k)] = f(0)
-        S[index(DV + n + k)] = f(0)
-        S[index(NORM_L + n + k)] = f(0)
+            bounds[y + L.TILE] = a
+    for k in range(L.TILE):
+        S[index(L.DU + n + k)] = f(0)
+        S[index(L.DV + n + k)] = f(0)
+        S[index(L.NORM_L + n + k)] = f(0)
     return n
 
 
 @inline
 def chords(S, n, p, depth_floor, with_mid, backward):  # type: ignore[no-untyped-def]
     """Chord middle Q, direction E and half length of n lanes (method: "Line integral"); HALF = 0 where the ray misses."""
-    e0, e1, e2 = p[E0], p[E0 + 1], p[E0 + 2]
-    x0, x1, x2 = p[EX], p[EX + 1], p[EX + 2]
-    y0, y1, y2 = p[EY], p[EY + 1], p[EY + 2]
-    a0, a1, a2 = p[XA], p[XA + 1], p[XA + 2]
-    u0, u1, u2 = p[XU], p[XU + 1], p[XU + 2]
-    v0, v1, v2 = p[XV], p[XV + 1], p[XV + 2]
-    tu, tv, near, offset = p[TU], p[TV], p[NEAR], p[OFFSET]
+    e0, e1, e2 = p[L.E0], p[L.E0 + 1], p[L.E0 + 2]
+    x0, x1, x2 = p[L.EX], p[L.EX + 1], p[L.EX + 2]
+    y0, y1, y2 = p[L.EY], p[L.EY + 1], p[L.EY + 2]
+    a0, a1, a2 = p[L.XA], p[L.XA + 1], p[L.XA + 2]
+    u0, u1, u2 = p[L.XU], p[L.XU + 1], p[L.XU + 2]
+    v0, v1, v2 = p[L.XV], p[L.XV + 1], p[L.XV + 2]
+    tu, tv, near, offset = p[L.TU], p[L.TV], p[L.NEAR], p[L.OFFSET]
     for k in range(n):
-        du, dv = S[DU + k], S[DV + k]
+        du, dv = S[L.DU + k], S[L.DV + k]
         slide = du * tu + dv * tv
         gx, gy, gz = du * x0 + dv * y0, du * x1 + dv * y1, du * x2 + dv * y2
         ex, ey, ez = e0 + gx, e1 + gy, e2 + gz
@@ -142,14 +103,14 @@ def chords(S, n, p, depth_floor, with_mid, backward):  # type: ignore[no-untyped
         half = max(half, f(0))
         # from the closest point, not from the ray's origin: the shift is zero unless the near plane cuts
         shift = mid - tm
-        S[QX + k], S[QY + k], S[QZ + k] = px + shift * ex, py + shift * ey, pz + shift * ez
-        S[EXL + k], S[EYL + k], S[EZL + k] = ex, ey, ez
-        S[HALF + k] = half
-        S[FIELD + k] = offset
+        S[L.QX + k], S[L.QY + k], S[L.QZ + k] = px + shift * ex, py + shift * ey, pz + shift * ez
+        S[L.EXL + k], S[L.EYL + k], S[L.EZL + k] = ex, ey, ez
+        S[L.HALF + k] = half
+        S[L.FIELD + k] = offset
         if with_mid:
-            S[MID + k] = mid + slide
+            S[L.MID + k] = mid + slide
         if backward:
-            S[PX + k], S[PY + k], S[PZ + k] = px, py, pz
-            S[MID + k], S[TM + k], S[IA + k], S[UNCUT + k] = mid, tm, ia, uncut
-            S[HEIGHT + k], S[SLIDE + k] = h, slide
-            S[DH + k] = f(0.5) * ia / np.sqrt(max(D, depth_floor) * ia)
+            S[L.PX + k], S[L.PY + k], S[L.PZ + k] = px, py, pz
+            S[L.MID + k], S[L.TM + k], S[L.IA + k], S[L.UNCUT + k] = mid, tm, ia, uncut
+            S[L.HEIGHT + k], S[L.SLIDE + k] = h, slide
+            S[L.DH + k] = f(0.5) * ia / np.sqrt(max(D, depth_floor) * ia)

@@ -1,4 +1,4 @@
-"""Fit the even polynomials in turns that the kernels use for cos, sinc and sinc's derivative, and print their float32 errors.
+"""Fit the even polynomials in turns that the kernels use for cos, sinc, the profiles of soft edges, and their derivatives; print float32 errors.
 
     python benchmarks/fit_polynomials.py
 
@@ -7,9 +7,12 @@ Lawson-weighted least squares on Chebyshev nodes in z = r^2, |r| up to 1/2 or 3/
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.polynomial import Polynomial, chebyshev
 from numpy.typing import NDArray
+from scipy.special import spherical_jn
 
 F64 = NDArray[np.float64]
 
@@ -29,6 +32,30 @@ def dsinc_turns(z: F64) -> F64:
     s = np.where(h < 1e-2, 1, h)
     exact = (np.cos(s) - np.sin(s) / s) / s * (2 * np.pi) ** 2 / (2 * s)
     return np.where(h < 1e-2, (2 * np.pi) ** 2 * (-1 / 6 + h * h / 60), exact)
+
+
+def profile_turns(p: int) -> Callable[[F64], F64]:
+    """B_p(2 pi r) = (2p + 1)!! j_p(2 pi r)/(2 pi r)^p, p = 1 or 2, of z = r^2."""
+    factor = (1, 3, 15)[p]
+
+    def function(z: F64) -> F64:
+        h = 2 * np.pi * np.sqrt(z)
+        s = np.where(h < 1e-3, 1, h)
+        return np.where(h < 1e-3, 1 - h * h / (2 * (2 * p + 3)), factor * spherical_jn(p, s) / s**p)
+
+    return function
+
+
+def dprofile_turns(p: int) -> Callable[[F64], F64]:
+    """d B_p(2 pi r) / d(r^2), from dB_p/dh = -(2p + 1)!! j_(p+1)(h)/h^p."""
+    factor, limit = (1, 3, 15)[p], -1 / (2 * p + 3)
+
+    def function(z: F64) -> F64:
+        h = 2 * np.pi * np.sqrt(z)
+        s = np.where(h < 1e-3, 1, h)
+        return np.where(h < 1e-3, limit, -factor * spherical_jn(p + 1, s) / s ** (p + 1)) * (2 * np.pi) ** 2 / 2
+
+    return function
 
 
 def fit(function, degree: int, reach: float, centred: bool) -> tuple[F64, float]:  # type: ignore[no-untyped-def]
@@ -55,6 +82,14 @@ def main() -> None:
         ("dsinc", dsinc_turns, 5, 0.5, False),
         ("sinc medium", sinc_turns, 10, 1.5, True),
         ("dsinc medium", dsinc_turns, 9, 1.5, True),
+        ("B1", profile_turns(1), 5, 0.5, False),
+        ("dB1", dprofile_turns(1), 5, 0.5, False),
+        ("B1 medium", profile_turns(1), 9, 1.5, True),
+        ("dB1 medium", dprofile_turns(1), 9, 1.5, True),
+        ("B2", profile_turns(2), 5, 0.5, False),
+        ("dB2", dprofile_turns(2), 5, 0.5, False),
+        ("B2 medium", profile_turns(2), 9, 1.5, True),
+        ("dB2 medium", dprofile_turns(2), 9, 1.5, True),
     ):
         c, error = fit(function, degree, reach, centred)
         r = np.linspace(0, reach, 200_001).astype(np.float32)
@@ -63,7 +98,7 @@ def main() -> None:
         p = np.full_like(x, np.float32(c[-1]))
         for q in c[-2::-1]:
             p = (p * x + np.float32(q)).astype(np.float32)
-        scale = 2 * r if name.startswith("dsinc") else 1  # what the kernels use is d sinc/dr
+        scale = 2 * r if name.startswith("d") else 1  # what the kernels use is the derivative by r
         e32 = (np.abs(p - function(z.astype(np.float64))) * scale).max()
         print(f"{name:12} degree {degree}, |r| <= {reach}: fit {error:.2e}, float32 Horner {e32:.2e}")
         print("   ", ", ".join(repr(float(np.float32(x))) for x in c))

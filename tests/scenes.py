@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 import torch
 from torch import Tensor
@@ -71,6 +74,20 @@ def channels(t: dict[str, Tensor]) -> int:
     return int(t["colors" if "colors" in t else "base"].shape[1])
 
 
+_EDGE: ContextVar[int] = ContextVar("edge", default=0)
+
+
+@contextmanager
+def soft(edge: int) -> Iterator[None]:
+    """Every model that :func:`lowered` makes in this block has this edge."""
+    token = _EDGE.set(edge)
+    try:
+        yield
+    finally:
+        _EDGE.reset(token)
+
+
 def lowered(t: dict[str, Tensor]) -> Lowered:
     """The renderer's input from a dictionary of :func:`tensors`."""
-    return Lowered(Geometry(t["means"], t["log_scales"], t["quats"]), Cosine(t["W1"], t["b1"], t["w2"], t["b2"]), colour(t))
+    density = Cosine(t["W1"], t["b1"], t["w2"], t["b2"], edge=_EDGE.get())
+    return Lowered(Geometry(t["means"], t["log_scales"], t["quats"]), density, colour(t))

@@ -18,11 +18,12 @@ from typing import Any
 import llvmlite.binding as llvm
 import numba
 from numba import njit
+from numba.extending import overload
 
 from neuprim.core.io import files
 from neuprim.version import __version__
 
-__all__ = ["FAST", "cache_directory", "exact_kernel", "inline", "kernel", "kernel_sources", "sources_hash"]
+__all__ = ["FAST", "by_length", "cache_directory", "exact_kernel", "inline", "kernel", "kernel_sources", "sources_hash"]
 
 
 def _prefer_wide_vectors() -> None:
@@ -87,6 +88,23 @@ inline = njit(fastmath=FAST, error_model="numpy", forceinline=True)
 
 kernel = _jit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
 """A pixel kernel, called from worker threads."""
+
+
+def by_length(*functions: Any) -> Any:
+    """One function of (tuple, *arguments) for use in kernels, which calls ``functions[len(tuple)]`` of the arguments.
+
+    A tuple's length belongs to its type: the choice is made while a kernel is compiled, and what is not chosen leaves no trace in it.
+    """
+
+    def choose(key: Any, *arguments: Any) -> Any: ...
+
+    @overload(choose, jit_options={"forceinline": True, "fastmath": FAST, "error_model": "numpy"}, strict=False)
+    def _choose(key: Any, *arguments: Any) -> Any:
+        chosen = functions[len(key)]
+        return lambda key, *arguments: chosen(*arguments)
+
+    return choose
+
 
 exact_kernel = _jit(error_model="numpy", nogil=True, cache=True)
 """A kernel in strict IEEE arithmetic: per-primitive preparation, binning, sums whose order matters."""

@@ -81,8 +81,6 @@ def kernels_refuse(lowered: Lowered, camera: AnyCamera | None) -> str | None:
     if not (isinstance(lowered.density, Cosine) and isinstance(lowered.colour, Constant | RayNet)):
         forms = f"{type(lowered.density).__name__} density, {type(lowered.colour).__name__} colour"
         return f"{forms}; it knows Cosine, and Constant or RayNet"
-    if lowered.density.edge:
-        return f"a soft edge ({lowered.density.edge}); it knows edge 0"
     if isinstance(camera, RayCamera):
         return "a RayCamera (fisheye, equirectangular); it knows pinhole cameras"
     return None

@@ -22,6 +22,7 @@ from neuprim.core.render.cpu.colour_net import Net, net_backward, net_rows
 from neuprim.core.render.cpu.entry import backward_tiles_by_entry, composite_tiles_by_entry
 from neuprim.core.render.cpu.forward import composite_tiles
 from neuprim.core.render.cpu.prepare import NON_FINITE, VISIBLE, prepare, prepare_backward, prepare_wide
+from neuprim.core.render.cpu.profiles import EDGE_TYPES
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.settings import RenderSettings
 
@@ -40,6 +41,7 @@ class _Prepared:
     camera: Camera
     settings: RenderSettings
     omega0: float
+    edge: int
     background: Array
     stats: RenderStats
     R: Array
@@ -92,7 +94,14 @@ def _norms(width: int, height: int, fx: float, fy: float, cx: float, cy: float) 
 
 
 def _prepare(
-    tensors: dict[str, Array], camera: Camera, view: Array, omega0: float, background: Array, settings: RenderSettings, stats: RenderStats
+    tensors: dict[str, Array],
+    camera: Camera,
+    view: Array,
+    omega0: float,
+    edge: int,
+    background: Array,
+    settings: RenderSettings,
+    stats: RenderStats,
 ) -> _Prepared:
     count, K = tensors["W1"].shape[:2]
     neurons = K + K % 2  # the backward kernel takes neurons in pairs; a padded one has amplitude 0
@@ -107,7 +116,7 @@ def _prepare(
     names = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
     parallel_for(
         prepare, count, _PRIMITIVES_PER_CHUNK, settings.threads, *(tensors[n] for n in names),
-        R, t, cam, size, settings.near, omega0 / _TURN, rows, spans, kinds, order, boxes, depth, status, in_float64,
+        R, t, cam, size, settings.near, omega0 / _TURN, edge, rows, spans, kinds, order, boxes, depth, status, in_float64,
     )  # fmt: skip
     if bool((status == NON_FINITE).any()):
         raise _non_finite(tensors, int(np.flatnonzero(status == NON_FINITE)[0]))
@@ -134,6 +143,7 @@ def _prepare(
         camera,
         settings,
         omega0,
+        edge,
         background,
         stats,
         R,
@@ -175,7 +185,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
         ctx: Any, means: Tensor, log_scales: Tensor, quats: Tensor, W1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor,
-        colors: Tensor, viewmat: Tensor, background: Tensor, camera: Camera, omega0: float, settings: RenderSettings, stats: RenderStats,
+        colors: Tensor, viewmat: Tensor, background: Tensor, camera: Camera, omega0: float, edge: int, settings: RenderSettings, stats: RenderStats,
         *net: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         names = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
@@ -183,7 +193,7 @@ class _Rasterize(torch.autograd.Function):
         kernels = zip((*names, *painted[:-1]), (means, log_scales, quats, W1, b1, w2, b2, *net), strict=True)
         tensors = _alike({n: _array(v) for n, v in kernels}) | {painted[-1]: _array(colors)}
         _check_colours(tensors, painted)
-        frame = _prepare(tensors, camera, viewmat.detach().double().numpy(), omega0, _array(background.float()), settings, stats)
+        frame = _prepare(tensors, camera, viewmat.detach().double().numpy(), omega0, edge, _array(background.float()), settings, stats)
         h, w, C = camera.height, camera.width, colors.shape[1]
         rgb, T = np.empty((h, w, C), np.float32), np.empty((h, w), np.float32)
         z, last = np.zeros((h, w) if settings.depth else (1, 1), np.float32), np.empty((h, w), np.int32)
@@ -192,7 +202,7 @@ class _Rasterize(torch.autograd.Function):
         lanes = parallel_for(
             tiles, frame.tiles, frame.chunk, settings.threads, frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
             frame.lists.starts, frame.lists.ids, palette, frame.norms, frame.background, frame.limits, settings.depth, frame.neurons,
-            rgb, T, z, last, frame.net,
+            rgb, T, z, last, frame.net, EDGE_TYPES[frame.edge],
         )  # fmt: skip
         stats.extra["forward_lanes"] = sum(lanes)
         ctx.frame, ctx.tensors, ctx.palette, ctx.last, ctx.T = frame, tensors, palette, last, T
@@ -223,7 +233,7 @@ class _Rasterize(torch.autograd.Function):
         lanes = parallel_for(
             tiles, frame.tiles, frame.chunk, s.threads, frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
             frame.lists.starts, frame.lists.ids, ctx.palette, frame.norms, frame.limits, with_depth, frame.neurons,
-            ctx.T, ctx.last, grad_rgb, gT, gz, error, pair_rows, frame.net,
+            ctx.T, ctx.last, grad_rgb, gT, gz, error, pair_rows, frame.net, EDGE_TYPES[frame.edge],
         )  # fmt: skip
         frame.stats.extra["backward_lanes"] = sum(lanes)
         grads, touched = np.empty((count, width), np.float32), np.empty(count, np.bool_)
@@ -268,7 +278,7 @@ class _Rasterize(torch.autograd.Function):
         if ctx.needs_input_grad[9]:
             g_background = (g_rgb * torch.from_numpy(ctx.T)[..., None]).sum((0, 1)).to(ctx.background_dtype)
         nets = (torch.from_numpy(r).to(d) for r, d in zip(g_net, ctx.net_dtypes, strict=True))
-        return (*tensors, view, g_background, None, None, None, None, *nets)
+        return (*tensors, view, g_background, None, None, None, None, None, *nets)
 
 
 def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
@@ -282,7 +292,7 @@ def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings
         background = torch.zeros(palette.shape[1])
     rgb, T, zsum = _Rasterize.apply(
         g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1), palette,
-        camera.viewmat, background, camera, density.omega0, settings, stats, *net,
+        camera.viewmat, background, camera, density.omega0, density.edge, settings, stats, *net,
     )  # fmt: skip
     dtype = g.means.dtype
     alpha = 1 - T

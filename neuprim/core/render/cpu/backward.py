@@ -11,7 +11,7 @@ import numpy as np
 from neuprim.core.compute.kernels import exact_kernel, inline, kernel
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
-from neuprim.core.render.cpu.gradients import chord_gradient, field_gradient, two_neurons
+from neuprim.core.render.cpu.gradients import chord_gradient, density_alone, field_gradient, two_neurons
 from neuprim.core.render.cpu.neurons import field_with_slopes
 from neuprim.core.render.cpu.ray_colours import (
     ray_colour_gradient,
@@ -31,11 +31,13 @@ _STEPS = np.arange(L.TILE).astype(np.float32)
 
 
 @inline
-def opacity(S, n, amin, amax):  # type: ignore[no-untyped-def]
-    """ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF) of every lane, with exactly the forward pass's clamp and cut."""
+def opacity(S, n, amin, amax, edge):  # type: ignore[no-untyped-def]
+    """ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF FADE) of every lane, with exactly the forward pass's clamp and cut."""
     for k in range(n):
         norm = S[L.NORM_L + k]
         depth = S[L.FIELD + k] * S[L.HALF + k] * norm * f(2)
+        if len(edge) > 0:
+            depth *= S[L.FADE + k]
         raw = one_minus_exp(depth)
         alpha = min(raw, amax)
         alpha = alpha if alpha >= amin else f(0)
@@ -120,7 +122,7 @@ def _total(sums, first):  # type: ignore[no-untyped-def]
 @kernel
 def backward_tiles(  # type: ignore[no-untyped-def]
     start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, limits, with_depth, neurons,
-    transmittance, last, g_rgb, g_transmittance, g_z, error, pair_rows, net,
+    transmittance, last, g_rgb, g_transmittance, g_z, error, pair_rows, net, edge,
 ):  # fmt: skip
     """Gradient rows of every pair of tiles ``start:stop``. ``g_transmittance`` already holds the background's share.
 
@@ -182,8 +184,8 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                 continue
             n16 = ((n + 15) // 16) * 16
             evaluated += n16
-            field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor)
-            opacity(S, n16, amin, amax)
+            field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, edge)
+            opacity(S, n16, amin, amax, edge)
             for k in range(n, n16):
                 S[L.GRAD + k] = f(0)
             if net is not None:
@@ -236,12 +238,14 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             if net is None:
                 for c in range(C):
                     out[color_at + c] = _total(sums, (2 + c) * L.TILE)
-            field_gradient(S, n16, out)
+            field_gradient(S, n16, out, edge)
             for m in range(0, neurons, 2):
                 two_neurons(S, V[m], V[m + 1], n16, p, m, out)
+            if len(edge) > 0 and slots[i] >= 0:
+                density_alone(S, n16)
             if net is not None:
                 ray_colour_gradient(S, waves, n16, i, net, C, out, color_at)
-            chord_gradient(S, n16, p, out)
+            chord_gradient(S, n16, p, out, edge, slots[i] >= 0)
     return evaluated
 
 

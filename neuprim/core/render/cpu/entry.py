@@ -19,7 +19,7 @@ from neuprim.core.compute.kernels import inline, kernel
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.backward import opacity
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
-from neuprim.core.render.cpu.gradients import chord_gradient, field_gradient, two_neurons
+from neuprim.core.render.cpu.gradients import chord_gradient, density_alone, field_gradient, two_neurons
 from neuprim.core.render.cpu.neurons import field_values, field_with_slopes
 from neuprim.core.render.cpu.ray_colours import ray_colour_gradient, ray_colours
 from neuprim.core.render.cpu.tiles import compact, row_spans
@@ -72,7 +72,7 @@ def _room(first, end, ids, boxes, tx, ty):  # type: ignore[no-untyped-def]
 @inline
 def _list_hits(  # type: ignore[no-untyped-def]
     S, D, state, offset, bounds, rows_live, first, end, tx, ty, rows, wide, slots, spans, kinds, boxes, ids, limits, neurons,
-    hits, marks, starts_of, colors, net, waves, hues,
+    hits, marks, starts_of, colors, net, waves, hues, edge,
 ):  # fmt: skip
     """List the hits of a tile in the order of its pairs; those of pair r lie in ``starts_of[r] : starts_of[r + 1]``.
 
@@ -89,8 +89,8 @@ def _list_hits(  # type: ignore[no-untyped-def]
             continue
         n16 = ((n + 15) // 16) * 16
         evaluated += n16
-        field_values(S, D, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, False, True)
-        opacity(S, n16, amin, amax)
+        field_values(S, D, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, False, True, edge)
+        opacity(S, n16, amin, amax, edge)
         if net is not None:
             ray_colours(S, D, waves, n16, i, net, slots, colors[i], False)
         anchor, unit = p[L.ANCHOR_Z], p[L.UNIT]
@@ -145,7 +145,7 @@ def _sort_hits(count, hits, marks, begin, listing):  # type: ignore[no-untyped-d
 @kernel
 def composite_tiles_by_entry(  # type: ignore[no-untyped-def]
     start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, background, limits, with_depth, neurons,
-    rgb, transmittance, zsum, last, net,
+    rgb, transmittance, zsum, last, net, edge,
 ):  # fmt: skip
     """As :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``last`` receives how many hits each pixel composited."""
     height, width = norms.shape
@@ -178,7 +178,7 @@ def composite_tiles_by_entry(  # type: ignore[no-untyped-def]
             starts_of = np.empty(end - first + 1, np.int32)
         count, lanes = _list_hits(
             S, D, state, offset, bounds, rows_live, first, end, tx, ty, rows, wide, slots, spans, kinds, boxes, ids, limits, neurons,
-            hits, marks, starts_of, colors, net, waves, hues,
+            hits, marks, starts_of, colors, net, waves, hues, edge,
         )  # fmt: skip
         evaluated += lanes
         _sort_hits(count, hits, marks, begin, listing)
@@ -210,7 +210,7 @@ def composite_tiles_by_entry(  # type: ignore[no-untyped-def]
 @kernel
 def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
     start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, limits, with_depth, neurons,
-    transmittance, last, g_rgb, g_transmittance, g_z, error, pair_rows, net,
+    transmittance, last, g_rgb, g_transmittance, g_z, error, pair_rows, net, edge,
 ):  # fmt: skip
     """As :func:`~neuprim.core.render.cpu.backward.backward_tiles`. Composites anew, so ``transmittance`` and ``last`` are not read."""
     height, width = norms.shape
@@ -245,7 +245,7 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
             starts_of = np.empty(end - first + 1, np.int32)
         count, lanes = _list_hits(
             S, D, state, offset, bounds, rows_live, first, end, tx, ty, rows, wide, slots, spans, kinds, boxes, ids, limits, neurons,
-            hits, marks, starts_of, colors, net, waves, hues,
+            hits, marks, starts_of, colors, net, waves, hues, edge,
         )  # fmt: skip
         evaluated += lanes
         _sort_hits(count, hits, marks, begin, listing)
@@ -294,7 +294,7 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
             n, y0, y1 = _lanes_of(S, state, offset, bounds, rows_live, spans[i], boxes[i], p, tx, ty)
             n16 = ((n + 15) // 16) * 16
             evaluated += n16
-            field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor)
+            field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, edge)
             for k in range(n16):
                 S[L.GRAD + k], S[L.GMID + k] = f(0), f(0)
             if net is not None:
@@ -311,10 +311,12 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
                             S[L.RAY_COLOUR + (C + c) * L.LANES + k] = hits[s, H_WEIGHT] * g_rgb[ty + j // L.TILE, tx + j % L.TILE, c]
                 if with_depth:
                     S[L.GMID + k] = hits[s, H_WEIGHT] * g_z[ty + j // L.TILE, tx + j % L.TILE] * p[L.UNIT]
-            field_gradient(S, n16, out)
+            field_gradient(S, n16, out, edge)
             for m in range(0, neurons, 2):
                 two_neurons(S, V[m], V[m + 1], n16, p, m, out)
+            if len(edge) > 0 and slots[i] >= 0:
+                density_alone(S, n16)
             if net is not None:
                 ray_colour_gradient(S, waves, n16, i, net, C, out, color_at)
-            chord_gradient(S, n16, p, out)
+            chord_gradient(S, n16, p, out, edge, slots[i] >= 0)
     return evaluated

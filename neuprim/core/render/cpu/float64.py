@@ -12,14 +12,18 @@ from neuprim.core.compute.kernels import inline
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, dsinc_turns, sinc_turns
 
-__all__ = ["FLOAT64_SCRATCH", "chords_float64", "neurons_float64", "phase_float64", "slopes_float64"]
+__all__ = [
+    "FLOAT64_SCRATCH", "HALF64", "INNER", "SHIFT", "SQUARE", "chords_float64", "hard_neurons_float64", "hard_slopes_float64", "phase_float64", "reduced_float64",
+]  # fmt: skip
 
 f = np.float32
-# float64 lanes: chord middle and half chord vector in whitened space
+# float64 lanes: chord middle and half chord vector in whitened space, then 1 - |y|^2 at the closest approach, how far the middle is from it
+# and the half chord (units of m along e), and e.e
 _Q, _V = (L.lane(0), L.lane(1), L.lane(2)), (L.lane(3), L.lane(4), L.lane(5))
 _Q0, _Q1, _Q2 = _Q
 _V0, _V1, _V2 = _V
-FLOAT64_SCRATCH = L.lane(6)
+INNER, SHIFT, SQUARE, HALF64 = L.lane(6), L.lane(7), L.lane(8), L.lane(9)
+FLOAT64_SCRATCH = L.lane(10)
 
 
 @inline
@@ -49,6 +53,7 @@ def chords_float64(S, X, bounds, y0, y1, tx, ty, n, p, depth_floor, with_mid, ba
             X[at + _V0], X[at + _V1], X[at + _V2] = ex * half, ey * half, ez * half
             S[L.QX + at], S[L.QY + at], S[L.QZ + at] = f(qx), f(qy), f(qz)
             S[L.EXL + at], S[L.EYL + at], S[L.EZL + at] = f(ex), f(ey), f(ez)
+            X[at + INNER], X[at + SHIFT], X[at + SQUARE], X[at + HALF64] = D, shift, 1.0 / ia, half
             S[L.HALF + at] = f(half)
             S[L.FIELD + at] = f(p[L.OFFSET])
             if with_mid:
@@ -64,6 +69,7 @@ def chords_float64(S, X, bounds, y0, y1, tx, ty, n, p, depth_floor, with_mid, ba
             S[a + k] = f(0)
         for a in _Q + _V:
             X[a + k] = 0.0
+        X[INNER + k], X[SHIFT + k], X[SQUARE + k], X[HALF64 + k] = 0.0, 0.0, 0.0, 0.0
         if with_mid or backward:
             S[L.MID + k] = f(0)
         if backward:
@@ -79,7 +85,7 @@ def phase_float64(X, k, p, o):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _reduced(X, k, p, o):  # type: ignore[no-untyped-def]
+def reduced_float64(X, k, p, o):  # type: ignore[no-untyped-def]
     """Phase at the chord's middle and half its change, in turns: both reduced to half a turn, and the second whole."""
     wx, wy, wz = p[o + L.WX], p[o + L.WY], p[o + L.WZ]
     u = X[k + _Q0] * wx + X[k + _Q1] * wy + X[k + _Q2] * wz + p[o + L.PHASE]
@@ -88,12 +94,12 @@ def _reduced(X, k, p, o):  # type: ignore[no-untyped-def]
 
 
 @inline
-def neurons_float64(S, X, n, p, neurons):  # type: ignore[no-untyped-def]
+def hard_neurons_float64(S, X, n, p, neurons):  # type: ignore[no-untyped-def]
     """FIELD += w2 cos(phase at the middle) sinc(half its change) of every neuron of a float64 row."""
     for m in range(neurons):
         o = L.NEURONS + L.PER_NEURON * m
         for k in range(n):
-            r, s, v = _reduced(X, k, p, o)
+            r, s, v = reduced_float64(X, k, p, o)
             sinc = sinc_turns(s * s)
             if abs(v) > 0.5:
                 sinc *= f(s / v)
@@ -101,12 +107,12 @@ def neurons_float64(S, X, n, p, neurons):  # type: ignore[no-untyped-def]
 
 
 @inline
-def slopes_float64(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
+def hard_slopes_float64(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
     """The same, and the three products per neuron that the gradients need."""
     for m in range(neurons):
         o = L.NEURONS + L.PER_NEURON * m
         for k in range(n):
-            r, s, v = _reduced(X, k, p, o)
+            r, s, v = reduced_float64(X, k, p, o)
             sinc, slope = sinc_turns(s * s), dsinc_turns(s * s) * f(2) * s
             if abs(v) > 0.5:
                 sinc *= f(s / v)

@@ -21,10 +21,12 @@ _LIVE_EVERY = 4  # pairs between two counts of live pixels: a dead row costs a f
 
 
 @inline
-def _opacity(S, n, amin, amax):  # type: ignore[no-untyped-def]
+def _opacity(S, n, amin, amax, edge):  # type: ignore[no-untyped-def]
     """ALPHA of every lane: 0 below alpha_min and where the integral is not positive, at most alpha_max."""
     for k in range(n):
         depth = S[L.FIELD + k] * S[L.HALF + k] * S[L.NORM_L + k] * f(2)
+        if len(edge) > 0:
+            depth *= S[L.FADE + k]
         alpha = min(one_minus_exp(depth), amax)
         alpha = alpha if alpha >= amin else f(0)
         S[L.ALPHA + k] = alpha if depth > f(0) else f(0)
@@ -63,7 +65,7 @@ def _composite_row(st, lanes, w, a, b, tmin, rank):  # type: ignore[no-untyped-d
 @kernel
 def composite_tiles(  # type: ignore[no-untyped-def]
     start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, background, limits, with_depth, neurons,
-    rgb, transmittance, zsum, last, net,
+    rgb, transmittance, zsum, last, net, edge,
 ):  # fmt: skip
     """Draw tiles ``start:stop``; returns the number of evaluated lanes.
 
@@ -107,8 +109,8 @@ def composite_tiles(  # type: ignore[no-untyped-def]
             if n > 0:
                 n16 = ((n + 15) // 16) * 16
                 evaluated += n16
-                field_values(S, D, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, with_depth, False)
-                _opacity(S, n16, amin, amax)
+                field_values(S, D, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, with_depth, False, edge)
+                _opacity(S, n16, amin, amax, edge)
                 if net is not None:
                     ray_colours(S, D, waves, n16, i, net, slots, colors[i], False)
                 rank = f(q - starts[t] + 1)

@@ -1,4 +1,4 @@
-"""From dL/d(2 FIELD HALF) of every lane back to one gradient row: shared by both orders of compositing."""
+"""From dL/d(2 FIELD HALF FADE) of every lane back to one gradient row: shared by both orders of compositing."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import numpy as np
 from neuprim.core.compute.kernels import inline
 from neuprim.core.render.cpu import layout as L
 
-__all__ = ["chord_gradient", "field_gradient", "two_neurons"]
+__all__ = ["chord_gradient", "density_alone", "field_gradient", "two_neurons"]
 
 f = np.float32
 
 
 @inline
-def field_gradient(S, n, out):  # type: ignore[no-untyped-def]
-    """From dL/d(2 FIELD HALF) to dL/d FIELD, and the sums for b2 and log m."""
+def field_gradient(S, n, out, edge):  # type: ignore[no-untyped-def]
+    """From dL/d(2 FIELD HALF FADE) to dL/d FIELD, and the sums for b2 and log m."""
     offset, log_m = f(0), f(0)
     for k in range(n):
         g = f(2) * S[L.GRAD + k]
-        gf = g * S[L.HALF + k]
+        gf = g * S[L.HALF + k] * S[L.FADE + k] if len(edge) > 0 else g * S[L.HALF + k]
         S[L.GRAD + k], S[L.GF + k] = g, gf
         offset += gf
         log_m += gf * S[L.FIELD + k]
@@ -66,9 +66,22 @@ def two_neurons(S, V0, V1, n, p, m, out):  # type: ignore[no-untyped-def]
 
 
 @inline
-def chord_gradient(S, n, p, out):  # type: ignore[no-untyped-def]
-    """From chord middle, half chord and direction back to the affine ray (E0, EX, EY, XA)."""
-    tc = p[L.TC]
+def density_alone(S, n):  # type: ignore[no-untyped-def]
+    """Keep dL/dQ . e before colours add to dL/dQ: see :func:`chord_gradient`."""
+    for k in range(n):
+        S[L.INSIDE + k] = S[L.GQX + k] * S[L.EXL + k] + S[L.GQY + k] * S[L.EYL + k] + S[L.GQZ + k] * S[L.EZL + k]
+
+
+@inline
+def chord_gradient(S, n, p, out, edge, in_float64):  # type: ignore[no-untyped-def]
+    """From chord middle, half chord and direction back to the affine ray (E0, EX, EY, XA).
+
+    A hard edge has the gradient of its ends, t0 and t1. A soft one has none there, the density being zero, but its weight depends on
+    D = 1 - |p|^2, and on a = e.e and the closest approach where the near plane may cut the chord. In float32 no chord is cut, the weight is
+    proportional to D^p, and the ends' share through HALF is kept, as it belongs to the closed form: BY_D is d FADE/dD. In float64
+    the ends are left out, and BY_D, BY_A and BY_TM are derivatives of the whole mean FADE FIELD.
+    """
+    tc, soft = p[L.TC], len(edge)
     a0, a1, a2, a3, a4, a5 = f(0), f(0), f(0), f(0), f(0), f(0)
     a6, a7, a8, a9, b0, b1 = f(0), f(0), f(0), f(0), f(0), f(0)
     for k in range(n):
@@ -77,14 +90,23 @@ def chord_gradient(S, n, p, out):  # type: ignore[no-untyped-def]
         px, py, pz, h, slide = S[L.PX + k], S[L.PY + k], S[L.PZ + k], S[L.HEIGHT + k], S[L.SLIDE + k]
         gqx, gqy, gqz = S[L.GQX + k], S[L.GQY + k], S[L.GQZ + k]
         vx, vy, vz = S[L.GEX + k], S[L.GEY + k], S[L.GEZ + k]
-        g_half = vx * ex + vy * ey + vz * ez + S[L.GRAD + k] * S[L.FIELD + k]
+        g, field = S[L.GRAD + k], S[L.FIELD + k]
+        g_half = vx * ex + vy * ey + vz * ez + (g * field * S[L.FADE + k] if soft > 0 else g * field)
         gex, gey, gez = vx * half + mid * gqx, vy * half + mid * gqy, vz * half + mid * gqz
         g_mid = gqx * ex + gqy * ey + gqz * ez + S[L.GMID + k]
+        if soft > 0 and in_float64:
+            g_half, g_mid = f(0), g_mid - S[L.INSIDE + k]
         gt1 = (g_mid + g_half) * f(0.5)
         gt0 = (g_mid - g_half) * f(0.5) * uncut
         g_tm, g_h = gt0 + gt1, gt1 - gt0  # t0 = tm - h, t1 = tm + h
+        if soft > 0 and in_float64:
+            g_tm += g * half * S[L.BY_TM + k]
         gD = g_h * dh  # dh/dD with D floored
+        if soft > 0:
+            gD += g * half * S[L.BY_D + k] if in_float64 else g * half * field * S[L.BY_D + k]
         gA = -(g_h * h * f(0.5) + g_tm * tm) * ia  # via a = e.e, h = sqrt(D/a), tm = -(m.e)/a
+        if soft > 0 and in_float64:
+            gA += g * half * S[L.BY_A + k]
         gB = -g_tm * ia
         m2 = f(-2) * gD  # D = 1 - |p|^2, and |p| = |m + tm e| does not change with tm
         gmx, gmy, gmz = gqx + m2 * px + gB * ex, gqy + m2 * py + gB * ey, gqz + m2 * pz + gB * ez

@@ -83,17 +83,21 @@ DH = lane(16)  # dh/dD with the floor on D
 UNCUT = lane(17)  # 1 where the near plane does not cut the chord
 NORM_L = lane(18)  # length of the ray direction whose camera-z is 1
 ALPHA = lane(19)  # opacity after clamp and cut
-OVER = lane(20)  # 1/(1 - alpha)
-SLOPE = lane(21)  # d alpha / d(FIELD HALF 2), 0 where clamped or cut
-GRAD = lane(22)  # dL/d(FIELD HALF 2)
-GF = lane(23)  # dL/d FIELD
-GQX, GQY, GQZ = lane(24), lane(25), lane(26)  # dL/d chord middle
-GEX, GEY, GEZ = lane(27), lane(28), lane(29)  # dL/d (half e)
-GMID = lane(30)  # dL/d MID from the depth image
-HEIGHT = lane(31)  # half chord before the near plane cuts it
-SLIDE = lane(32)  # s: MID and TM are measured from a ray origin slid by this much
-FORWARD_SCRATCH = lane(20)
-BACKWARD_SCRATCH = lane(33)
+FADE = lane(20)  # soft edges: mean of (1 - |y|^2)^p over the chord; an optical depth is 2 FIELD HALF FADE, FADE = 1 without
+OVER = lane(21)  # 1/(1 - alpha)
+SLOPE = lane(22)  # d alpha / d(2 FIELD HALF FADE), 0 where clamped or cut
+GRAD = lane(23)  # dL/d(2 FIELD HALF FADE)
+GF = lane(24)  # dL/d FIELD
+GQX, GQY, GQZ = lane(25), lane(26), lane(27)  # dL/d chord middle
+GEX, GEY, GEZ = lane(28), lane(29), lane(30)  # dL/d (half e)
+GMID = lane(31)  # dL/d MID from the depth image
+HEIGHT = lane(32)  # half chord before the near plane cuts it
+SLIDE = lane(33)  # s: MID and TM are measured from a ray origin slid by this much
+# of soft edges only: derivatives of FADE, or in float64 of the mean of the whole density, see gradients.chord_gradient
+BY_D, BY_A, BY_TM = lane(34), lane(35), lane(36)
+INSIDE = lane(37)  # dL/dQ . e of the density alone
+FORWARD_SCRATCH = lane(21)
+BACKWARD_SCRATCH = lane(38)
 # with a colour network also, forward and backward: C arrays of colours before max(0, .), then C of dL/d those
 RAY_COLOUR = BACKWARD_SCRATCH
 # per neuron in the backward pass: cos sinc, -2 pi sin sinc, cos dsinc

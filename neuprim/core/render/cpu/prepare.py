@@ -34,6 +34,7 @@ _FLOAT32_MAX = 3.0e38
 _FLOAT64_RADII = 8.0  # terms of a point on the ray this many radii of the thinnest axis long: they cancel
 _FLOAT64_ANCHOR = 1.25  # the same of the centre seen from an anchor at the camera: most cameras outside, but near
 FLOAT64_TURNS = 4.0  # of a neuron, or a unit of a colour network, over half a chord
+_CUT = 1e-3  # of the reach: float32 may find a chord cut that float64 does not
 _FLOAT64_PIXELS = 16384.0  # from the corner of the image to the anchor
 _FLOAT64_RATIO = 256.0  # of the axes; for the gradients
 _FLOAT64_RATIO_NEAR = 16.0  # of the axes of a primitive anchored at the camera, which its chords pass closely
@@ -170,7 +171,7 @@ def prepare_wide(start, stop, which, means, log_scales, quats, W1, b1, w2, b2, R
 
 @exact_kernel
 def prepare(  # type: ignore[no-untyped-def]
-    start, stop, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, size, near, turns,
+    start, stop, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, size, near, turns, edge,
     rows, spans, kinds, order, boxes, depth, status, in_float64,
 ):  # fmt: skip
     """Fill kernel rows, silhouette spans, pixel boxes, view depths and status of primitives ``start:stop``.
@@ -203,6 +204,7 @@ def prepare(  # type: ignore[no-untyped-def]
         status[i] = CULLED
         szz = m * m * ((B[2, 0] * axes[0]) ** 2 + (B[2, 1] * axes[1]) ** 2 + (B[2, 2] * axes[2]) ** 2)
         reach = np.sqrt(szz)
+        in_float64[i] |= edge > 0 and c[2] - reach < near + _CUT * reach  # only there are integrals of cut chords with a soft edge
         if c[2] + reach <= near:
             continue
         if biggest > _FLOAT32_MAX:

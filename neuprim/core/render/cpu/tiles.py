@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import inline
+from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cpu import layout as L
 
 __all__ = ["chords", "compact", "row_spans"]
@@ -16,6 +17,7 @@ __all__ = ["chords", "compact", "row_spans"]
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(L.TILE).astype(np.float32)
+_MEANS = tuple(f(n / 2) for n in NORMS)  # of (1 - u^2)^p over [-1, 1]
 _MARGIN, _ROUNDING = f(2e-3), f(4e-7)  # pixels, and per pixel of the ellipse; a lane too many is rejected by its own D
 
 
@@ -73,8 +75,13 @@ def compact(S, state, offset, bounds, y0, y1, rows_live, fx0, fy0):  # type: ign
 
 
 @inline
-def chords(S, n, p, depth_floor, with_mid, backward):  # type: ignore[no-untyped-def]
-    """Chord middle Q, direction E and half length of n lanes (method: "Line integral"); HALF = 0 where the ray misses."""
+def chords(S, n, p, depth_floor, with_mid, backward, edge):  # type: ignore[no-untyped-def]
+    """Chord middle Q, direction E and half length of n lanes (method: "Line integral"); HALF = 0 where the ray misses.
+
+    Where the edge is soft, no chord may be cut: such primitives are drawn in float64.
+    """
+    soft = len(edge)
+    depth_floor = depth_floor if soft == 0 else f(1e-12)  # D^p tames what grows as D^-1/2
     e0, e1, e2 = p[L.E0], p[L.E0 + 1], p[L.E0 + 2]
     x0, x1, x2 = p[L.EX], p[L.EX + 1], p[L.EX + 2]
     y0, y1, y2 = p[L.EY], p[L.EY + 1], p[L.EY + 2]
@@ -107,6 +114,11 @@ def chords(S, n, p, depth_floor, with_mid, backward):  # type: ignore[no-untyped
         S[L.EXL + k], S[L.EYL + k], S[L.EZL + k] = ex, ey, ez
         S[L.HALF + k] = half
         S[L.FIELD + k] = offset
+        if soft > 0:
+            inner = max(D, f(0))
+            S[L.FADE + k] = _MEANS[1] * inner if soft == 1 else _MEANS[2] * inner * inner
+            if backward:
+                S[L.BY_D + k] = _MEANS[1] if soft == 1 else f(2) * _MEANS[2] * inner
         if with_mid:
             S[L.MID + k] = mid + slide
         if backward:

@@ -16,6 +16,7 @@ __all__ = [
     "TAU",
     "cos_turns",
     "one_minus_exp",
+    "reduced",
     "sinc_turns",
     "sincs_fast",
     "sincs_medium",
@@ -123,7 +124,7 @@ def slopes_medium(v, w):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _reduced(v, w):  # type: ignore[no-untyped-def]
+def reduced(v, w):  # type: ignore[no-untyped-def]
     """v and w reduced to half a turn, whether they were within, and their reciprocals (1 where within) from one division."""
     k, j = np.rint(v), np.rint(w)
     a, b = k == f(0), j == f(0)
@@ -135,7 +136,7 @@ def _reduced(v, w):  # type: ignore[no-untyped-def]
 @inline
 def sincs_fast(v, w):  # type: ignore[no-untyped-def]
     """Any v and w: sinc(2 pi v) = sinc(2 pi r) r/v with r = v - rint(v), exactly reduced."""
-    r, s, a, b, iv, iw = _reduced(v, w)
+    r, s, a, b, iv, iw = reduced(v, w)
     x, y = sinc_turns(r * r), sinc_turns(s * s)
     return x if a else x * r * iv, y if b else y * s * iw
 
@@ -143,7 +144,7 @@ def sincs_fast(v, w):  # type: ignore[no-untyped-def]
 @inline
 def slopes_fast(v, w):  # type: ignore[no-untyped-def]
     """d sinc/dv = (cos - sinc)/v beyond half a turn."""
-    r, s, a, b, iv, iw = _reduced(v, w)
+    r, s, a, b, iv, iw = reduced(v, w)
     y, z = r * r, s * s
     x, u = sinc_turns(y), sinc_turns(z)
     sx, su = x if a else x * r * iv, u if b else u * s * iw

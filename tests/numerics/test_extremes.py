@@ -20,6 +20,14 @@ def test_bounds_hold(region: Region) -> None:
         assert not result.broken, f"{result.label}: {result.broken}"
 
 
+@pytest.mark.parametrize("edge", [1, 2])
+@pytest.mark.parametrize("region", REGIONS, ids=lambda r: r.name)
+def test_bounds_hold_for_soft_edges(region: Region, edge: int) -> None:
+    for backend, precision in BACKENDS:
+        result = measure(region, backend, precision, 1, edge)
+        assert not result.broken, f"{result.label}: {result.broken}"
+
+
 @pytest.mark.parametrize("region", SINGLE, ids=lambda r: r.name)
 def test_the_oracle_agrees_with_fifty_digits(region: Region) -> None:
     """Another form of the integral, on the three most different pixels of a case: the largest and smallest D and the largest I."""

@@ -26,6 +26,7 @@ SOLID = 0.45  # shorter chords, as a share of the central one, are thin: D < 0.2
 OPAQUE = 1.5  # optical depth beyond which alpha is compared instead
 RIM = 1e-6  # |D| below which float32 may not know whether a ray meets an ellipsoid
 FUNCTIONALS = 4
+_SHORTEST = 1e-2  # share of the central chord below which a soft edge's error is compared with that of one as long
 
 
 @dataclass
@@ -36,6 +37,7 @@ class Case:
     camera: Camera
     settings: RenderSettings = OPEN
     name: str = ""
+    edge: int = 0
 
     def cast(self, precision: str) -> Case:
         dtype = torch.float64 if precision == "float64" else torch.float32
@@ -48,7 +50,8 @@ class Errors:
 
     Attributes:
         forward: |dI|/S on solid chords.
-        thin: |dI|/S (S/S_c)^2 on thin ones, S_c the central chord's S, and the same for hits missed and misses hit.
+        thin: |dI|/S (S/S_c)^2 on thin ones, S_c the central chord's S, and the same for hits missed and misses hit. With a soft edge, whose
+            integrals go as D^(p + 1/2), |dI|/S_c (S_c/S)^(2p - 1).
         at: S/S_c where ``forward`` was found.
         gradient: error of a parameter's gradient over the gradient's norm; ``parameter`` is the worst one.
         hits: pixels compared.
@@ -90,7 +93,7 @@ def drawn(case: Case, backend: str) -> tuple[np.ndarray, int]:  # type: ignore[t
 
 def integral_errors(case: Case, backend: str, exact: Integrals | None = None) -> Errors:
     """Worst |dI|/S over the pixels of a case of one primitive."""
-    exact = exact or long_integrals(case.tensors, 0, case.camera, case.settings.near)
+    exact = exact or long_integrals(case.tensors, 0, case.camera, case.settings.near, case.edge)
     alpha, wide = drawn(case, backend)
     low, high = case.settings.alpha_min, case.settings.alpha_max
     true = np.maximum(exact.depth, 0)
@@ -107,7 +110,11 @@ def integral_errors(case: Case, backend: str, exact: Integrals | None = None) ->
     # float32 knows D = 1 - |x_m|^2 to about 1e-7, and dI/S = dD/2D: thin chords get a law of their own
     short = (exact.scale < SOLID * exact.central) & (exact.D > -1)
     share = np.where(short | ~exact.hit, 0, error / np.where(exact.hit, exact.scale, 1)).astype(np.float64)
-    rim = np.where(short | ~exact.hit, error * np.maximum(exact.scale, error) / exact.central**2, 0).astype(np.float64)
+    if case.edge == 0:
+        rim = np.where(short | ~exact.hit, error * np.maximum(exact.scale, error) / exact.central**2, 0).astype(np.float64)
+    else:
+        length = np.maximum(exact.scale / exact.central, _SHORTEST)
+        rim = np.where(short | ~exact.hit, error / exact.central / length ** (2 * case.edge - 1), 0).astype(np.float64)
     at = np.unravel_index(np.argmax(share), share.shape)
     where = float((exact.scale / exact.central)[at])
     return Errors(float(share.max()), float(rim.max()), 0.0, "", where, int(exact.hit.sum()), wide, 1)
@@ -196,11 +203,15 @@ def frame_errors(case: Case, backend: str) -> tuple[Errors, Tensor]:
 
 def compare(case: Case, backend: str, precision: str, whole: bool, gradients: bool) -> Errors:
     """Everything about one case on one backend."""
-    case = case.cast(precision)
+    with scenes.soft(case.edge):
+        return _compare(case.cast(precision), backend, whole, gradients)
+
+
+def _compare(case: Case, backend: str, whole: bool, gradients: bool) -> Errors:
     if whole:
         errors, skip = frame_errors(case, backend)
     else:
-        exact = long_integrals(case.tensors, 0, case.camera, case.settings.near)
+        exact = long_integrals(case.tensors, 0, case.camera, case.settings.near, case.edge)
         errors = (colour_errors if "Wx" in case.tensors else integral_errors)(case, backend, exact)
         skip = torch.from_numpy((np.abs(exact.D) < RIM).astype(np.bool_))
     if gradients:

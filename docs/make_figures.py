@@ -1,8 +1,9 @@
-"""The figure of docs/mathematics.md: one primitive, one ray, and the integral of the density along their chord.
+"""The figures of docs/mathematics.md: one primitive, one ray and the integral of the density along their chord; the weights of soft edges.
 
 python docs/make_figures.py docs/pictures/chord.png
+python docs/make_figures.py docs/pictures/edges.png
 
-Everything in it is computed by the package: the field by `cosine_density`, the integral once by the renderer and once by summing.
+Everything in them is computed by the package: the field by `cosine_density`, the integral once by the renderer and once by summing.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import torch
 import neuprim
 from neuprim.core.cameras import look_at
 from neuprim.core.model.densities.cosine import OMEGA0, cosine_density
+from neuprim.core.model.edge import EDGES, NORMS, fade, profile
 from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry
 
@@ -36,7 +38,28 @@ def primitive() -> tuple[Geometry, Cosine]:
     return geometry, Cosine(W1, b1, w2, torch.tensor([0.75], dtype=torch.float64))
 
 
-def main(target: Path) -> None:
+def edges(target: Path) -> None:
+    """Weights along a chord, and what multiplies a neuron there; both from :mod:`neuprim.core.model.edge`."""
+    plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.1), layout="constrained")
+    u, z = torch.linspace(-1.25, 1.25, 1001, dtype=torch.float64), torch.linspace(0, 14, 1001, dtype=torch.float64)
+    for edge in EDGES:
+        weight = torch.where(u.abs() < 1, fade(u.square(), edge), torch.zeros_like(u))
+        summed = float(weight.sum() * (u[1] - u[0]))
+        if abs(summed - NORMS[edge]) > 3e-3:
+            sys.exit(f"N_{edge} is {NORMS[edge]}, the sum {summed}")
+        left.plot(u, weight, lw=1.8, label=f"p = {edge}")
+        right.plot(z, profile(z, edge), lw=1.8, label=f"B$_{edge}$")
+    left.plot(u, (-4.5 * u.square()).exp(), color="0.6", lw=1.2, ls="--", label="Gaussian")
+    left.set(xlabel="u", title="weight along a chord, (1 − u²)$^p$", xticks=[-1, -0.5, 0, 0.5, 1])
+    right.axhline(0, color="0.6", lw=0.8)
+    right.set(xlabel="z, the phase's change over half a chord (rad)", title="what multiplies a neuron")
+    for axes in (left, right):
+        axes.legend(frameon=False, loc="lower center" if axes is left else "upper right", fontsize=8)
+    figure.savefig(target, dpi=130)
+
+
+def chord(target: Path) -> None:
     geometry, form = primitive()
     origin, aim = np.array([-2.1, -0.55, 0.0]), np.array([0.1, 0.12, 0.0])
     d = (aim - origin) / np.linalg.norm(aim - origin)
@@ -88,11 +111,14 @@ def main(target: Path) -> None:
     right.set_ylim(min(along.min(), 0) - 1.0, along.max() + 0.2)
     if abs(closed - summed) > 1e-5:
         sys.exit(f"the closed form says {closed}, the sum {summed}")
-    target.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(target, dpi=130)
 
 
+FIGURES = {"chord.png": chord, "edges.png": edges}
+
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
+    if len(sys.argv) != 2 or Path(sys.argv[1]).name not in FIGURES:
         sys.exit(__doc__)
-    main(Path(sys.argv[1]))
+    place = Path(sys.argv[1])
+    place.parent.mkdir(parents=True, exist_ok=True)
+    FIGURES[place.name](place)

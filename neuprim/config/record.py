@@ -12,8 +12,9 @@ import yaml
 
 from neuprim.config.schema import build
 from neuprim.core.errors import CheckpointError, ConfigError, nearest
-from neuprim.core.render.backends import check_name
+from neuprim.core.render import backends
 from neuprim.core.settings import RenderSettings
+from neuprim.core.train import population
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.uses import OPTIONAL
 from neuprim.plugins.names import split
@@ -40,7 +41,8 @@ class RunSettings:
         """Raises ConfigError for a value out of range."""
         if not 0 <= self.seed < 2**63:
             raise ConfigError(f"seed={self.seed}: expected a whole number from 0 to 2^63 - 1")
-        check_name(self.renderer.backend)
+        backends.check_name(self.renderer.backend)
+        population.check_name(self.train.population.strategy)
 
 
 @dataclass

@@ -120,7 +120,6 @@ class TrainSettings:
                 raise ConfigError(f"train.{name}={getattr(self, name)!r}: expected {expected}")
         p = self.population
         for name, ok, expected in (
-            ("strategy", p.strategy in ("fixed", "relocate", "gradient"), "fixed, relocate or gradient"),
             ("every", p.every >= 1, "at least 1"),
             ("fraction", 0 <= p.fraction <= 1, "a number in [0, 1]"),
             ("start", 0 <= p.start <= 1, "a fraction of the budget"),

@@ -135,7 +135,7 @@ def make_loss(config: RunConfig, task: TaskSpec) -> Loss:
     with blamed(party.origin, party.what, config.output_dir / LOGS) as guard:
         made = (task.loss if chosen is None else chosen.make)(loss_settings(chosen or task, config.train, config.options))
     if not callable(made):
-        raise PluginError(f"{party.what} of {party.origin.origin}: made a {type(made).__name__}; expected a function")
+        raise PluginError(f"{party.who}: made a {type(made).__name__}; expected a function")
     return checked_loss(made, guard)
 
 

@@ -19,7 +19,7 @@ from neuprim.core.io.film import write_film
 from neuprim.core.model.fields import Conditions
 from neuprim.core.volumes.grid import POINTS_LIMIT, agreement, density_grid, lattice
 from neuprim.core.volumes.truth import DensityTruth
-from neuprim.plugins.crashes import is_ours, reported
+from neuprim.plugins.blame import reported
 from neuprim.plugins.inspect.against import open_truth, pair, write_volume
 from neuprim.plugins.inspect.field import FieldFrame, ViewOptions
 from neuprim.plugins.inspect.frames import box_of, condition_frames, in_words, round_up
@@ -112,12 +112,13 @@ def inspect_run(request: Request) -> list[Path]:
 def _watched(inspector: Inspector, name: str, request: Request) -> Inspector:
     """The inspector, whose crashes are reported."""
     folders = [request.run_dir / "logs", *([] if request.out is None else [request.out.absolute().parent])]
+    guard = reported(INSPECTORS, name, folders)
 
     def add(plotter: Any, frame: FieldFrame) -> None:
-        with reported(INSPECTORS, name, folders):
+        with guard:
             inspector.add(plotter, frame)
 
-    return inspector if is_ours(INSPECTORS, name) else replace(inspector, add=add)
+    return inspector if guard.party.origin.built_in else replace(inspector, add=add)
 
 
 def _paths(out: Path, count: int) -> list[Path]:

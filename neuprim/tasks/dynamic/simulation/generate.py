@@ -14,8 +14,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -25,8 +23,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neuprim.core.errors import ConfigError, DataError, nearest
+from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.scenes.cached import cached_folder
 from neuprim.tasks.dynamic.simulation.projection import Box
 from neuprim.tasks.dynamic.simulation.scenes import SCENES, Scene, Stage
 from neuprim.tasks.dynamic.simulation.solver import State, advance
@@ -76,20 +75,12 @@ def simulate(
     _whole("scene.resolution", resolution, *RESOLUTIONS)
     _whole("seed", seed, 0, 2**63 - 1)
     final = Path(cache_dir) / f"sim-{name}-{cache_key(scene, count, resolution, seed)}"
-    if _complete(final, name, count):
-        return final
-    try:
-        final.parent.mkdir(parents=True, exist_ok=True)
-        draft = Path(tempfile.mkdtemp(prefix=f".{final.name}-", dir=final.parent))
-        try:
-            draft.chmod(0o755)  # mkdtemp's 0700 would hide a shared cache from its other users
-            _write(scene, count, resolution, seed, draft, progress)
-            _publish(draft, final, name, count)
-        finally:
-            shutil.rmtree(draft, ignore_errors=True)
-    except OSError as error:
-        raise DataError(f"scene {name}: cannot write the simulated frames to {final}: {error}") from error
-    return final
+    files = [f"{name}_{i}.vdb" for i in range(count)]
+
+    def write(folder: Path) -> None:
+        _write(scene, count, resolution, seed, folder, progress)
+
+    return cached_folder(final, files, write, f"scene {name}: cannot write the simulated frames")
 
 
 def cache_key(scene: Scene, frames: int, resolution: int, seed: int) -> str:
@@ -173,21 +164,6 @@ def _one_torch_thread() -> Iterator[None]:
 def _finish(writing: Future[None] | None) -> None:
     if writing is not None:
         writing.result()  # raises what the writer raised
-
-
-def _complete(folder: Path, name: str, count: int) -> bool:
-    return all((folder / f"{name}_{i}.vdb").is_file() for i in range(count))
-
-
-def _publish(draft: Path, final: Path, name: str, count: int) -> None:
-    """Give the draft its name. Another process may have been faster: its files are the same ones."""
-    if final.exists() and not _complete(final, name, count):
-        shutil.rmtree(final)  # somebody deleted part of it
-    try:
-        draft.rename(final)
-    except OSError:
-        if not _complete(final, name, count):
-            raise
 
 
 def _scene(name: str) -> Scene:

@@ -16,7 +16,7 @@ from neuprim.core.volumes.grid import density_grid
 from neuprim.plugins.export import vdb as exporter
 from neuprim.runs.export import export_run
 from neuprim.runs.open import open_run
-from tests.core.openvdb_oracle import compare, environment, other_python
+from tests.core.io.vdb.openvdb_oracle import compare, environment, other_python
 from tests.plugins import marked
 
 

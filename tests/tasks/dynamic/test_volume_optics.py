@@ -17,7 +17,7 @@ from neuprim.core.io.vdb import scale_transform, sequence, write_vdb
 from neuprim.tasks.dynamic.volume import EMBERGEN_FIRE, LOOKS, Light, Look, Medium, Normalisation, integrate, medium_of, named_look, rig
 from neuprim.tasks.dynamic.volume.blackbody import black_body_rgb, black_body_xyz
 from neuprim.tasks.dynamic.volume.transmittance import transmittance
-from tests.core.vdb_bytes import real_folder
+from tests.core.io.vdb.vdb_bytes import real_folder
 from tests.tasks.dynamic.volumes import box, grey, grid_of, march_slowly, ragged, rotation
 
 SAME = Normalisation((0.0, 0.0, 0.0), 1.0)

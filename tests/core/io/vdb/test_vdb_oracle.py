@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from neuprim.core.io.vdb import Grid, Tiles, read_grids, scale_transform, write_vdb
-from tests.core.openvdb_oracle import VARIABLE, ask, chosen, compare, other_python, reason
-from tests.core.vdb_bytes import random_grid
+from tests.core.io.vdb.openvdb_oracle import VARIABLE, ask, chosen, compare, other_python, reason
+from tests.core.io.vdb.vdb_bytes import random_grid
 from tests.systems import posix
 
 # ---------------------------------------------------------------- without OpenVDB

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from neuprim.core.io.vdb import read_grid, read_header
-from tests.core.vdb_bytes import (
+from tests.core.io.vdb.vdb_bytes import (
     bits,
     file_head,
     grid_bytes,
@@ -179,7 +179,7 @@ def test_spoiled_files(tmp_path: Path) -> None:
 def test_many_spoiled_files(tmp_path: Path) -> None:
     """2,000 spoiled copies: of the smaller real files where the developer has them, of written ones elsewhere."""
     sources = [path.read_bytes() for path in small_files(tmp_path)]
-    if os.environ.get("NEUPRIM_TEST_DATA") or (Path(__file__).parents[3] / "shared" / "data").is_dir():
+    if os.environ.get("NEUPRIM_TEST_DATA") or (Path(__file__).parents[5] / "shared" / "data").is_dir():
         fire = real_folder("embergen_fire_a")
         sources += [(fire / f"embergen_fire_a_{i}.vdb").read_bytes() for i in (0, 1, 5)]
         sources.append((real_folder("vdb_samples") / "dragon.vdb").read_bytes())

@@ -9,7 +9,7 @@ import pytest
 
 from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import Grid, Tiles, read_grid, read_header, scale_transform, write_vdb
-from tests.core.vdb_bytes import random_grid, refused, same
+from tests.core.io.vdb.vdb_bytes import random_grid, refused, same
 
 
 @pytest.mark.parametrize("compression", ["none", "zip", "blosc"])

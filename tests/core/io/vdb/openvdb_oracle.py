@@ -1,7 +1,7 @@
 """OpenVDB itself, in another Python of this machine that has its module.
 
 Looked for in ``$NEUPRIM_OPENVDB_PYTHON``, else in ``/usr/bin/python3`` (Debian's package is python3-openvdb). The other Python
-runs :mod:`tests.core.openvdb_side`; numbers travel in .npz files.
+runs :mod:`tests.core.io.vdb.openvdb_side`; numbers travel in .npz files.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from neuprim.core.io.vdb import read_grid, read_grids, read_header
-from tests.core.vdb_bytes import LEAF_CORNER, bits, file_head, grid_bytes, one_grid, one_leaf, refused, text
+from tests.core.io.vdb.vdb_bytes import LEAF_CORNER, bits, file_head, grid_bytes, one_grid, one_leaf, refused, text
 
 RNG = np.random.default_rng(11)
 MASK = RNG.random(512) < 0.3

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from neuprim.core.io.vdb import Grid, read_grid, read_header, sequence, write_vdb
-from tests.core.vdb_bytes import real_folder, refused, same
+from tests.core.io.vdb.vdb_bytes import real_folder, refused, same
 
 FOLDERS = {"embergen_fire_a": 2, "mantaflow_smoke": 21, "vdb_samples": 1}
 """Folder -> how many grids of its first file are decodable."""

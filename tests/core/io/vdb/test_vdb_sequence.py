@@ -10,7 +10,7 @@ import pytest
 
 from neuprim.cli import main
 from neuprim.core.io.vdb import Grid, scale_transform, sequence, write_vdb
-from tests.core.vdb_bytes import one_grid, one_leaf, refused
+from tests.core.io.vdb.vdb_bytes import one_grid, one_leaf, refused
 
 
 def frame(path: Path, size: int, voxel: float = 1.0, name: str = "density", value: float = 1.0) -> Path:

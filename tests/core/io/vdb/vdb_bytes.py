@@ -175,7 +175,7 @@ def survives(path: Path, sources: list[bytes], count: int, seed: int) -> int:
 
 def real_folder(name: str) -> Path:
     """A folder of real files, where the developer has it."""
-    root = Path(os.environ.get("NEUPRIM_TEST_DATA") or Path(__file__).parents[3] / "shared" / "data")
+    root = Path(os.environ.get("NEUPRIM_TEST_DATA") or Path(__file__).parents[5] / "shared" / "data")
     path = root / name
     if not path.is_dir():
         pytest.skip(f"needs real data: no {path} (set NEUPRIM_TEST_DATA to a folder with {name})")

@@ -214,7 +214,7 @@ def test_run_directories_from_before_still_load(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("task", ["static", "dynamic", "relight"])
 def test_names_of_initial_values_and_rates_are_checked_before_data(task: str) -> None:
-    with pytest.raises(ConfigError, match=r"model.init.alhpa: no such setting; did you mean 'alpha'"):
+    with pytest.raises(ConfigError, match=r"model.init.alhpa: no such setting; did you mean 'model.init.alpha'"):
         compose([f"task={task}", "model.init.alhpa=0.3"], False)
     with pytest.raises(ConfigError, match=r"train.rates.mean: no such parameter; did you mean 'means'"):
         compose([f"task={task}", "train.rates.mean=0.3"], False)

@@ -13,9 +13,9 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -23,13 +23,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from neuprim.core.cameras import look_at
+from neuprim.core.checked import Range, checked, verify
 from neuprim.core.data import Dataset
 from neuprim.core.errors import DataError
 from neuprim.core.io.files import publish_folder
 from neuprim.core.task import SceneContext
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.rays import bands, pixel_means
-from neuprim.scenes.settings import check_names, check_whole, settings_key
+from neuprim.scenes.settings import ImageSize, Supersampling, settings_key
 from neuprim.scenes.shapes import build
 from neuprim.tasks.static.solids.shading import encode_srgb, radiance
 
@@ -55,19 +56,13 @@ class SolidsSettings:
         supersampling: rays per pixel along each axis.
     """
 
-    size: int = 200
-    train_views: int = 80
-    test_views: int = 20
-    supersampling: int = 3
+    size: ImageSize = 200
+    train_views: Annotated[int, Range(1, 10000)] = 80
+    test_views: Annotated[int, Range(1, 10000)] = 20
+    supersampling: Supersampling = 3
 
     def __post_init__(self) -> None:
-        check_whole(self, {"size": (8, 4096), "train_views": (1, 10000), "test_views": (1, 10000), "supersampling": (1, 16)})
-
-    @staticmethod
-    def parse(settings: Mapping[str, Any]) -> SolidsSettings:
-        """Settings from a mapping; :class:`ConfigError` for an unknown name or impossible value."""
-        check_names(settings, [f.name for f in fields(SolidsSettings)])
-        return SolidsSettings(**settings)
+        verify(self, "scene")
 
     def key(self) -> str:
         """A short hash of every setting and the generator's version."""
@@ -81,7 +76,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         ConfigError: unknown setting or impossible value.
         DataError: the cache directory cannot be written.
     """
-    folder = generate(SolidsSettings.parse(settings), context.cache_dir, context.progress)
+    folder = generate(checked(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
     from neuprim.tasks.static.datasets import blender
 
     dataset = blender.load({"path": str(folder)}, context)

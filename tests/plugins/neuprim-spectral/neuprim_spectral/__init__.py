@@ -1,6 +1,6 @@
 """Multispectral scenes: five bands of light, whose wavelengths shift from view to view."""
 
-from neuprim.core.choices import choose
+from neuprim.core.checked import choose
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import LossExtension
 from neuprim.core.task import SceneSpec, TaskSpec

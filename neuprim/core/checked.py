@@ -280,7 +280,7 @@ def _words(hint: Any, where: str) -> str:
     if origin is Literal:
         return _either(args)
     if origin is tuple:
-        return "a list" if args[-1] is ... else f"{len(args)} values, as [{', '.join('0' * len(args))}]"
+        return f"a list, each {_words(args[0], where)}" if args[-1] is ... else f"a list of {', '.join(_words(a, where) for a in args)}"
     if plain is str:
         return f"text (quote it: {where}='...')"
     kind = _KINDS.get(plain, getattr(plain, "__name__", str(plain)))
@@ -314,10 +314,10 @@ def _unwrapped(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 def _one_of(value: Any, options: tuple[Any, ...], where: str) -> Any:
     """The value as the first of the types that it is one of."""
+    if value is None and type(None) in options:
+        return None
     refused = []
     for option in options:
-        if value is None and option is type(None):
-            return None
         if option is not type(None):
             try:
                 return converted(value, option, where)
@@ -346,7 +346,10 @@ def _plain(value: Any, kind: Any, notes: tuple[Any, ...], where: str) -> Any:
     elif origin is tuple:
         items = args[:1] * len(value) if isinstance(value, list | tuple) and args[-1] is ... else args
         if isinstance(value, list | tuple) and len(items) == len(value):
-            return tuple(converted(v, item, where) for v, item in zip(value, items, strict=True))
+            try:
+                return tuple(converted(v, item, where) for v, item in zip(value, items, strict=True))
+            except _Unfit:  # said of the whole list, below
+                pass
     elif (made := _scalar(value, kind)) is not None:
         return made
     hint = Annotated[kind, *notes] if notes else kind

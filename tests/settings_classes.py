@@ -14,22 +14,24 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 import neuprim
 from neuprim.core.checked import Range, Unbounded, hints_of
 
-REQUIRED: dict[str, Any] = {"path": Path("folder"), "simulation": "smoke_fire"}
+REQUIRED: dict[str, Any] = {"path": Path("folder"), "simulation": "smoke_fire", "direction": (0.0, 0.0, 1.0), "irradiance": (1.0, 1.0, 1.0)}
 """What a dataclass needs beside its defaults."""
-
-TYPES = (True, 1.5, "no number", [1], {"a": 1}, None)
 
 
 def settings_classes() -> list[type]:
-    """All dataclasses of the package whose name ends in Settings; a module that cannot be imported is a failure."""
+    """All classes of the package whose name ends in Settings, and dataclasses that verify themselves."""
     found: dict[str, type] = {}
     for module in pkgutil.walk_packages(neuprim.__path__, "neuprim."):
         if module.name.startswith(("neuprim.plugins.template", "neuprim.cli.__main__")) or module.name.endswith("__main__"):
             continue
         for name, value in vars(importlib.import_module(module.name)).items():
-            if name.endswith("Settings") and isinstance(value, type) and value.__module__ == module.name:
+            if isinstance(value, type) and value.__module__ == module.name and (name.endswith("Settings") or _verifies(value)):
                 found[f"{module.name}.{name}"] = value
     return [found[name] for name in sorted(found)]
+
+
+def _verifies(cls: type) -> bool:
+    return "verify" in getattr(getattr(cls, "__post_init__", None), "__code__", settings_classes.__code__).co_names
 
 
 def required(cls: type) -> dict[str, Any]:

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from neuprim.config import RunSettings
 from neuprim.core.checked import checked, hints_of, joined
 from neuprim.core.errors import ConfigError
 from tests.settings_classes import bad_values, required, settings_classes, unbounded_numbers
@@ -16,17 +15,21 @@ CLASSES = settings_classes()
 FIELDS = [(cls, name) for cls in CLASSES for name in hints_of(cls)]
 
 GROUPS = {
+    "RunSettings": "",
     "RenderSettings": "renderer",
     "ModelSettings": "model",
     "TrainSettings": "train",
     "PopulationSettings": "train.population",
     "SolverSettings": "solver",
+    "Look": "scene.optics",
+    "Light": "scene.optics.light",
 }
+"""The dotted names under which users type them; of all others it is ``scene``."""
 
 
 def group(cls: type) -> str:
     """The dotted name under which users type the settings."""
-    return "" if cls is RunSettings else GROUPS.get(cls.__name__, "scene")
+    return GROUPS.get(cls.__name__, "scene")
 
 
 def named(value: object) -> str:
@@ -41,7 +44,7 @@ def refusal(cls: type, values: dict[str, Any]) -> str:
 
 def test_they_are_found() -> None:
     names = {cls.__name__ for cls in CLASSES}
-    assert names >= {"RenderSettings", "TrainSettings", "VolumeSettings", "OlatSettings", "SolidsSettings", "SolverSettings"}
+    assert names >= {"RenderSettings", "TrainSettings", "VolumeSettings", "OlatSettings", "SolidsSettings", "SolverSettings", "Look"}
     assert all(dataclasses.is_dataclass(cls) for cls in CLASSES) and len(FIELDS) > 100
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 from scipy import ndimage
 
-from neuprim.core.checked import Accepts, Range, verify
+from neuprim.core.checked import Accepts, Range, Unbounded, verify
 from neuprim.core.errors import DataError, nearest
 from neuprim.core.io.vdb import DENSE_LIMIT, Bounds, Grid
 from neuprim.tasks.dynamic.volume.blackbody import black_body_rgb
@@ -24,7 +24,10 @@ __all__ = ["Light", "Look", "medium_of"]
 
 NotNegative = Annotated[float, Range(at_least=0)]
 RGB = Annotated[tuple[NotNegative, NotNegative, NotNegative], Accepts(lambda colour: True, "three numbers of at least 0, as [1, 0.5, 0]")]
-Direction = Annotated[tuple[float, float, float], Accepts(any, "three numbers that are not all 0, as [0, 0, 1]")]
+Coordinate = Annotated[float, Unbounded("any direction, of any length")]
+Level = Annotated[float, Unbounded("values of a grid, in whatever unit its files have")]
+Kelvin = Annotated[float, Range(above=0, at_most=1e5)]
+Direction = Annotated[tuple[Coordinate, Coordinate, Coordinate], Accepts(any, "three numbers that are not all 0, as [0, 0, 1]")]
 
 _STEPS = 1024
 """Entries of the table of black bodies over a look's range of temperatures; linear between them."""
@@ -89,10 +92,11 @@ class Look:
     ambient: RGB = (0.0, 0.0, 0.0)
     light: Light | None = None
     flame_grid: Meaning = "flames"
-    flame_range: Annotated[tuple[float, float], Accepts(lambda ends: ends[0] < ends[1], "two rising numbers, as [0, 1]")] = (0.0, 1.0)
-    kelvin: Annotated[
-        tuple[float, float], Accepts(lambda k: 0 < k[0] <= k[1] <= 1e5, "two rising numbers within 0..1e5, as [1000, 2000]")
-    ] = (1000.0, 2000.0)
+    flame_range: Annotated[tuple[Level, Level], Accepts(lambda ends: ends[0] < ends[1], "two rising numbers, as [0, 1]")] = (0.0, 1.0)
+    kelvin: Annotated[tuple[Kelvin, Kelvin], Accepts(lambda k: k[0] <= k[1], "two rising numbers within 0..1e5, as [1000, 2000]")] = (
+        1000.0,
+        2000.0,
+    )
     emission: NotNegative = 0.0
     flame_extinction: NotNegative = 0.0
     color_grid: Meaning | None = None

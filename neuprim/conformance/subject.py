@@ -23,7 +23,7 @@ from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.backends import ORACLE
 from neuprim.core.task import TaskSpec
-from neuprim.core.train.settings import PopulationSettings, TrainSettings
+from neuprim.core.train.settings import PopulationSettings, Strategy, TrainSettings
 from neuprim.core.train.trainer import Trainer, initial_model
 from neuprim.core.uses import build_settings, loss_settings
 
@@ -129,7 +129,7 @@ class Subject:
             field.set_progress(1.0)
         return model
 
-    def trainer(self, iterations: int, strategy: str = "relocate", seed: int = 0) -> Trainer:
+    def trainer(self, iterations: int, strategy: Strategy = "relocate", seed: int = 0) -> Trainer:
         """What fits a fresh model, for a few steps, with interventions in the population every second step."""
         model, train = self.fresh(seed), self.settings.train
         population = PopulationSettings(strategy=strategy, every=2, start=0.0, stop=1.0, fraction=0.2)

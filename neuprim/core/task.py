@@ -8,6 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
+from neuprim.core.checked import Option
 from neuprim.core.data import Dataset, View
 from neuprim.core.data.context import SceneContext
 from neuprim.core.environment import Environment, Illumination
@@ -79,7 +80,8 @@ class TaskSpec:
         check: (what ``build`` gets) raises :class:`~neuprim.core.errors.ConfigError` for choices the task does not have, before
             any data is loaded.
         options: name -> (default, one line of help) of the task's own settings, the only ones under ``task.options``; values are
-            converted to the default's type. ``task/NAME.yaml`` may say other defaults.
+            converted to the default's type, or to what stands third: ``Annotated[float, Range(0, 1)]``, ``("soft", "hard")``
+            (:mod:`neuprim.core.checked`). ``task/NAME.yaml`` may say other defaults.
         uses: the shared settings of :data:`neuprim.core.uses.OPTIONAL` that ``build`` (``model.…``) and ``loss`` (``train.…``) read.
             Others are refused when somebody sets them.
         environment: what an image of the light all around means to the task (``neuprim render --environment``); None for tasks that
@@ -108,7 +110,7 @@ class TaskSpec:
     """What pictures show: (H, W, C) colours in the data set's colour space -> (H, W, 3) sRGB values 0..1. It must take each pixel by
     itself, as it also gets the colours of primitives, as an image one pixel high. None: three channels are red, green and blue, one is
     grey, and of others the first three are shown."""
-    options: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
+    options: Mapping[str, Option] = field(default_factory=dict)
     uses: tuple[str, ...] = ()
 
     def parameter_names(self) -> set[str]:

@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 
 from neuprim.config import RunConfig, compose, compose_all, expand_sweep
+from neuprim.core.checked import checked
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.task import SceneContext
 from neuprim.plugins.registry import load_task
@@ -81,18 +82,18 @@ def test_interpolation_follows_the_override(toy: Path) -> None:
         (["train.iterations=abc"], "train.iterations=abc: expected a whole number"),
         (["train.iterations=1.5"], "train.iterations=1.5: expected a whole number"),
         (["train.iterations=true"], "train.iterations=true: expected a whole number"),
-        (["train.iterations=-1"], "train.iterations=-1: expected 0 or more"),
+        (["train.iterations=-1"], "train.iterations=-1: expected a whole number of at least 0"),
         (["train.final_rate=nan"], "expected a finite number"),
         (["train.rates.w2=fast"], "train.rates.w2=fast: expected a finite number"),
         (["train.rates=3"], "train.rates=3: expected entries"),
         (["train.population=3"], "train.population=3: expected settings"),
         (["model=3"], "model is a group of settings"),
-        (["model.neurons=17"], "model.neurons=17: expected 0 to 16"),
+        (["model.neurons=17"], "model.neurons=17: expected a whole number from 0 to 16"),
         (["renderer.backend=cpuu"], "renderer.backend=cpuu: expected auto, cpu or reference"),
         (["renderer.backend=gpu"], "renderer.backend=gpu: expected auto, cpu or reference"),
         (["renderer.backend=3"], "renderer.backend=3: expected"),
         (["renderer.depth=1"], "renderer.depth=1: expected true or false"),
-        (["renderer.alpha_max=2"], "renderer.alpha_max=2.0: expected"),
+        (["renderer.alpha_max=2"], "renderer.alpha_max=2: expected a number above 0 and at most 0.9999"),
         (["renderer.sort=depth"], "renderer.sort=depth: expected center or entry"),
         (["renderer.samples=0"], "renderer.samples=0: expected a whole number of rays per pixel side, 1 to 16"),
         (["scene.size=big"], "scene.size=big: expected a whole number"),
@@ -375,4 +376,4 @@ def test_static_loaders_know_every_key_of_their_yaml(tmp_path: Path, scene: str)
 def test_solids_knows_every_key_of_its_yaml(tmp_path: Path) -> None:
     from neuprim.tasks.static.solids.generate import SolidsSettings
 
-    assert SolidsSettings.parse(compose([f"output_dir='{tmp_path}/out'"]).scene) == SolidsSettings()
+    assert checked(SolidsSettings, compose([f"output_dir='{tmp_path}/out'"]).scene) == SolidsSettings()

@@ -80,7 +80,6 @@ def trainer(dataset: Dataset, iterations: int = 40, seed: int = 0, **changes: An
     """A fresh trainer of 12 primitives; ``changes`` go to the train settings, ``population`` as a dictionary."""
     population = PopulationSettings(**{"strategy": "fixed", "every": 7, "start": 0.0, "stop": 1.0, **changes.pop("population", {})})
     settings = TrainSettings(iterations=iterations, **changes, population=population)
-    settings.check()
     model = initial_model(CosineDensity(4), SphericalHarmonics(1, 3, 0.25), dataset, ModelSettings(primitives=12), seed)
     return Trainer(model, dataset, photometric({"ssim_weight": settings.ssim_weight}), settings, RenderSettings(), seed)
 

@@ -108,7 +108,7 @@ def test_python_blocks(page: Path, static_run: Path, tmp_path: Path, monkeypatch
     names: dict[str, Any] = {"__name__": "documentation"}
     for block in blocks(page):
         if block.language == "python" and block.skipped is None:
-            exec(compile("\n" * (block.line - 1) + block.text, str(page), "exec"), names)
+            exec(compile("\n" * (block.line - 1) + block.text, str(page), "exec", dont_inherit=True), names)
     AFTER.get(name_of(page), lambda names: None)(names)
 
 

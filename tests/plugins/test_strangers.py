@@ -266,7 +266,7 @@ def test_options_have_their_defaults_and_limits(site: Path, run_dir: Path, tmp_p
     for word, text in (
         ("digits=10", "digits=10: expected a whole number from 0 to 9"),
         ("digits=1.5", "digits=1.5: expected a whole number from 0 to 9"),
-        ("scale=nan", "scale=nan: expected a number"),
+        ("scale=nan", "scale=nan: expected a finite number"),
         ("pretty=1", "pretty=1: expected true or false"),
         ("up=x", "up=x: expected y or z"),
         ("wavelength_shift=0,1", "given twice"),

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from neuprim.core.data import Dataset, PointCloud, ViewSet, camera_extent
 from neuprim.core.data.context import SceneContext
 from neuprim.core.data.focus import focus_point
 from neuprim.core.data.initial import initial_points
+from neuprim.core.data.settings import FolderSettings
 from neuprim.core.data.views import ImageFrame, ImageViews
 from neuprim.core.errors import ConfigError, DataError
 
@@ -115,7 +116,7 @@ def posed_images(
     name: str,
     train: Sequence[ImageFrame],
     test: Sequence[ImageFrame],
-    settings: Mapping[str, Any],
+    settings: FolderSettings,
     context: SceneContext,
     up: Tensor | None = None,
     points: PointCloud | None = None,
@@ -128,7 +129,7 @@ def posed_images(
 
     Args:
         where: file or folder that errors name.
-        settings: the common settings, already checked.
+        settings: the common settings.
         up: (3,) upward direction; None takes the mean of the cameras' own.
         points: starting points that the format brings, if any.
         prefix: reduction already in the files, e.g. "images_4".
@@ -153,14 +154,14 @@ def posed_images(
                 f"{frame.path}: image has {frame.info.channels} channels, {both[0].path} has {both[0].info.channels}; expected all RGB or all RGBA"
             )
     alpha = both[0].info.channels == 4
-    background = settings["background"]
+    background: str = settings.background
     if background == "auto":
         background = "white" if alpha else "black"
     if background == "random" and not alpha:
         raise ConfigError(f"scene.background is 'random', but the images in {where} have no alpha; expected auto, white or black")
-    factor = settings["downsample"]
+    factor = settings.downsample
     views = [ImageViews(frames, factor, to_linear=to_linear) for frames in (train, test)]
-    if settings["preload"]:
+    if settings.preload:
         for split, images in zip(("training", "test"), views, strict=True):
             images.preload(lambda fraction, split=split: context.progress(f"reading {split} images", fraction))  # type: ignore[misc]
     return kind(

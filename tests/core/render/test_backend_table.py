@@ -101,7 +101,7 @@ def test_a_wrong_name_is_told_the_table(fake: Fake, scene: Path, tmp_path: Path)
     low, camera = scenes.lowered(scenes.tensors(3)), scenes.camera(8, 8)
     with pytest.raises(ConfigError, match=r"^renderer\.backend=gpu: expected auto, fake, cpu or reference$"):
         render_lowered(low, camera, RenderSettings(backend="gpu"))
-    with pytest.raises(ConfigError, match=r"^renderer\.backend=None: expected auto or the name of a backend$"):
+    with pytest.raises(ConfigError, match=r"^renderer\.backend=null: expected auto or the name of a backend$"):
         RenderSettings(backend=None)  # type: ignore[arg-type]
 
 

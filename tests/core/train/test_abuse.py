@@ -72,7 +72,6 @@ def abused(abuse: str, steps: int, primitives: int = 500) -> Trainer:
     if abuse == "rates times ten":
         rates = {s.name: 10 * s.lr for s in model.specs}
     settings = TrainSettings(iterations=steps, rates=rates, population=population)
-    settings.check()
     return Trainer(model, dataset, photometric({"ssim_weight": settings.ssim_weight}), settings, RenderSettings(), 0)
 
 

@@ -237,7 +237,12 @@ def test_few_points_still_make_a_model(plain: Dataset, count: int) -> None:
 
 @pytest.mark.parametrize(
     ("key", "value", "expected"),
-    [("alpha", 1.0, "above 0 and below 1"), ("alpha", "much", "a number"), ("scale", 0, "above 0"), ("mode", "papr", "opaque or paper")],
+    [
+        ("alpha", 1.0, "above 0 and below 1"),
+        ("alpha", "much", "a finite number above 0 and below 1"),
+        ("scale", 0, "above 0"),
+        ("mode", "papr", "opaque or paper"),
+    ],
 )
 def test_impossible_starting_values_name_their_key(plain: Dataset, key: str, value: object, expected: str) -> None:
     with pytest.raises(ConfigError, match=rf"model\.init\.{key}={value}: expected .*{expected}"):

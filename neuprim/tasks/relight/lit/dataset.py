@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
 
+from neuprim.core.checked import Accepts, checked
 from neuprim.core.data import Clip
+from neuprim.core.data.settings import HoldOut
 from neuprim.core.data.views import ImageViews
-from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.errors import DataError
 from neuprim.core.io.images import read_image
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import SceneContext
@@ -23,9 +26,22 @@ from neuprim.tasks.relight.lit.generate import LitSettings, generate
 from neuprim.tasks.relight.lit.rig import NEAR_LIGHTS, PARTS
 from neuprim.tasks.relight.measure import class_errors, class_shares, scores
 
-__all__ = ["LitSolids", "load"]
+__all__ = ["LitSolids", "LitSolidsSettings", "load"]
 
-_READING = ("background", "hold_out")
+_BLACK_OR_RANDOM = ("black", "random")
+
+
+@dataclass(frozen=True)
+class LitSolidsSettings(LitSettings):
+    """What the user may set for ``scene=lit_solids``: what changes the images, and how they are read.
+
+    Attributes:
+        background: "black", or "random": training composites random colours.
+        hold_out: n: every n-th training view is the test split, for tuning; 0 for the split that is drawn.
+    """
+
+    background: Annotated[str, Accepts(_BLACK_OR_RANDOM.__contains__, "black or random: nothing but the light shines here")] = "black"
+    hold_out: HoldOut = 0
 
 
 def load(settings: Mapping[str, Any], context: SceneContext) -> LitSolids:
@@ -35,11 +51,9 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> LitSolids:
         ConfigError: unknown setting or impossible value.
         DataError: the cache directory cannot be written.
     """
-    drawn = LitSettings.parse(settings, _READING)
-    reading = {name: settings[name] for name in _READING if name in settings}
-    olat.check({"path": "lit_solids", **reading})  # before a minute of drawing
-    if reading.get("background", "black") not in ("black", "random"):
-        raise ConfigError(f"scene.background is {reading['background']!r}; expected black or random: nothing but the light shines here")
+    asked = checked(LitSolidsSettings, settings, "scene")  # before a minute of drawing
+    drawn = LitSettings(**{f.name: getattr(asked, f.name) for f in fields(LitSettings)})
+    reading = {"background": asked.background, "hold_out": asked.hold_out}
     folder = generate(drawn, context.cache_dir, context.progress)
     dataset = olat.read({"path": str(folder), "falloff": "inverse_square", **reading}, context, LitSolids)
     dataset.name, dataset.data_source, dataset.background = "lit_solids", "generated", torch.zeros(3)

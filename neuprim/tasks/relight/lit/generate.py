@@ -14,22 +14,23 @@ Scene, cameras and lights are fixed: equal settings give equal files whatever th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from neuprim.core.checked import Range, verify
 from neuprim.core.io.images import write_exr
 from neuprim.scenes.image_set import ImageSet, Progress
 from neuprim.scenes.poses import camera_to_world
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.rays import bands, pixel_means
-from neuprim.scenes.settings import check_names, check_whole, settings_key
+from neuprim.scenes.settings import ImageSize, Supersampling, settings_key
 from neuprim.tasks.relight.lit.rig import DISTANCE, LitView, splits
 from neuprim.tasks.relight.lit.scene import RADIUS, solids
 from neuprim.tasks.relight.lit.shading import shade
@@ -57,20 +58,13 @@ class LitSettings:
         supersampling: rays per pixel along each axis.
     """
 
-    size: int = 128
-    train_views: int = 500
-    test_views: int = 100
-    supersampling: int = 2
+    size: ImageSize = 128
+    train_views: Annotated[int, Range(1, 100000)] = 500
+    test_views: Annotated[int, Range(1, 10000)] = 100
+    supersampling: Supersampling = 2
 
     def __post_init__(self) -> None:
-        check_whole(self, {"size": (8, 4096), "train_views": (1, 100000), "test_views": (1, 10000), "supersampling": (1, 16)})
-
-    @staticmethod
-    def parse(settings: Mapping[str, Any], others: Sequence[str] = ()) -> LitSettings:
-        """Settings from a mapping, of which ``others`` are not read here; :class:`ConfigError` for an unknown name or impossible value."""
-        known = [f.name for f in fields(LitSettings)]
-        check_names(settings, [*known, *others])
-        return LitSettings(**{name: value for name, value in settings.items() if name in known})
+        verify(self, "scene")
 
     def key(self) -> str:
         """A short hash of every setting and the generator's version."""

@@ -10,21 +10,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from neuprim.core.checked import Range, checked, verify
 from neuprim.core.data import Dataset
 from neuprim.core.task import SceneContext
 from neuprim.scenes.image_set import ImageSet, Progress
 from neuprim.scenes.poses import camera_to_world, direction
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.rays import bands, pixel_means
-from neuprim.scenes.settings import check_names, check_whole, settings_key
+from neuprim.scenes.settings import ImageSize, Supersampling, settings_key
 from neuprim.scenes.shapes import build
 from neuprim.tasks.static.solids.shading import encode_srgb, radiance
 
@@ -48,19 +49,13 @@ class SolidsSettings:
         supersampling: rays per pixel along each axis.
     """
 
-    size: int = 200
-    train_views: int = 80
-    test_views: int = 20
-    supersampling: int = 3
+    size: ImageSize = 200
+    train_views: Annotated[int, Range(1, 10000)] = 80
+    test_views: Annotated[int, Range(1, 10000)] = 20
+    supersampling: Supersampling = 3
 
     def __post_init__(self) -> None:
-        check_whole(self, {"size": (8, 4096), "train_views": (1, 10000), "test_views": (1, 10000), "supersampling": (1, 16)})
-
-    @staticmethod
-    def parse(settings: Mapping[str, Any]) -> SolidsSettings:
-        """Settings from a mapping; :class:`ConfigError` for an unknown name or impossible value."""
-        check_names(settings, [f.name for f in fields(SolidsSettings)])
-        return SolidsSettings(**settings)
+        verify(self, "scene")
 
     def key(self) -> str:
         """A short hash of every setting and the generator's version."""
@@ -79,7 +74,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         ConfigError: unknown setting or impossible value.
         DataError: the cache directory cannot be written.
     """
-    folder = generate(SolidsSettings.parse(settings), context.cache_dir, context.progress)
+    folder = generate(checked(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
     from neuprim.tasks.static.datasets import blender
 
     dataset = blender.load({"path": str(folder)}, context)

@@ -1,6 +1,8 @@
 """Multispectral scenes: five bands of light, whose wavelengths shift from view to view."""
 
-from neuprim.core.choices import choose
+from typing import Annotated
+
+from neuprim.core.checked import Range, choose
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import LossExtension
 from neuprim.core.task import SceneSpec, TaskSpec
@@ -11,6 +13,7 @@ from neuprim_spectral.loss import spectral_loss
 from neuprim_spectral.scene import Ball
 
 _HELP = "weight of the angle between spectra in the loss, 0 to 1"
+_SHARE = Annotated[float, Range(0, 1)]
 
 
 def _build(model, dataset):
@@ -24,9 +27,6 @@ def _check(model):
         TwoScales(**model["density"])
     except ValueError as error:
         raise ConfigError(f"model.density: {error}") from error
-    angle = model["options"]["angle"]
-    if not 0 <= angle <= 1:
-        raise ConfigError(f"task.options.angle={angle}: expected a number from 0 to 1")
 
 
 TASK = TaskSpec(
@@ -42,7 +42,7 @@ TASK = TaskSpec(
     loss=lambda settings: spectral_loss(settings["options"]["angle"]),
     check=_check,
     conditions=(SHIFT,),
-    options={"angle": (0.2, _HELP)},
+    options={"angle": (0.2, _HELP, _SHARE)},
     uses=(),
     fields={"TwoScales": TwoScales, "ShiftedSpectrum": ShiftedSpectrum},
     example=lambda: Ball(size=12, train_views=5, test_views=2),
@@ -55,5 +55,5 @@ SPECTRAL_LOSS = LossExtension(
     name="spectral-angle",
     summary="absolute differences and the angle between spectra",
     make=lambda settings: spectral_loss(settings["options"]["angle_weight"]),
-    options={"angle_weight": (0.2, _HELP)},
+    options={"angle_weight": (0.2, _HELP, _SHARE)},
 )

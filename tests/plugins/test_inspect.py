@@ -26,6 +26,7 @@ from neuprim.plugins.inspect.page import encoded
 from neuprim.plugins.inspect.shapes import ellipsoids
 from neuprim.plugins.registry import load_task
 from neuprim.runs import inspect as inspecting
+from neuprim.runs.events import Event, Note
 from neuprim.runs.inspect import Request, inspect_run
 from neuprim.runs.open import load_dataset, load_run
 from tests.plugins import runs
@@ -47,8 +48,9 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def look(run_dir: Path, **words: Any) -> tuple[list[Path], list[str]]:
-    said: list[str] = []
-    return inspect_run(Request(run_dir, say=said.append, **words)), said
+    heard: list[Event] = []
+    paths = inspect_run(Request(run_dir, **words), heard.append)
+    return paths, [event.text for event in heard if isinstance(event, Note)]
 
 
 # ---------------------------------------------------------------- frames and boxes
@@ -203,6 +205,13 @@ def test_a_page_holds_the_grids(run_dir: Path, tmp_path: Path) -> None:
 def test_eight_bits_keep_thin_matter() -> None:
     sigma = np.array([0.0, 0.001, 0.5, 1.0, 7.0], np.float32)
     assert encoded(sigma, 1.0).tolist() == [0, 8, 180, 255, 255]
+
+
+def test_what_is_said_is_an_event_that_the_command_prints(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (path,), said = look(run_dir, grid=8, out=tmp_path / "a.vdb")
+    assert capsys.readouterr() == ("", "") and len(said) == 1
+    assert main(["inspect", str(run_dir), "--grid", "8", "--out", str(path), "--force"]) == 0
+    assert capsys.readouterr().out.splitlines() == [*said, str(path)]
 
 
 # ---------------------------------------------------------------- refusals

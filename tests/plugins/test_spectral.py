@@ -158,7 +158,7 @@ def test_webp_is_a_picture_of_the_display(trained: Path, tmp_path: Path) -> None
 
 def test_the_inspectors_page_has_the_displays_colours(trained: Path, tmp_path: Path) -> None:
     said: list[str] = []
-    inspect_run(Request(trained, ("primitives",), grid=8, out=tmp_path / "page.html", say=said.append))
+    inspect_run(Request(trained, ("primitives",), grid=8, out=tmp_path / "page.html"), lambda event: said.append(event.text))
     data = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', (tmp_path / "page.html").read_text(), re.S)[1])  # type: ignore[index]
     found = np.frombuffer(zlib.decompress(base64.b64decode(data["frames"][0]["prims"])), "<f4").reshape(-1, 15)[:, 12:]
     _, task, model, _ = load_run(trained)
@@ -231,7 +231,7 @@ def test_without_a_display_it_is_said_what_is_shown(site: Path, tmp_path: Path, 
     assert lines == [f"shown: {SHOWN}; --format exr and npy hold all channels"]
     render_run(out, "orbit", None, "exr", tmp_path / "exr", 1, {}, tell=lines.append)
     assert len(lines) == 1
-    inspect_run(Request(out, ("primitives",), grid=8, out=tmp_path / "page.html", say=lines.append))
+    inspect_run(Request(out, ("primitives",), grid=8, out=tmp_path / "page.html"), lambda event: lines.append(event.text))
     assert f"shown: {SHOWN}" in lines
     monkeypatch.setattr(mesh, "_sample", lambda *a: pytest.fail("too late"))
     with pytest.raises(ConfigError, match=r"5 channels, .* and task 'spectral' has no display that makes these"):

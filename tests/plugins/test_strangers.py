@@ -358,7 +358,7 @@ def test_a_crash_of_an_inspector(
     path = Path(error.strip().rpartition("traceback in ")[2])
     assert path.parent == run_dir / "logs" and "strange_inspector.py" in path.read_text() and not (tmp_path / "a.png").exists()
     with pytest.raises(AttributeError):  # neuprim's own
-        inspect_run(Request(run_dir, ["slices"], grid=8, out=tmp_path / "a.png", say=lambda text: None))
+        inspect_run(Request(run_dir, ["slices"], grid=8, out=tmp_path / "a.png"))
 
 
 def test_the_package_of_a_name_that_two_have(site: Path) -> None:
@@ -379,7 +379,7 @@ def test_an_inspector_of_strangers_still_draws(site: Path, run_dir: Path, tmp_pa
     except BackendUnavailable as error:
         pytest.skip(str(error))
     add(site, "inspector", INSPECTOR)
-    request = Request(run_dir, ["crumbs"], grid=8, out=tmp_path / "a.png", size=(80, 60), say=lambda text: None)
+    request = Request(run_dir, ["crumbs"], grid=8, out=tmp_path / "a.png", size=(80, 60))
     (path,) = inspect_run(request)
     with Image.open(path) as picture:
         assert picture.size == (80, 60)

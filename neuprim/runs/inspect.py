@@ -19,14 +19,17 @@ from neuprim.core.io.film import write_film
 from neuprim.core.model.fields import Conditions
 from neuprim.core.volumes.grid import POINTS_LIMIT, agreement, density_grid, lattice
 from neuprim.core.volumes.truth import DensityTruth
+from neuprim.plugins.blame import origin_of
 from neuprim.plugins.crashes import is_ours, reported
 from neuprim.plugins.inspect.against import open_truth, pair, write_volume
 from neuprim.plugins.inspect.field import FieldFrame, ViewOptions
 from neuprim.plugins.inspect.frames import box_of, condition_frames, in_words, round_up
 from neuprim.plugins.inspect.headless import has_display, prepare_headless, require_pyvista
+from neuprim.plugins.inspect.layer_checks import fault
+from neuprim.plugins.inspect.layers import Layer
 from neuprim.plugins.inspect.page import write_page
 from neuprim.plugins.inspect.window import Window, panels_of
-from neuprim.plugins.registry import INSPECTORS, load_inspector
+from neuprim.plugins.registry import INSPECTORS, PluginError, load_inspector
 from neuprim.runs.events import Events, Note, silent
 from neuprim.runs.open import open_run
 
@@ -77,7 +80,7 @@ def inspect_run(request: Request, events: Events = silent) -> list[Path]:
 
     Raises:
         ConfigError, DataError, CheckpointError: the user's words or files, files in the way.
-        PluginError: an inspector that crashed.
+        PluginError: an inspector that crashed, or returned what cannot be drawn.
         BackendUnavailable: pyvista is missing, VTK cannot draw here, or there is no display and no ``out``.
     """
     kind = "" if request.out is None else request.out.suffix.lower()
@@ -112,14 +115,20 @@ def inspect_run(request: Request, events: Events = silent) -> list[Path]:
 
 
 def _watched(inspector: Inspector, name: str, request: Request) -> Inspector:
-    """The inspector, whose crashes are reported."""
+    """The inspector under the name that the user gave it; its crashes are reported, and so is what cannot be drawn."""
+    if is_ours(INSPECTORS, name):
+        return inspector
     folders = [request.run_dir / "logs", *([] if request.out is None else [request.out.absolute().parent])]
 
-    def add(plotter: Any, frame: FieldFrame) -> None:
+    def layers(frame: FieldFrame) -> Sequence[Layer]:
         with reported(INSPECTORS, name, folders):
-            inspector.add(plotter, frame)
+            found = inspector.layers(frame)
+        wrong = fault(found)
+        if wrong:
+            raise PluginError(f"inspector {inspector.name!r} of {origin_of(INSPECTORS, name).origin}: {wrong}")
+        return found
 
-    return inspector if is_ours(INSPECTORS, name) else replace(inspector, add=add)
+    return replace(inspector, name=name, layers=layers)
 
 
 def _paths(out: Path, count: int) -> list[Path]:

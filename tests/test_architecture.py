@@ -174,6 +174,18 @@ def test_nobody_imports_the_command_line() -> None:
     assert wrong == []
 
 
+def test_runs_do_not_print() -> None:
+    """What happens is told as events; ``print`` as a default says it past them."""
+    wrong = [
+        f"{f.relative_to(ROOT)}:{node.lineno}"
+        for f in FILES
+        if f.is_relative_to(ROOT / "runs")
+        for node in ast.walk(ast.parse(f.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Name) and node.id == "print"
+    ]
+    assert wrong == []
+
+
 def test_the_checker_sees_every_form_of_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(globals(), "ROOT", tmp_path)
     (tmp_path / "core" / "render").mkdir(parents=True)

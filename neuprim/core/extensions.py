@@ -7,7 +7,7 @@ through the same groups as anybody's.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -173,16 +173,16 @@ class Inspector:
     """A way of showing a density in ``neuprim inspect --show NAME``; group ``neuprim.inspectors``.
 
     Attributes:
-        add: (pyvista plotter, :class:`~neuprim.plugins.inspect.field.FieldFrame`) draws one frame into the plotter; called again with
-            the next frame after the plotter's actors of the last one were removed.
-        shows: "sigma" for the extinction on the frame's grid, drawn a second time from the ground truth where there is one; "model"
+        layers: a :class:`~neuprim.plugins.inspect.field.FieldFrame` -> a list of layers of :mod:`neuprim.plugins.inspect.layers`, which
+            a window, a picture, a film and a page draw; called once per frame and panel.
+        shows: "sigma" for the extinction on the frame's grid, asked a second time with the ground truth where there is one; "model"
             for the primitives themselves; "primitive" for a single one, with a camera of its own; "both" for what needs the truth.
     """
 
     api: int
     name: str
     summary: str
-    add: Callable[[Any, Any], None]
+    layers: Callable[[Any], Sequence[Any]]
     shows: Literal["sigma", "model", "primitive", "both"] = "sigma"
 
 

@@ -33,7 +33,7 @@ _CALLS: dict[type, tuple[str, ...]] = {
     ConditionSpec: ("parse",),
     LossExtension: ("make",),
     Exporter: ("write",),
-    Inspector: ("add",),
+    Inspector: ("layers",),
 }
 
 
@@ -58,6 +58,8 @@ def fault(spec: Any) -> str | None:
         return _one(spec.scene, SceneSpec, "scene")
     if isinstance(spec, ConditionSpec):
         return _condition(spec)
+    if isinstance(spec, Inspector):
+        return _inspector(spec)
     return _exporter(spec) if isinstance(spec, Exporter) else None
 
 
@@ -66,6 +68,18 @@ def _condition(spec: ConditionSpec) -> str | None:
     numbers = isinstance(ends, tuple | list) and len(ends) == 2 and all(isinstance(end, int | float) for end in ends)
     if not numbers or not ends[0] < ends[1]:
         return f"range is {ends!r}; expected a lower and a higher number"
+    return None
+
+
+def _inspector(spec: Inspector) -> str | None:
+    try:
+        signature = inspect.signature(spec.layers)
+    except (TypeError, ValueError):  # of compiled code that does not say
+        return None
+    try:
+        signature.bind(None)
+    except TypeError:
+        return f"layers is a function of {signature}; expected one of a frame alone, which returns layers"
     return None
 
 

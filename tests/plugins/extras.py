@@ -42,7 +42,7 @@ PLUGIN = Exporter(api=1, name="extra", summary="nothing at all", write=lambda jo
 """
 INSPECTOR = """
 from neuprim.core.extensions import Inspector
-PLUGIN = Inspector(api=1, name="extra", summary="nothing at all", add=lambda plotter, frame: None)
+PLUGIN = Inspector(api=1, name="extra", summary="nothing at all", layers=lambda frame: [])
 """
 KINDS: dict[str, tuple[Group[Any], str, str, str]] = {
     "task": (TASKS, "extra", TOY.replace('name="toy"', 'name="extra"').replace("TASK", "PLUGIN"), "TaskSpec"),

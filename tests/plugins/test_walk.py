@@ -27,6 +27,7 @@ from neuprim.plugins.members import fault
 from neuprim.plugins.registry import TASKS, list_tasks, load_task
 from neuprim.runs.open import load_run, read_metrics
 from tests.plugins.fakes import site, uninstall
+from tests.plugins.pages import layers_of
 from tests.plugins.spectral import NAMES, PACKAGE, fit, forget, install_spectral
 
 __all__ = ["site"]
@@ -141,9 +142,11 @@ def test_its_exporter_and_inspector(package: Path, tmp_path: Path, capsys: pytes
         assert refusal(capsys, *table, *spoken, word, "--force") == text
     assert refusal(capsys, *table, *advice, "--out", tmp_path / "a.txt").endswith("expected a file name that ends in .csv or .json")
 
-    pytest.importorskip("pyvista", exc_type=ImportError)
     view = ["inspect", out, "--show", "bands", "--grid", "8"]
-    assert "--show bands: not in a page" in refusal(capsys, *view, "--out", tmp_path / "page.html")
+    assert call(*view, "--out", tmp_path / "page.html") == 0
+    (frame,) = layers_of(tmp_path / "page.html")["frames"]
+    assert [layer["kind"] for layer in frame["layers"]["bands"]["model"]] == ["points"]
+    pytest.importorskip("pyvista", exc_type=ImportError)
     assert call(*view, "--out", tmp_path / "bands.png") == 0
     with Image.open(tmp_path / "bands.png") as picture:
         assert np.asarray(picture.convert("RGB")).std() > 1

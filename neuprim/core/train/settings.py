@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from neuprim.core.checked import Range, text, verify
 
-__all__ = ["ModelSettings", "PopulationSettings", "Strategy", "TrainSettings"]
+__all__ = ["ModelSettings", "PopulationSettings", "TrainSettings"]
 
 Share = Annotated[float, Range(0, 1, says="a fraction of the budget, 0 to 1")]
 NotNegative = Annotated[float, Range(at_least=0)]

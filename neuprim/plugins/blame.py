@@ -15,6 +15,7 @@ from typing import Any
 
 from neuprim.core.data.check import DatasetFault
 from neuprim.core.errors import DataError, NeuprimError
+from neuprim.plugins.judging import TaskFault
 from neuprim.plugins.mechanism import Group, PluginError, PluginInfo
 from neuprim.plugins.names import normalised, split
 from neuprim.plugins.registry import LOSSES, SCENES, TASKS
@@ -97,14 +98,17 @@ class Suspects:
         self.loss = Party(f"the loss of task {task!r}", home) if loss is None else Party(f"loss {loss!r}", origin_of(LOSSES, loss))
 
     def know(self, dataset: object) -> None:
-        """Code of the data set that the scene's loader made is the scene's, whichever module it is in."""
-        parts = (dataset, getattr(dataset, "train", None), getattr(dataset, "test", None))
-        self.scene.modules |= {_top(type(part).__module__) for part in parts} - {_OURS, "builtins"}
+        """Code that the scene's loader put into its data set is the scene's, whichever module it is in."""
+        views = (getattr(dataset, name, None) for name in ("train", "test", "extra"))
+        start = getattr(getattr(dataset, "start", None), "__module__", None)
+        modules = [*(type(part).__module__ for part in views), *([start] if isinstance(start, str) else [])]
+        self.scene.modules |= {_top(module) for module in modules} - {_OURS, "builtins"}
 
     def watch(self, folder: Path | None = None) -> _Watch:
         """Around neuprim's own code that calls plugins here and there: whose code a crash is in is read off the traceback.
 
-        A :class:`~neuprim.core.data.check.DatasetFault` becomes a DataError that names the scene's package.
+        A :class:`~neuprim.core.data.check.DatasetFault` becomes a DataError that names the scene's package, and a
+        :class:`~neuprim.plugins.judging.TaskFault` a PluginError that names the task's.
         """
         return _Watch(self, folder)
 
@@ -120,6 +124,9 @@ class _Watch:
         scene = self.suspects.scene
         if isinstance(error, DatasetFault):
             raise DataError(f"{scene.what} of {scene.origin.origin}: {error}") from error
+        if isinstance(error, TaskFault):
+            task = self.suspects.task
+            raise PluginError(f"{task.what} of {task.origin.origin}: {error}") from error
         if not _a_crash(error):
             return
         called = _frames(trace)[1:]

@@ -31,12 +31,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, opengl_to_viewmat
+from neuprim.core.data import Dataset
 from neuprim.core.data.common import IMAGE_SUFFIXES, every_nth, find_image, missing_files, posed_images, unique_names
 from neuprim.core.data.records import Record, read_json
 from neuprim.core.data.settings import BACKGROUNDS, Setting, data_folder, flag, read_settings, text
@@ -44,30 +45,18 @@ from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import ImageInfo, image_info
 from neuprim.core.task import SceneContext
-from neuprim.tasks.relight.data import PointLit, bright
+from neuprim.tasks.relight.data import Lighting, bright
 
-__all__ = ["check", "load", "read", "read_split"]
-
-Made = TypeVar("Made", bound=PointLit)
+__all__ = ["check", "load", "read_split"]
 
 
-def load(settings: Mapping[str, Any], context: SceneContext) -> PointLit:
+def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """The scene in the folder ``settings["path"]``, in linear light over the exposure.
 
     Raises:
         ConfigError: unknown or impossible settings.
         DataError: missing or damaged files, wrong or missing fields, impossible cameras, empty splits, black images with exposure=auto.
     """
-    return read(settings, context, PointLit)
-
-
-def check(settings: Mapping[str, Any]) -> None:
-    """Raises ConfigError for unknown or impossible settings, before any file is touched."""
-    read_settings(settings, _SETTINGS)
-
-
-def read(settings: Mapping[str, Any], context: SceneContext, kind: type[Made]) -> Made:
-    """As :func:`load`, with the class to make."""
     values = read_settings(settings, _SETTINGS)
     folder = data_folder(values["path"])
     train = read_split(folder, values["train_split"], values["ignore_corrections"])
@@ -79,12 +68,24 @@ def read(settings: Mapping[str, Any], context: SceneContext, kind: type[Made]) -
         train, test = every_nth(train, values["hold_out"])
     else:
         test = read_split(folder, values["test_split"], values["ignore_corrections"])
-    up = torch.tensor([0.0, 0.0, 1.0])
-    dataset = posed_images(str(folder), folder.resolve().name, train, test, values, context, up=up, to_linear=True, kind=kind)
-    dataset.falloff = values["falloff"]
     auto = values["exposure"] == _AUTO
-    dataset.expose(bright(dataset.train, str(folder)) if auto else float(values["exposure"]))
-    return dataset
+    return posed_images(
+        str(folder),
+        folder.resolve().name,
+        train,
+        test,
+        values,
+        context,
+        up=torch.tensor([0.0, 0.0, 1.0]),
+        to_linear=True,
+        exposure=(lambda views: bright(views, str(folder))) if auto else float(values["exposure"]),
+        extra=Lighting(values["falloff"]),
+    )
+
+
+def check(settings: Mapping[str, Any]) -> None:
+    """Raises ConfigError for unknown or impossible settings, before any file is touched."""
+    read_settings(settings, _SETTINGS)
 
 
 def read_split(folder: Path, split: str, ignore_corrections: bool = False) -> list[ImageFrame]:

@@ -13,7 +13,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -84,9 +84,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     folder = generate(SolidsSettings.parse(settings), context.cache_dir, context.progress)
     from neuprim.tasks.static.datasets import blender
 
-    dataset = blender.load({"path": str(folder)}, context)
-    dataset.name, dataset.data_source = "solids", "generated"
-    return dataset
+    return replace(blender.load({"path": str(folder)}, context), name="solids", data_source="generated")
 
 
 def generate(settings: SolidsSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None) -> Path:

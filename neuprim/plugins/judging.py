@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
 
 from torch import Tensor
 
@@ -16,6 +16,8 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 
 __all__ = ["TaskFault", "clips_of", "diagnosed", "facts_of", "judged", "mask_of", "orbit_of"]
+
+Kind = TypeVar("Kind")
 
 _OURS = ("name", "psnr", "ssim", "seconds")  # of a view, in metrics.json
 
@@ -80,14 +82,12 @@ def clips_of(task: TaskSpec, dataset: Dataset) -> list[Clip]:
     Raises:
         TaskFault: one is no :class:`~neuprim.core.data.dataset.Clip`, or has a view that is not there.
     """
-    found = list(task.clips(dataset))
+    found = _listed(task.clips(dataset), "clips", Clip)
     for clip in found:
-        if not isinstance(clip, Clip):
-            raise TaskFault(f"clips: found a {type(clip).__name__}; expected a neuprim.core.data.Clip")
         count = len(dataset.test if clip.source is None else clip.source)
-        beyond = [i for i in clip.views if not 0 <= i < count]
+        beyond = [i for i in clip.views if not isinstance(i, int) or not 0 <= i < count]
         if beyond or len(clip.views) == 0:
-            what = f"view {beyond[0]}" if beyond else "no views"
+            what = f"view {beyond[0]!r}" if beyond else "no views"
             raise TaskFault(f"clips: {clip.name!r} has {what}; expected indices below {count}")
     return found
 
@@ -98,12 +98,19 @@ def orbit_of(task: TaskSpec, dataset: Dataset, frames: int) -> list[View]:
     Raises:
         TaskFault: one is no :class:`~neuprim.core.data.dataset.View`, or there are none.
     """
-    found = list(task.orbit(dataset, frames))
-    strange = next((view for view in found if not isinstance(view, View)), None)
-    if strange is not None or not found:
-        what = "no views" if not found else f"a {type(strange).__name__}"
-        raise TaskFault(f"orbit: found {what}; expected neuprim.core.data.View")
+    found = _listed(task.orbit(dataset, frames), "orbit", View)
+    if not found:
+        raise TaskFault("orbit: found no views; expected some")
     return found
+
+
+def _listed(found: Any, where: str, kind: type[Kind]) -> list[Kind]:
+    if not isinstance(found, Sequence):
+        raise TaskFault(f"{where}: found a {type(found).__name__}; expected a list of neuprim.core.data.{kind.__name__}")
+    for entry in found:
+        if not isinstance(entry, kind):
+            raise TaskFault(f"{where}: found a {type(entry).__name__} in the list; expected a neuprim.core.data.{kind.__name__}")
+    return list(found)
 
 
 def _mapping(found: Any, where: str) -> Mapping[str, Any]:

@@ -273,12 +273,14 @@ def test_broken_promises_name_the_scenes_package(code: dict[str, str], text: str
         ({"judge": "return {'psnr': 3.0}"}, "judge of test view v0: psnr is a name that all views' numbers have"),
         ({"diagnose": "return {'shape': {1, 2}}"}, "diagnose: shape cannot be written as JSON (Object of type set is not"),
         ({"diagnose": "return {'error': float('inf')}"}, "diagnose: error cannot be written as JSON (Out of range float values"),
-        ({"clips": "return [3]"}, "clips: found a int; expected a neuprim.core.data.Clip"),
+        ({"clips": "return [3]"}, "clips: found a int in the list; expected a neuprim.core.data.Clip"),
+        ({"clips": "return None"}, "clips: found a NoneType; expected a list of neuprim.core.data.Clip"),
+        ({"clips": "return [Clip('round', ['v0'])]"}, "clips: 'round' has view 'v0'; expected indices below 2"),
         ({"clips": "return [Clip('round', [0, 2])]"}, "clips: 'round' has view 2; expected indices below 2"),
         ({"clips": "return [Clip('round', [])]"}, "clips: 'round' has no views; expected indices below 2"),
         ({"facts": "return None"}, "facts: found a NoneType; expected a dictionary"),
-        ({"orbit": "return []"}, "orbit: found no views; expected neuprim.core.data.View"),
-        ({"orbit": "return [3]"}, "orbit: found a int; expected neuprim.core.data.View"),
+        ({"orbit": "return []"}, "orbit: found no views; expected some"),
+        ({"orbit": "return [3]"}, "orbit: found a int in the list; expected a neuprim.core.data.View"),
     ],
 )
 def test_broken_promises_of_judging_name_the_tasks_package(

@@ -314,6 +314,7 @@ def vague(model: Mapping[str, Any]) -> None:
 
 MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("members", "build is of type int", replace(TASK, build=3)),  # type: ignore[arg-type]
+    ("members", "judge is of type int; expected a function", replace(TASK, judge=3)),  # type: ignore[arg-type]
     ("members", "TaskSpec.fields", replace(TASK, fields=None)),
     ("files", "scene/static/ghost.yaml", replace(TASK, scenes=(*TASK.scenes, GHOST))),
     ("files", "train.rates.W1", replace(TASK, fields={"SphericalHarmonics": SphericalHarmonics})),

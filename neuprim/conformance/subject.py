@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neuprim.config import RunSettings, preset_settings, task_choices
-from neuprim.conformance.example import Example
+from neuprim.conformance.example import example
 from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.data import Dataset, View
 from neuprim.core.errors import NonFiniteError
@@ -23,7 +23,7 @@ from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.backends import ORACLE
 from neuprim.core.task import TaskSpec
-from neuprim.core.train.settings import PopulationSettings, Strategy, TrainSettings
+from neuprim.core.train.settings import PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer, initial_model
 from neuprim.core.uses import build_settings, loss_settings
 
@@ -59,7 +59,7 @@ class Subject:
     def with_channels(self, channels: int) -> Subject:
         """The same on a synthetic data set of so many colour channels."""
         other = copy(self)
-        other.dataset = Example(self.task.conditions, channels)
+        other.dataset = example(self.task.conditions, channels)
         return other
 
     # ------------------------------------------------------------ verdicts
@@ -97,7 +97,7 @@ class Subject:
     @cached_property
     def dataset(self) -> Dataset:
         """The task's own example, or one with the conditions and channels it declares."""
-        return self.task.example() if self.task.example is not None else Example(self.task.conditions, len(self.task.channels) or 3)
+        return self.task.example() if self.task.example is not None else example(self.task.conditions, len(self.task.channels) or 3)
 
     def fields(self) -> tuple[DensityField, ColourField]:
         """Freshly built fields."""
@@ -129,7 +129,7 @@ class Subject:
             field.set_progress(1.0)
         return model
 
-    def trainer(self, iterations: int, strategy: Strategy = "relocate", seed: int = 0) -> Trainer:
+    def trainer(self, iterations: int, strategy: str = "relocate", seed: int = 0) -> Trainer:
         """What fits a fresh model, for a few steps, with interventions in the population every second step."""
         model, train = self.fresh(seed), self.settings.train
         population = PopulationSettings(strategy=strategy, every=2, start=0.0, stop=1.0, fraction=0.2)

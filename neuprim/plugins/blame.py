@@ -14,6 +14,7 @@ from typing import Any
 from neuprim.core.data.check import DatasetFault
 from neuprim.core.errors import DISK, DataError, NeuprimError
 from neuprim.plugins import crashes
+from neuprim.plugins.judging import TaskFault
 from neuprim.plugins.mechanism import Group, PluginError, PluginInfo
 from neuprim.plugins.names import normalised, split
 from neuprim.plugins.registry import LOSSES, SCENES, TASKS
@@ -143,14 +144,17 @@ class Suspects:
         self.loss = Party(f"the loss of task {task!r}", home) if loss is None else Party(f"loss {loss!r}", origin_of(LOSSES, loss))
 
     def know(self, dataset: object) -> None:
-        """Code of the data set that the scene's loader made is the scene's, whichever module it is in."""
-        parts = (dataset, getattr(dataset, "train", None), getattr(dataset, "test", None))
-        self.scene.modules |= {_top(type(part).__module__) for part in parts} - {_OURS, "builtins"}
+        """Code that the scene's loader put into its data set is the scene's, whichever module it is in."""
+        views = (getattr(dataset, name, None) for name in ("train", "test", "extra"))
+        start = getattr(getattr(dataset, "start", None), "__module__", None)
+        modules = [*(type(part).__module__ for part in views), *([start] if isinstance(start, str) else [])]
+        self.scene.modules |= {_top(module) for module in modules} - {_OURS, "builtins"}
 
     def watch(self, folder: Path | None = None) -> _Watch:
         """Around neuprim's own code that calls plugins here and there: whose code a crash is in is read off the traceback.
 
-        A :class:`~neuprim.core.data.check.DatasetFault` becomes a DataError that names the scene's package.
+        A :class:`~neuprim.core.data.check.DatasetFault` becomes a DataError that names the scene's package, and a
+        :class:`~neuprim.plugins.judging.TaskFault` a PluginError that names the task's.
         """
         return _Watch(self, folder)
 
@@ -162,6 +166,8 @@ class _Watch(_Guard):
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if isinstance(error, DatasetFault):
             raise DataError(f"{self.suspects.scene.who}: {error}") from error
+        if isinstance(error, TaskFault):
+            raise PluginError(f"{self.suspects.task.who}: {error}") from error
         super().__exit__(kind, error, trace)
 
     def accused(self, error: BaseException, called: Sequence[StackFrame]) -> Party | None:

@@ -125,7 +125,7 @@ def _watched(inspector: Inspector, name: str, request: Request) -> Inspector:
             found = inspector.layers(frame)
         wrong = fault(found)
         if wrong:
-            raise PluginError(f"{guard.party.who} of {guard.party.origin.origin}: {wrong}")
+            raise PluginError(f"{guard.party.who}: {wrong}")
         return found
 
     return replace(inspector, name=name, layers=layers)

@@ -15,9 +15,9 @@ from neuprim.core.extensions import SceneExtension
 from neuprim.core.task import SceneSpec
 
 def load(settings, context):
-    from tests.core.tiny import TwoPrimitives
+    from tests.core.tiny import two_primitives
     assert settings == {"wobble": 2.0}
-    return TwoPrimitives()
+    return two_primitives()
 
 PLUGIN = SceneExtension(api=1, task="static", scene=SceneSpec("extra", "two ellipsoids", load), config_package="fake_extra.conf")
 """

@@ -159,7 +159,7 @@ def test_its_own_volume_agrees_with_the_model(run_dir: Path, tmp_path: Path) -> 
 
 def test_the_numbers_are_those_of_the_data_set(run_dir: Path, tmp_path: Path) -> None:
     config, task, model, _ = load_run(run_dir)
-    expected = {f["frame"]: f for f in load_dataset(config, task).diagnose(model)["sigma_frames"]}
+    expected = {f["frame"]: f for f in task.diagnose(load_dataset(config, task), model)["sigma_frames"]}
     for against in (str(run_dir.parent / "files"), "scene"):
         _, said = look(run_dir, conditions={"time": "0:1:20"}, grid=8, against=against, out=tmp_path / "x.vdb", overwrite=True)
         assert len(expected) == 3 and len(said) == 5

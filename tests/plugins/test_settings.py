@@ -332,7 +332,7 @@ def test_a_loss_sees_view_mask_alpha_and_progress() -> None:
     from tests.core import tiny
 
     seen: list[tuple[Tensor, Tensor, Supervision]] = []
-    data: Dataset = tiny.TwoPrimitives(random_background=True)
+    data: Dataset = tiny.two_primitives(random_background=True)
     mask = torch.ones(tiny.SIZE, tiny.SIZE, dtype=torch.bool)
     mask[:, 12:] = False
     data.train.images = [replace(p, mask=mask) for p in data.train.images]  # type: ignore[attr-defined]

@@ -16,7 +16,7 @@ from tests import kernels
 def test_what_is_compiled_is_what_training_needs() -> None:
     """A run that waited for it finds on disk every kernel that training calls, for the types that training calls it with."""
     ahead = kernels.compiled_by("from neuprim.runs import compile; compile.main('cpu')")
-    training = "t = tiny.trainer(tiny.TwoPrimitives(True), 4, population={'strategy': 'relocate', 'every': 2})"
+    training = "t = tiny.trainer(tiny.two_primitives(True), 4, population={'strategy': 'relocate', 'every': 2})"
     needed = kernels.compiled_by(f"from tests.core import tiny; {training}; assert len(list(t.run())) == 4")
     assert len(needed) > 8
     missing = [f"{name}{types}" for name, signatures in needed.items() for types in signatures if types not in ahead.get(name, [])]

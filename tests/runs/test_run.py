@@ -22,14 +22,14 @@ import neuprim.runs.fit as fitting
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint
 from neuprim.core.channels import Channels
-from neuprim.core.data import Clip
-from neuprim.core.data.common import PosedImages
+from neuprim.core.data import Clip, Dataset
 from neuprim.core.errors import CheckpointError, DataError, NonFiniteError
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.runs.curve import curve_psnr
 from neuprim.runs.draw import render_run
 from neuprim.runs.measure import evaluate_run, measure
 from neuprim.runs.open import read_metrics
+from neuprim.tasks.static import TASK
 from tests.core import tiny
 from tests.short_runs import STEPS, fit, words
 from tests.systems import posix
@@ -122,7 +122,7 @@ def test_curve(whole: Path) -> None:
 
 
 def test_masked_pixels_do_not_count_on_the_curve() -> None:
-    dataset = tiny.TwoPrimitives()
+    dataset = tiny.two_primitives()
     mask = torch.zeros(tiny.SIZE, tiny.SIZE, dtype=torch.bool)
     mask[8:14, 5:20] = True
     dataset.test.images = [  # type: ignore[attr-defined]
@@ -130,23 +130,31 @@ def test_masked_pixels_do_not_count_on_the_curve() -> None:
         for p in dataset.test.images  # type: ignore[attr-defined]
     ]
     trainer = tiny.trainer(dataset, 3)
-    views = measure(trainer.model, dataset, trainer.renderer, Channels())
+    views = measure(trainer.model, TASK, dataset, trainer.renderer, Channels())
     assert curve_psnr(trainer) == pytest.approx(sum(v.psnr for v in views) / len(views), abs=1e-9)
 
 
 def test_a_perfect_view_leaves_the_curve_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    dataset = tiny.TwoPrimitives()
+    dataset = tiny.two_primitives()
     monkeypatch.setattr("neuprim.runs.curve.draw", lambda model, view, settings, background: dataset.test.pixels(0).over(background))
     dataset.test.images = [dataset.test.images[0]] * 2  # type: ignore[attr-defined]
     assert curve_psnr(tiny.trainer(dataset, 3)) == 200.0
 
 
-def test_a_data_set_may_judge_views_and_keep_films_beside_them(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def judge(dataset: PosedImages, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
+def test_a_task_may_judge_views_and_make_films_and_tell_facts(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def judge(dataset: Dataset, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
         return {"index": float(index), "mse_part": 0.1 if index else 0.2, "pixels_part": 3.0 if index == 0 else 1.0}
 
-    monkeypatch.setattr(PosedImages, "judge", judge)
-    monkeypatch.setattr(PosedImages, "clips", lambda dataset: [Clip("round", [2, 0, 1], 10.0, dataset.train)])
+    mine = replace(
+        TASK,
+        judge=judge,
+        mask=lambda dataset, index: dataset.test.pixels(index).alpha > 0.5,
+        diagnose=lambda dataset, model: {"counted": [model.count, dataset.channels]},
+        clips=lambda dataset: [Clip("round", [2, 0, 1], 10.0, dataset.train)],
+        facts=lambda dataset: {"seen": len(dataset.train)},
+        orbit=lambda dataset, frames: dataset.orbit(frames)[:3],
+    )
+    monkeypatch.setattr("neuprim.tasks.static.TASK", mine)
     out = fit(words(scene, tmp_path / "film", 20))
     metrics = read_metrics(out)
     count = len(metrics["per_view"])
@@ -154,6 +162,12 @@ def test_a_data_set_may_judge_views_and_keep_films_beside_them(scene: Path, tmp_
     pooled = (3 * 0.2 + (count - 1) * 0.1) / (3 + count - 1)
     assert metrics["psnr_pooled_part"] == pytest.approx(-10 * math.log10(pooled)) and metrics["pixels_part"] == 3 + count - 1
     assert "per_frame" not in metrics
+    assert metrics["counted"] == [metrics["primitives"], 3]
+    assert all(math.isfinite(view["psnr_mask"] + view["mse_mask"]) for view in metrics["per_view"])
+    header = checkpoint.read(out / "model.safetensors", "model")[0]
+    assert header["data"] == {"up": [0.0, 0.0, 1.0], "center": header["data"]["center"], "seen": 6}
+    with Image.open(out / "renders" / "orbit.webp") as film:
+        assert getattr(film, "n_frames", 1) == 3
     with Image.open(out / "renders" / "clip_round.webp") as film:
         assert getattr(film, "n_frames", 1) == 3 and film.width == 2 * film.height
     assert evaluate_run(out)["index"] == metrics["index"]

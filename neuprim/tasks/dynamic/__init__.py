@@ -12,6 +12,7 @@ from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim.core.volumes.source import VolumeSource
+from neuprim.tasks.dynamic import judging
 from neuprim.tasks.dynamic.colour import FREQUENCIES, RENAMED, TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.dynamic.time import parse_times
@@ -81,4 +82,7 @@ TASK = TaskSpec(
     conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_times, sweep="0:1"),),
     fields={"TimeDensity": TimeDensity, "TimeHarmonics": TimeHarmonics},
     uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),
+    mask=judging.mask,
+    diagnose=judging.diagnose,
+    clips=judging.clips,
 )

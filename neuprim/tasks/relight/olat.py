@@ -32,13 +32,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, opengl_to_viewmat
 from neuprim.core.checked import Range, checked
+from neuprim.core.data import Dataset
 from neuprim.core.data.common import IMAGE_SUFFIXES, every_nth, find_image, missing_files, posed_images, unique_names
 from neuprim.core.data.records import Record, read_json
 from neuprim.core.data.settings import Background, FolderSettings, HoldOut, SplitName, data_folder
@@ -46,25 +47,18 @@ from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import ImageInfo, image_info
 from neuprim.core.task import SceneContext
-from neuprim.tasks.relight.data import PointLit, bright
+from neuprim.tasks.relight.data import Lighting, bright
 
-__all__ = ["OlatSettings", "load", "read", "read_split"]
-
-Made = TypeVar("Made", bound=PointLit)
+__all__ = ["OlatSettings", "load", "read_split"]
 
 
-def load(settings: Mapping[str, Any], context: SceneContext) -> PointLit:
+def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """The scene in the folder ``settings["path"]``, in linear light over the exposure.
 
     Raises:
         ConfigError: unknown or impossible settings.
         DataError: missing or damaged files, wrong or missing fields, impossible cameras, empty splits, black images with exposure=auto.
     """
-    return read(settings, context, PointLit)
-
-
-def read(settings: Mapping[str, Any], context: SceneContext, kind: type[Made]) -> Made:
-    """As :func:`load`, with the class to make."""
     asked = checked(OlatSettings, settings, "scene")
     folder = data_folder(asked.path)
     train = read_split(folder, asked.train_split, asked.ignore_corrections)
@@ -74,11 +68,18 @@ def read(settings: Mapping[str, Any], context: SceneContext, kind: type[Made]) -
         train, test = every_nth(train, asked.hold_out)
     else:
         test = read_split(folder, asked.test_split, asked.ignore_corrections)
-    up = torch.tensor([0.0, 0.0, 1.0])
-    dataset = posed_images(str(folder), folder.resolve().name, train, test, asked, context, up=up, to_linear=True, kind=kind)
-    dataset.falloff = asked.falloff
-    dataset.expose(bright(dataset.train, str(folder)) if asked.exposure == "auto" else asked.exposure)
-    return dataset
+    return posed_images(
+        str(folder),
+        folder.resolve().name,
+        train,
+        test,
+        asked,
+        context,
+        up=torch.tensor([0.0, 0.0, 1.0]),
+        to_linear=True,
+        exposure=(lambda views: bright(views, str(folder))) if asked.exposure == "auto" else asked.exposure,
+        extra=Lighting(asked.falloff),
+    )
 
 
 def read_split(folder: Path, split: str, ignore_corrections: bool = False) -> list[ImageFrame]:

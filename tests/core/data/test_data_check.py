@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, replace
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,8 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.rays import RayCamera
-from neuprim.core.data import PointCloud
-from neuprim.core.data.check import DatasetFault, check_dataset, check_mask, check_pixels, check_points
+from neuprim.core.data import Dataset, Pixels, PointCloud
+from neuprim.core.data.check import DatasetFault, check_dataset, check_mask, check_pixels, check_points, extra_of
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import ConditionSpec
@@ -63,10 +63,6 @@ def empty(data: Any) -> None:
     data.test.cameras = []
 
 
-def without(name: str) -> Callable[[Any], None]:
-    return lambda data: data.__dict__.pop(name)
-
-
 def wrong_view(data: Any) -> None:
     data.test.view = lambda index: "a view"
 
@@ -110,7 +106,9 @@ FAULTS: dict[str, tuple[Callable[[Any], None], str]] = {
     ),
     "no name": (viewed("train", name=""), "train view 0: name is ''; expected text"),
     "no view": (wrong_view, "test view 0: found a str; expected a neuprim.core.data.View"),
-    "a member missing": (without("center"), "two: center is missing"),
+    "no starting points": (member(start=None), "two: start is None; expected a function of (views, count, generator)"),
+    "exposure": (member(exposure=0), "two: exposure is 0; expected a positive number"),
+    "placement": (member(placement={}), "two: placement is a dict; expected a neuprim.core.volumes.source.Placement, or None"),
     "a split that is none": (member(test=[]), "two: test is a list; expected a neuprim.core.data.ViewSet"),
     "colour space": (member(color_space="sRGB"), "two: color_space is 'sRGB'; expected srgb or linear"),
     "data source": (member(data_source="photos"), "two: data_source is 'photos'; expected real or generated or simulated"),
@@ -122,7 +120,7 @@ FAULTS: dict[str, tuple[Callable[[Any], None], str]] = {
 
 @pytest.mark.parametrize(("change", "text"), FAULTS.values(), ids=FAULTS)
 def test_a_broken_promise_is_one_line(change: Callable[[Any], None], text: str) -> None:
-    data = tiny.TwoPrimitives()
+    data = tiny.two_primitives()
     check_dataset(data, ())
     change(data)
     with pytest.raises(DatasetFault) as caught:
@@ -140,7 +138,7 @@ def test_a_broken_promise_is_one_line(change: Callable[[Any], None], text: str) 
     ],
 )
 def test_conditions_that_the_task_declares(value: Any, text: str) -> None:
-    data = tiny.TwoPrimitives()
+    data = tiny.two_primitives()
     if value is not None:
         viewed("train", conditions={"time": value})(data)
     with pytest.raises(DatasetFault) as caught:
@@ -149,7 +147,7 @@ def test_conditions_that_the_task_declares(value: Any, text: str) -> None:
 
 
 def test_a_condition_missing_in_one_later_view_is_found() -> None:
-    data = tiny.TwoPrimitives()
+    data = tiny.two_primitives()
     for split in (data.train, data.test):
         plain = split.view
         split.view = lambda index, plain=plain: replace(plain(index), conditions={} if index == 3 else {"time": torch.tensor(0.5)})  # type: ignore[method-assign, misc]
@@ -158,7 +156,7 @@ def test_a_condition_missing_in_one_later_view_is_found() -> None:
 
 
 def test_conditions_that_no_task_needs_and_ray_cameras_are_fine() -> None:
-    data = tiny.TwoPrimitives()
+    data = tiny.two_primitives()
     viewed("train", conditions={"time": torch.tensor(0.5), "more": "text"})(data)
     viewed("test", camera=RayCamera.fisheye(N, N, torch.eye(4)))(data)
     check_dataset(data, [])
@@ -178,27 +176,27 @@ POINTS: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize(("changes", "text"), POINTS.values(), ids=POINTS)
-def test_starting_points(changes: dict[str, Any], text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    data, cloud = tiny.TwoPrimitives(), PointCloud(torch.zeros(5, 3), torch.zeros(5, 3))
+def test_starting_points(changes: dict[str, Any], text: str) -> None:
+    data, cloud = tiny.two_primitives(), PointCloud(torch.zeros(5, 3), torch.zeros(5, 3))
     check_points(cloud, 6, data)
     cloud = replace(cloud, **changes)
     with pytest.raises(DatasetFault) as caught:
         check_points(cloud, 6, data)
     assert text in str(caught.value)
-    monkeypatch.setattr(data, "initial_points", lambda count, generator: cloud)
+    data = replace(data, start=lambda views, count, generator: cloud)
     with pytest.raises(DatasetFault, match="starting points"):  # where a run asks for them
         initial_model(CosineDensity(1), SphericalHarmonics(0, 3), data, ModelSettings(primitives=6), 0)
 
 
 def test_no_points_at_all_and_a_list_of_them() -> None:
-    data = tiny.TwoPrimitives()
+    data = tiny.two_primitives()
     check_points(PointCloud(torch.zeros(0, 3), torch.zeros(0, 3)), 6, data)
     with pytest.raises(DatasetFault, match="found a list; expected a neuprim"):
         check_points([[0, 0, 0]], 6, data)  # type: ignore[arg-type]
 
 
 def test_a_later_view_is_noticed_when_it_is_drawn() -> None:
-    data = tiny.TwoPrimitives()
+    data = tiny.two_primitives()
     spoil(index=4, rgb=lambda x: x.permute(2, 0, 1))(data)
     check_dataset(data, ())
     trainer = tiny.trainer(data)
@@ -208,7 +206,7 @@ def test_a_later_view_is_noticed_when_it_is_drawn() -> None:
 
 
 def test_checking_pixels_and_masks_alone() -> None:
-    data = tiny.TwoPrimitives()
+    data = tiny.two_primitives()
     view = data.test.view(1)
     check_pixels("test", view, data.test.pixels(1), 3)
     check_mask("test", view, torch.ones(N, N, dtype=torch.bool))
@@ -219,7 +217,7 @@ def test_checking_pixels_and_masks_alone() -> None:
 def test_the_message_of_a_loss_that_is_nan_says_whether_the_image_was() -> None:
     from neuprim.core.errors import NonFiniteError
 
-    data = tiny.TwoPrimitives()
+    data = tiny.two_primitives()
     spoil(index=4, rgb=nan)(data)
     with pytest.raises(NonFiniteError, match=r"on view v4, whose pixels are NaN or infinite somewhere"):
         list(tiny.trainer(data).run())
@@ -230,4 +228,38 @@ def test_a_light_network_refuses_a_wrong_start_value_in_one_line() -> None:
 
     for value in ("abc", None, float("nan"), True):
         with pytest.raises(ConfigError, match=r"model\.init\.output=.*: expected a number"):
-            initial_model(CosineDensity(1), LightNetwork(2), tiny.TwoPrimitives(), ModelSettings(primitives=4, init={"output": value}), 0)
+            initial_model(CosineDensity(1), LightNetwork(2), tiny.two_primitives(), ModelSettings(primitives=4, init={"output": value}), 0)
+
+
+def test_a_data_set_is_a_description_that_stays_as_it_is() -> None:
+    data = tiny.two_primitives()
+    with pytest.raises(FrozenInstanceError):
+        data.name = "other"  # type: ignore[misc]
+    with pytest.raises(TypeError, match=r"^class Mine\(Dataset\): a data set is made by calling neuprim\.core\.data\.Dataset\(name="):
+        type("Mine", (Dataset,), {"judge": lambda self, index, rendered, truth: {}})
+    with pytest.raises(TypeError, match="missing 1 required keyword-only argument: 'extent'"):
+        Dataset(name="x", train=data.train, test=data.test, start=data.start, background=torch.ones(3))  # type: ignore[call-arg]
+
+
+def test_starting_points_follow_the_training_views() -> None:
+    data = tiny.two_primitives(
+        start=lambda views, count, generator: PointCloud(torch.full((len(views), 3), 0.5), torch.zeros(len(views), 3))
+    )
+    other = replace(data, train=data.test)
+    assert [len(d.initial_points(9, torch.Generator()).means) for d in (data, other)] == [6, 2]
+
+
+def test_what_a_task_knows_of_a_data_set_is_of_its_own_class() -> None:
+    data = tiny.two_primitives()
+    assert extra_of(data, Pixels) is None and extra_of(replace(data, extra=data.test.pixels(0)), Pixels) is data.test.pixels(0)
+    with pytest.raises(DatasetFault, match=r"^two: extra is a dict; expected a neuprim\.core\.data\.dataset\.Pixels, or None$"):
+        extra_of(replace(data, extra={"rgb": 1}), Pixels)
+
+
+def test_an_orbit_has_every_condition_of_the_training_views() -> None:
+    data = tiny.two_primitives()
+    plain = data.train.view
+    data.train.view = lambda i: replace(plain(i), conditions={"time": torch.tensor(0.1 * i), "light": torch.tensor([i, 2.0, 3.0])})  # type: ignore[method-assign]
+    views = data.orbit(3)
+    torch.testing.assert_close(torch.stack([v.conditions["time"] for v in views]), torch.tensor([0.0, 0.25, 0.5]))
+    assert [v.conditions["light"].tolist() for v in views] == [[0.0, 2.0, 3.0]] * 3

@@ -24,7 +24,7 @@ from tests.core import tiny
 
 def fresh(path: Path | str, primitives: int = 50, **init: object) -> Primitives:
     settings = ModelSettings(primitives=primitives, init={"points": str(path), **init})
-    return initial_model(CosineDensity(4), SphericalHarmonics(1), tiny.TwoPrimitives(), settings, 0)
+    return initial_model(CosineDensity(4), SphericalHarmonics(1), tiny.two_primitives(), settings, 0)
 
 
 def splats(path: Path, **changes: float) -> Path:

@@ -11,7 +11,7 @@ import torch
 
 from neuprim.core import checkpoint
 from neuprim.core.cameras import Camera
-from neuprim.core.data import Pixels, PointCloud
+from neuprim.core.data import Dataset, Pixels, PointCloud, ViewSet
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.render import RenderSettings
@@ -26,45 +26,46 @@ SIZE = 64
 ABUSES = ("rates times ten", "one view", "one primitive", "black images", "a camera inside")
 
 
-class Abused(tiny.TwoPrimitives):
+def abused_data(abuse: str) -> Dataset:
     """The two known primitives at 64 x 64, with something wrong."""
 
-    def __init__(self, abuse: str) -> None:
-        super().__init__()
-        self.abuse = abuse
-        for views in (self.train, self.test):
-            assert isinstance(views, tiny.Views)
-            views.images = [self._pixels(p) for p in views.images]
-            views.cameras = [c.resized(SIZE, SIZE) for c in views.cameras]
-        if abuse == "one view":
-            self.train.cameras, self.train.images = self.train.cameras[:1], self.train.images[:1]  # type: ignore[attr-defined]
-        if abuse == "a camera inside":
-            self.train.cameras[:3] = [self._inside(c) for c in self.train.cameras[:3]]  # type: ignore[attr-defined]
+    def start(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
+        return tiny.near_the_truth(views, 1 if abuse == "one primitive" else count, generator)
 
-    def _pixels(self, pixels: Pixels) -> Pixels:
-        def larger(image: torch.Tensor) -> torch.Tensor:
-            channels = image[None, None] if image.dim() == 2 else image.permute(2, 0, 1)[None]
-            out = torch.nn.functional.interpolate(channels, (SIZE, SIZE), mode="bilinear")[0].clamp(0, 1)
-            return out[0] if image.dim() == 2 else out.permute(1, 2, 0).contiguous()
+    dataset = tiny.two_primitives(start=start)
+    train, test = dataset.train, dataset.test
+    assert isinstance(train, tiny.Views) and isinstance(test, tiny.Views)
+    for views in (train, test):
+        views.images = [_pixels(p, abuse) for p in views.images]
+        views.cameras = [c.resized(SIZE, SIZE) for c in views.cameras]
+    if abuse == "one view":
+        train.cameras, train.images = train.cameras[:1], train.images[:1]
+    if abuse == "a camera inside":
+        train.cameras[:3] = [_inside(c) for c in train.cameras[:3]]
+    return dataset
 
-        assert pixels.alpha is not None
-        if self.abuse == "black images":
-            return Pixels(torch.zeros(SIZE, SIZE, 3), torch.ones(SIZE, SIZE))
-        return Pixels(larger(pixels.rgb), larger(pixels.alpha))
 
-    @staticmethod
-    def _inside(camera: Camera) -> Camera:
-        """The camera moved to the middle of the red ellipsoid, looking the same way."""
-        view = camera.viewmat.clone()
-        view[:3, 3] = -view[:3, :3] @ tiny.truth().geometry.means[0].double()
-        return replace(camera, viewmat=view)
+def _pixels(pixels: Pixels, abuse: str) -> Pixels:
+    def larger(image: torch.Tensor) -> torch.Tensor:
+        channels = image[None, None] if image.dim() == 2 else image.permute(2, 0, 1)[None]
+        out = torch.nn.functional.interpolate(channels, (SIZE, SIZE), mode="bilinear")[0].clamp(0, 1)
+        return out[0] if image.dim() == 2 else out.permute(1, 2, 0).contiguous()
 
-    def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
-        return super().initial_points(1 if self.abuse == "one primitive" else count, generator)
+    assert pixels.alpha is not None
+    if abuse == "black images":
+        return Pixels(torch.zeros(SIZE, SIZE, 3), torch.ones(SIZE, SIZE))
+    return Pixels(larger(pixels.rgb), larger(pixels.alpha))
+
+
+def _inside(camera: Camera) -> Camera:
+    """The camera moved to the middle of the red ellipsoid, looking the same way."""
+    view = camera.viewmat.clone()
+    view[:3, 3] = -view[:3, :3] @ tiny.truth().geometry.means[0].double()
+    return replace(camera, viewmat=view)
 
 
 def abused(abuse: str, steps: int, primitives: int = 500) -> Trainer:
-    dataset = Abused(abuse)
+    dataset = abused_data(abuse)
     population = PopulationSettings(strategy="relocate", every=50, start=0.0, stop=1.0)
     rates: dict[str, float] = {}
     density, colour = CosineDensity(8), SphericalHarmonics(3, 3, 0.1)

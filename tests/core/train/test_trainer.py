@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core import checkpoint
-from neuprim.core.data import Dataset, Pixels
+from neuprim.core.data import Dataset
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NonFiniteError
 from neuprim.core.metrics import psnr
 from neuprim.core.task import Supervision
@@ -24,12 +24,12 @@ from tests.core import tiny
 
 @pytest.fixture(scope="module")
 def plain() -> Dataset:
-    return tiny.TwoPrimitives()
+    return tiny.two_primitives()
 
 
 @pytest.fixture(scope="module")
 def random_background() -> Dataset:
-    return tiny.TwoPrimitives(random_background=True)
+    return tiny.two_primitives(random_background=True)
 
 
 STRATEGIES: dict[str, dict[str, Any]] = {
@@ -130,20 +130,14 @@ def test_budget_of_seconds(plain: Dataset) -> None:
 
 
 def test_masked_pixels_do_not_count(plain: Dataset) -> None:
-    class Masked(tiny.TwoPrimitives):
-        def __init__(self) -> None:
-            super().__init__()
-            views = self.train
-            mask = torch.ones(tiny.SIZE, tiny.SIZE, dtype=torch.bool)
-            mask[:, 12:] = False
-            spoiled = [replace(p, rgb=torch.where(mask[..., None], p.rgb, torch.full_like(p.rgb, 1e3)), mask=mask) for p in views.images]  # type: ignore[attr-defined]
-            clean = [replace(p, mask=mask) for p in views.images]  # type: ignore[attr-defined]
-            self.choices: tuple[list[Pixels], list[Pixels]] = (spoiled, clean)
-
+    mask = torch.ones(tiny.SIZE, tiny.SIZE, dtype=torch.bool)
+    mask[:, 12:] = False
+    clean = [replace(p, mask=mask) for p in plain.train.images]  # type: ignore[attr-defined]
+    spoiled = [replace(p, rgb=torch.where(mask[..., None], p.rgb, torch.full_like(p.rgb, 1e3))) for p in clean]
     results = []
-    for choice in (0, 1):
-        dataset = Masked()
-        dataset.train.images = dataset.choices[choice]  # type: ignore[attr-defined]
+    for images in (spoiled, clean):
+        dataset = tiny.two_primitives()
+        dataset.train.images = images  # type: ignore[attr-defined]
         trainer = tiny.trainer(dataset, 5, ssim_weight=0.0)
         list(trainer.run())
         results.append(trainer)
@@ -151,7 +145,7 @@ def test_masked_pixels_do_not_count(plain: Dataset) -> None:
 
 
 def test_the_psnr_of_a_step_is_that_of_the_pixels_that_count() -> None:
-    dataset = tiny.TwoPrimitives()
+    dataset = tiny.two_primitives()
     mask = torch.zeros(tiny.SIZE, tiny.SIZE, dtype=torch.bool)
     mask[8:14, 5:20] = True
     dataset.train.images = [replace(p, mask=mask) for p in dataset.train.images]  # type: ignore[attr-defined]
@@ -168,7 +162,7 @@ def test_the_psnr_of_a_step_is_that_of_the_pixels_that_count() -> None:
 
 def poisoned(name: str, row: int, at: int):  # type: ignore[no-untyped-def]
     """A trainer, of whose parameter ``name`` the gradient of primitive ``row`` is NaN at step ``at``."""
-    trainer = tiny.trainer(tiny.TwoPrimitives(), 40)
+    trainer = tiny.trainer(tiny.two_primitives(), 40)
     plain_loss = trainer.loss
 
     def poison(grad: Tensor) -> Tensor:
@@ -209,7 +203,7 @@ def test_a_non_finite_parameter_stops_by_name(plain: Dataset) -> None:
 
 
 def test_a_non_finite_image_stops_by_view() -> None:
-    dataset = tiny.TwoPrimitives()
+    dataset = tiny.two_primitives()
     dataset.train.images[2].rgb[3, 4, 1] = float("nan")  # type: ignore[attr-defined]
     trainer = tiny.trainer(dataset)
     with pytest.raises(NonFiniteError, match=r"loss is nan at step \d on view v2"):
@@ -219,13 +213,13 @@ def test_a_non_finite_image_stops_by_view() -> None:
 
 def test_empty_splits_and_no_points(plain: Dataset) -> None:
     model = tiny.trainer(plain).model
-    dataset = tiny.TwoPrimitives()
+    dataset = tiny.two_primitives()
     dataset.train.cameras = []  # type: ignore[attr-defined]
     with pytest.raises(DataError, match="training split is empty"):
         Trainer(model, dataset, lambda a, b: (a, {}), TrainSettings(), tiny.RenderSettings(), 0)
-    dataset.initial_points = lambda count, generator: tiny.PointCloud(torch.zeros(0, 3), torch.zeros(0, 3))  # type: ignore[method-assign]
+    nowhere = replace(dataset, start=lambda views, count, generator: tiny.PointCloud(torch.zeros(0, 3), torch.zeros(0, 3)))
     with pytest.raises(DataError, match="two: no starting points"):
-        initial_model(model.density, model.colour, dataset, ModelSettings(), 0)
+        initial_model(model.density, model.colour, nowhere, ModelSettings(), 0)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])

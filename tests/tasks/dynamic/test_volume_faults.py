@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 import torch
 
+from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.tasks.dynamic.volume.dataset import FrameViews
 from neuprim.tasks.dynamic.volume.looks import changed, named_look
 from neuprim.tasks.dynamic.volume.normalise import Normalisation
 from neuprim.tasks.dynamic.volume.optics import medium_of
-from tests.tasks.dynamic.sequences import VOXEL, blob, dataset
+from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, recorded
 
 
 @pytest.fixture
@@ -82,16 +84,17 @@ def test_the_box_is_that_of_the_grid_that_the_look_absorbs_by(folder: Path, tmp_
     write_vdb(folder / "ball_1.vdb", [hot, far])
     write_vdb(folder / "ball_2.vdb", [hot])  # has what absorbs, whatever else it lacks
     data = dataset(folder, tmp_path, look="embergen_fire")
-    assert data.capture.normalisation.center[0] < 100
+    assert recorded(data).capture.normalisation.center[0] < 100
     alphas = [data.test.pixels(i).alpha for i in range(2)]
     assert all(a is not None and bool(a.any()) for a in alphas)
-    assert dataset(folder, tmp_path, look="dust_tornado").capture.normalisation.center[0] > 400
+    assert recorded(dataset(folder, tmp_path, look="dust_tornado")).capture.normalisation.center[0] > 400
 
 
 def test_a_frame_without_the_grid_that_absorbs_takes_no_other(folder: Path, tmp_path: Path) -> None:
     write_vdb(folder / "ball_2.vdb", blob(12.0, ("temperature", "flames")))
     data = dataset(folder, tmp_path, look="smoke_fire")
-    assert data.capture.medium(data.capture.frames[1]).empty and not data.capture.medium(data.capture.frames[0]).empty
+    recording = recorded(data)
+    assert recording.capture.medium(recording.capture.frames[1]).empty and not recording.capture.medium(recording.capture.frames[0]).empty
 
 
 def test_a_look_whose_grids_are_missing(folder: Path, tmp_path: Path) -> None:
@@ -127,12 +130,18 @@ def test_grids_far_from_the_worlds_origin_are_still_told_apart() -> None:
 # ---------------------------------------------------------------- time and starting points
 
 
+def times(data: Dataset) -> list[torch.Tensor]:
+    """Of the training views' frames."""
+    assert isinstance(data.train, FrameViews)
+    return data.train.times
+
+
 def test_a_gap_in_the_numbers_is_a_gap_in_time(folder: Path, tmp_path: Path) -> None:
     write_vdb(folder / "ball_5.vdb", blob(16.0))
     data = dataset(folder, tmp_path)
-    assert [float(t) for t in data.test.times] == [0.0, 0.25, 1.0]
-    assert [float(t) for t in dataset(folder, tmp_path, frames="2:5:3").train.times] == [0.0, 1.0]
-    assert [float(t) for t in dataset(folder, tmp_path, frames="2:4").train.times] == [0.0]
+    assert [float(t) for t in recorded(data).test.times] == [0.0, 0.25, 1.0]
+    assert [float(t) for t in times(dataset(folder, tmp_path, frames="2:5:3"))] == [0.0, 1.0]
+    assert [float(t) for t in times(dataset(folder, tmp_path, frames="2:4"))] == [0.0]
 
 
 def test_more_starting_points_than_were_kept_are_distinct(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,15 +175,17 @@ def test_two_runs_that_render_the_same_frame_do_not_disturb_each_other(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = dataset(folder, tmp_path)
-    image = data.capture.image(data.folder, data.capture.frames[0], 0)
+    recording = recorded(data)
+    image = recording.capture.image(recording.folder, recording.capture.frames[0], 0)
     before = os.stat(image).st_ino
-    data.capture._take_frame(data.folder, data.capture.frames[0])  # as the slower one of two does
+    recording.capture._take_frame(recording.folder, recording.capture.frames[0])  # as the slower one of two does
     assert os.stat(image).st_ino == before
-    assert not list(data.folder.glob(".*"))
+    assert not list(recording.folder.glob(".*"))
 
 
 def test_a_damaged_image_says_what_to_do(folder: Path, tmp_path: Path) -> None:
     data = dataset(folder, tmp_path)
-    data.capture.image(data.folder, data.capture.frames[1], 0).write_bytes(b"")
+    recording = recorded(data)
+    recording.capture.image(recording.folder, recording.capture.frames[1], 0).write_bytes(b"")
     with pytest.raises(DataError, match=r"cam_00\.exr: file is empty.*; delete the folder .*frame_00002 to render the frame again"):
         data.train.pixels(1)

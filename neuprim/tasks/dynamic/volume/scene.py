@@ -18,7 +18,7 @@ from neuprim.core.io.vdb import VdbFrame, sequence
 from neuprim.core.task import SceneContext
 from neuprim.tasks.dynamic.simulation import simulate
 from neuprim.tasks.dynamic.volume.capture import Capture
-from neuprim.tasks.dynamic.volume.dataset import VolumeDataset
+from neuprim.tasks.dynamic.volume.dataset import volume_dataset
 from neuprim.tasks.dynamic.volume.grids import GridReader, find_grids
 from neuprim.tasks.dynamic.volume.looks import changed, named_look
 from neuprim.tasks.dynamic.volume.normalise import Normalisation
@@ -42,7 +42,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     asked, name, source, capture, held_out = _prepare(settings, context)
     rendered = capture.take(context.cache_dir, context.progress)
     up = torch.tensor(AXES[asked.up], dtype=torch.float64)
-    return VolumeDataset(name, source, capture, rendered, held_out, up, asked.train_every)
+    return volume_dataset(name, source, capture, rendered, held_out, up, asked.train_every)
 
 
 def load_volume(settings: Mapping[str, Any], context: SceneContext) -> CaptureSource:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -77,9 +77,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     folder = generate(checked(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
     from neuprim.tasks.static.datasets import blender
 
-    dataset = blender.load({"path": str(folder)}, context)
-    dataset.name, dataset.data_source = "solids", "generated"
-    return dataset
+    return replace(blender.load({"path": str(folder)}, context), name="solids", data_source="generated")
 
 
 def generate(settings: SolidsSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None) -> Path:

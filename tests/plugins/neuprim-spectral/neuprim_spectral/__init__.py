@@ -8,9 +8,9 @@ from neuprim.core.extensions import LossExtension
 from neuprim.core.task import SceneSpec, TaskSpec
 from neuprim_spectral.bands import BANDS, SHIFT, display
 from neuprim_spectral.fields import ShiftedSpectrum, TwoScales
-from neuprim_spectral.files import Files
+from neuprim_spectral.files import files
 from neuprim_spectral.loss import spectral_loss
-from neuprim_spectral.scene import Ball
+from neuprim_spectral.scene import ball
 
 _HELP = "weight of the angle between spectra in the loss, 0 to 1"
 _SHARE = Annotated[float, Range(0, 1)]
@@ -35,8 +35,8 @@ TASK = TaskSpec(
     summary="Five bands of light from blue to near infrared",
     config_package="neuprim_spectral.conf",
     scenes=(
-        SceneSpec("ball", "a ball of three belts, made on the spot", lambda settings, context: Ball(**settings)),
-        SceneSpec("files", "EXR or .npy images of five bands, and cameras.json", lambda settings, context: Files(**settings)),
+        SceneSpec("ball", "a ball of three belts, made on the spot", lambda settings, context: ball(**settings)),
+        SceneSpec("files", "EXR or .npy images of five bands, and cameras.json", lambda settings, context: files(**settings)),
     ),
     build=_build,
     loss=lambda settings: spectral_loss(settings["options"]["angle"]),
@@ -45,7 +45,7 @@ TASK = TaskSpec(
     options={"angle": (0.2, _HELP, _SHARE)},
     uses=(),
     fields={"TwoScales": TwoScales, "ShiftedSpectrum": ShiftedSpectrum},
-    example=lambda: Ball(size=12, train_views=5, test_views=2),
+    example=lambda: ball(size=12, train_views=5, test_views=2),
     channels=BANDS,
     display=display,
 )

@@ -134,7 +134,7 @@ def test_its_exporter_and_inspector(package: Path, tmp_path: Path, capsys: pytes
     assert call(*table, *advice, "most=3", "--out", tmp_path / "a.json") == 0
     assert len(json.loads((tmp_path / "a.json").read_text())) == 3
     for word, text in (
-        ("digits=x", "digits=x: expected a whole number from 0 to 12"),
+        ("digits=x", "digits=x: expected a whole number from 0 to 12, or null"),
         ("digts=3", "digts: no such option of --format spectra; did you mean 'digits'?"),
         ("wavelength-shift=0:1", "--wavelength-shift 0:1: 60 values; expected one value"),
     ):
@@ -213,7 +213,7 @@ def test_conformance_finds_it(module: str, old: str, new: str, check: str, text:
 
 
 def test_a_package_that_raises_on_import_breaks_itself_alone(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    install_spectral(site, {"__init__": ("from neuprim.core.choices", 'raise RuntimeError("no licence")\nfrom neuprim.core.choices')})
+    install_spectral(site, {"__init__": ("from neuprim.core.checked", 'raise RuntimeError("no licence")\nfrom neuprim.core.checked')})
     assert call("tasks") == 0
     said = capsys.readouterr().out
     assert said.count("BROKEN") == said.count("RuntimeError: no licence") == 4, "task, loss, exporter and inspector"

@@ -227,7 +227,7 @@ def test_a_light_network_refuses_a_wrong_start_value_in_one_line() -> None:
     from neuprim.tasks.relight.colour import LightNetwork
 
     for value in ("abc", None, float("nan"), True):
-        with pytest.raises(ConfigError, match=r"model\.init\.output=.*: expected a number"):
+        with pytest.raises(ConfigError, match=r"model\.init\.output=.*: expected a finite number"):
             initial_model(CosineDensity(1), LightNetwork(2), tiny.two_primitives(), ModelSettings(primitives=4, init={"output": value}), 0)
 
 

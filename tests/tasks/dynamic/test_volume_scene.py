@@ -169,7 +169,7 @@ def test_the_files_extinction_on_a_lattice(folder: Path, tmp_path: Path) -> None
         ({"frames": "9-11"}, r"scene\.frames=9-11: expected all, FIRST:LAST or FIRST:LAST:STEP"),
         ({"frames": "11:9"}, r"scene\.frames=11:9: expected"),
         ({"look": "smok_fire"}, r"smok_fire.*'smoke_fire'"),
-        ({"optics": {"extinktion": 1}}, r"scene\.optics\.extinktion: no such setting.*'extinction'"),
+        ({"optics": {"extinktion": 1}}, r"scene\.optics\.extinktion: no such setting; did you mean 'scene\.optics\.extinction'"),
         ({"optics": {"extinction": -1.0}}, r"scene\.optics\.extinction=-1\.0: expected a number of at least 0"),
         ({"optics": {"extinction": "much"}}, r"scene\.optics\.extinction=much"),
         ({"grids": {"smoke": "density"}}, r"scene\.grids\.smoke: no such setting; valid: scene\.grids\.color, "),

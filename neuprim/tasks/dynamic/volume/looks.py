@@ -9,6 +9,7 @@ from typing import Any
 from neuprim.core.checked import hints_of, refuse_unknown
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.tasks.dynamic.volume.optics import Light, Look
+from neuprim.tasks.dynamic.volume.settings import Axis
 
 __all__ = ["EMBERGEN_FIRE", "LOOKS", "changed", "named_look"]
 
@@ -75,7 +76,7 @@ LOOKS = {
 }
 
 
-def named_look(name: str, up: str = "z") -> Look:
+def named_look(name: str, up: Axis = "z") -> Look:
     """The preset of that name, for sequences with this up axis."""
     if name not in LOOKS:
         raise ConfigError(f"scene.look={name}: no such look{nearest(name, LOOKS)}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from scipy import ndimage
@@ -17,7 +17,7 @@ from neuprim.tasks.dynamic.volume.blackbody import black_body_rgb
 from neuprim.tasks.dynamic.volume.medium import Medium
 from neuprim.tasks.dynamic.volume.normalise import Normalisation
 from neuprim.tasks.dynamic.volume.rig import AXES
-from neuprim.tasks.dynamic.volume.settings import GRIDS, Meaning
+from neuprim.tasks.dynamic.volume.settings import GRIDS, Axis, Meaning
 from neuprim.tasks.dynamic.volume.transmittance import transmittance
 
 __all__ = ["Light", "Look", "medium_of"]
@@ -28,6 +28,11 @@ Coordinate = Annotated[float, Unbounded("any direction, of any length")]
 Level = Annotated[float, Unbounded("values of a grid, in whatever unit its files have")]
 Kelvin = Annotated[float, Range(above=0, at_most=1e5)]
 Direction = Annotated[tuple[Coordinate, Coordinate, Coordinate], Accepts(any, "three numbers that are not all 0, as [0, 0, 1]")]
+
+
+def _absorbing(names: tuple[str, ...]) -> bool:
+    return bool(names) and set(names) <= set(GRIDS)
+
 
 _STEPS = 1024
 """Entries of the table of black bodies over a look's range of temperatures; linear between them."""
@@ -82,7 +87,7 @@ class Look:
     """
 
     extinction_grids: Annotated[
-        tuple[Meaning, ...], Accepts(bool, f"a list of {', '.join(GRIDS)} (scene.grids says which grid that is)")
+        tuple[str, ...], Accepts(_absorbing, f"a list of {', '.join(GRIDS)} (scene.grids says which grid that is)")
     ] = (
         "density",
         "temperature",
@@ -101,7 +106,7 @@ class Look:
     flame_extinction: NotNegative = 0.0
     color_grid: Meaning | None = None
     gradient: Annotated[tuple[RGB, ...], Accepts(bool, "colours from bottom to top, as [[1, 0, 0], [0, 0, 1]]")] | None = None
-    up: Literal["y", "z"] = "z"
+    up: Axis = "z"
 
     def __post_init__(self) -> None:
         verify(self, "scene.optics")
@@ -111,7 +116,7 @@ class Look:
         """Names of all grids that the look reads where a file has them."""
         return tuple(dict.fromkeys(n for n in (*self.extinction_grids, self.flame_grid, self.color_grid) if n))
 
-    def turned(self, up: str) -> Look:
+    def turned(self, up: Axis) -> Look:
         """The same look for sequences whose up axis is ``up``; the light turns along."""
         if up == self.up or up not in AXES or self.light is None:
             return replace(self, up=up)

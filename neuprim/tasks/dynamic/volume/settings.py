@@ -12,7 +12,10 @@ from neuprim.core.checked import Accepts, Range, converted, text, verify
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.tasks.dynamic.simulation.generate import TIMESTEPS, Resolution
 
-__all__ = ["GRIDS", "VolumeSettings", "choose_frames"]
+__all__ = ["GRIDS", "Axis", "Meaning", "VolumeSettings", "choose_frames"]
+
+Axis = Literal["y", "z"]
+"""The upward one of a sequence's files."""
 
 Meaning = Literal["density", "temperature", "flames", "color"]
 
@@ -64,7 +67,7 @@ class VolumeSettings:
     field_of_view: Annotated[float, Range(1, 120, says="degrees from 1 to 120")] = 27.0
     samples: Annotated[int, Range(1, 16)] = 2
     train_every: Annotated[int, Range(1, 1000)] = 1
-    up: Literal["y", "z"] = "z"
+    up: Axis = "z"
 
     def __post_init__(self) -> None:
         verify(self, "scene")

@@ -10,18 +10,24 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import math
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import make_dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from kornia.metrics import ssim
 
+from neuprim.core.checked import checked
+from neuprim.core.errors import ConfigError
 from neuprim.core.io.ply import read_ply, write_ply
+from neuprim.core.settings import RenderSettings
 from neuprim.core.train.ssim_cpu import photometric_fused
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shapes import build
@@ -99,12 +105,57 @@ def point_files(rounds: int, folder: Path) -> None:
         )
 
 
-def imports(rounds: int) -> None:
-    if importlib.util.find_spec("pydantic") is None:
+def started(rounds: int, work: dict[str, list[str]]) -> dict[str, float]:
+    """Seconds that processes take beyond an empty one."""
+    words = {"": ["-c", ""], **work}
+    seconds = best(rounds, {name: lambda w=w: subprocess.run([sys.executable, *w], check=True, stdout=subprocess.DEVNULL) for name, w in words.items()})  # fmt: skip
+    return {name: seconds[name] - seconds[""] for name in work}
+
+
+def settings(rounds: int) -> None:
+    """Start-up, a check of every field, and what lax and strict pydantic make of what the tests of the settings demand."""
+    work = {"neuprim --help": ["-m", "neuprim", "--help"], "settings": ["-c", "import neuprim.core.settings"]}
+    if importlib.util.find_spec("pydantic") is not None:
+        work["pydantic"] = ["-c", "from pydantic import TypeAdapter; from pydantic.dataclasses import dataclass"]
+    print("seconds to start: " + ", ".join(f"{name} {1e3 * s:.0f} ms" for name, s in started(rounds, work).items()))
+    own = RenderSettings()
+    made = best(rounds, {"": lambda: [replace(own, near=0.02) for _ in range(1000)]})
+    print(f"a check of the {len(vars(own))} fields of RenderSettings: {1e3 * made['']:.0f} microseconds")
+    if "pydantic" not in work:
         print("pydantic: not installed")
         return
-    seconds = best(rounds, {"": lambda: subprocess.run([sys.executable, "-c", ""], check=True), "pydantic": lambda: subprocess.run([sys.executable, "-c", "import pydantic; pydantic.BaseModel"], check=True)})  # fmt: skip
-    print(f"importing pydantic: {(seconds['pydantic'] - seconds['']) * 1e3:.0f} ms")
+    from pydantic import ConfigDict, TypeAdapter, ValidationError
+    from pydantic.dataclasses import dataclass as pydantic_dataclass
+
+    fields: list[tuple[str, type, Any]] = [("samples", int, 1), ("near", float, 0.01), ("depth", bool, False)]
+
+    def pydantic(strict: bool) -> Any:
+        config = ConfigDict(extra="forbid", strict=strict, allow_inf_nan=False)
+        return pydantic_dataclass(make_dataclass("Made", fields), config=config)
+
+    lax, strict, plain = pydantic(False), pydantic(True), TypeAdapter(make_dataclass("Plain", fields))
+
+    def verdict(make: Callable[[], Any]) -> str:
+        try:
+            return repr(make())
+        except ValidationError as error:
+            return f"refused in {len(str(error).splitlines())} lines"
+
+    def ours(values: dict[str, Any]) -> str:
+        try:
+            made = checked(RenderSettings, values, "renderer")
+            return ", ".join(f"{key}={getattr(made, key)!r}" for key in values)
+        except ConfigError as error:
+            return str(error)
+
+    for values in ({"samples": True}, {"samples": 4.0}, {"near": "1e-3"}, {"near": math.nan}, {"depth": "yes"}, {"sampels": 4}):
+        found = {
+            "here": ours(values),
+            "lax": verdict(lambda v=values: lax(**v)),
+            "strict": verdict(lambda v=values: strict(**v)),
+            "a dataclass that does not know pydantic": verdict(lambda v=values: plain.validate_python(v)),
+        }
+        print(f"  {values}: " + "; ".join(f"{name}: {text}" for name, text in found.items()))
 
 
 def main() -> None:
@@ -116,7 +167,7 @@ def main() -> None:
     similarity(args.rounds)
     with tempfile.TemporaryDirectory() as folder:
         point_files(args.rounds, Path(folder))
-    imports(args.rounds)
+    settings(args.rounds)
 
 
 if __name__ == "__main__":

@@ -32,9 +32,12 @@ from tables import README, ROOT, between_markers
 
 from neuprim.config import compose
 from neuprim.core.compute.threads import core_count
+from neuprim.core.data import Dataset
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import complete, start
 from neuprim.runs.measure import draw
+from neuprim.tasks.dynamic.judging import recording_of
+from neuprim.tasks.dynamic.volume.dataset import Recording
 
 RESULTS = Path(__file__).parent / "results" / "dynamic_quality.json"
 SIZE = 96
@@ -67,20 +70,27 @@ def shuffled_times(trainer: Trainer) -> None:
     views.times = [views.times[i] for i in order]
 
 
+def recorded_in(trainer: Trainer) -> tuple[Dataset, Recording]:
+    """The data set, and the sequence that it was rendered from."""
+    recording = recording_of(trainer.dataset)
+    assert recording is not None
+    return trainer.dataset, recording
+
+
 def between_frames(trainer: Trainer) -> dict[str, float]:
     """PSNR inside the mask of test frames that were learned from and of those between them, and the largest step between frames.
 
     The steps: the image at every quarter of a frame's interval. ``largest_step`` is the largest mean absolute difference of two such
     neighbours over that of the two whole frames around them; smooth motion gives about 1/4, a jump 1 or more.
     """
-    data: Any = trainer.dataset
-    frames, every = len(data.test.times), data.every
+    data, recording = recorded_in(trainer)
+    frames, every = len(recording.test.times), recording.every
     errors: dict[bool, list[float]] = {True: [], False: []}
     worst = 0.0
     for index in range(len(data.test)):
         view, t = data.test.view(index), index % frames
         rendered, truth = draw(trainer.model, view, trainer.renderer, data.background), data.test.pixels(index).over(data.background)
-        error = (rendered - truth)[data.mask(index)].double().square().mean().item()
+        error = (rendered - truth)[recording.track(index)].double().square().mean().item()
         errors[t % every == 0].append(-10 * math.log10(error))
         if t + 1 < frames and index < frames:
             after = data.test.view(index + 1)
@@ -94,12 +104,12 @@ def between_frames(trainer: Trainer) -> dict[str, float]:
 
 def repeat_neighbour(trainer: Trainer) -> float:
     """PSNR inside the mask of showing, for each frame that was not learned, the real frame before it: what interpolation must beat."""
-    data: Any = trainer.dataset
-    frames, values = len(data.test.times), []
+    data, recording = recorded_in(trainer)
+    frames, every, values = len(recording.test.times), recording.every, []
     for index in range(len(data.test)):
-        if (index % frames) % data.every:
-            pair = [data.test.pixels(i).over(data.background) for i in (index - (index % frames) % data.every, index)]
-            error = (pair[0] - pair[1])[data.mask(index)].double().square().mean().item()
+        if (index % frames) % every:
+            pair = [data.test.pixels(i).over(data.background) for i in (index - (index % frames) % every, index)]
+            error = (pair[0] - pair[1])[recording.track(index)].double().square().mean().item()
             values.append(-10 * math.log10(error))
     return statistics.mean(values)
 

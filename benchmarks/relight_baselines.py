@@ -12,9 +12,11 @@ import time
 
 from tables import ROOT, Table, between_markers
 
+from neuprim.core.data.views import ImageViews
 from neuprim.core.io.files import cache_directory
 from neuprim.core.task import SceneContext
-from neuprim.tasks.relight.data import bright
+from neuprim.tasks.relight.data import bright, lighting_of
+from neuprim.tasks.relight.judging import baselines
 from neuprim.tasks.relight.lit import load
 from neuprim.tasks.relight.lit.generate import LitSettings
 from neuprim.tasks.relight.measure import CLASSES, class_shares
@@ -35,15 +37,17 @@ def main() -> None:
     there = (cache / f"lit_solids-{LitSettings().key()}").is_dir()
     start = time.perf_counter()
     dataset = load({}, SceneContext(seed=0, cache_dir=cache))
+    pixel_classes = lighting_of(dataset).classes
+    assert isinstance(dataset.train, ImageViews) and pixel_classes is not None
     print(
         f"{'read' if there else 'drawn'} in {time.perf_counter() - start:.1f} s; {bright(dataset.train, 'lit_solids'):.4f} is the exposure\n"
     )
     classes = CLASSES[1:]
     table = Table("test split of `lit_solids`", "PSNR linear", "PSNR display", *(c.replace("_", " ") for c in classes))
-    for key, numbers in dataset.baselines().items():
+    for key, numbers in baselines(dataset).items():
         pooled = [f"psnr_pooled_{c}" for c in classes]
         table.row(NAMES[key], *(f"{numbers[k]:.1f}" for k in ("psnr_linear_clamped", "psnr_display", *pooled)))
-    shares = class_shares([dataset.classes(i) for i in range(len(dataset.test))])
+    shares = class_shares([pixel_classes(i) for i in range(len(dataset.test))])
     table.row("share of the pixels that show matter", "", "", *(f"{shares[c]:.1f} %" for c in classes))
     if args.record:
         between_markers(PAGE, "relight-baselines", str(table))

@@ -33,6 +33,7 @@ from neuprim.config import compose
 from neuprim.core.compute.threads import core_count
 from neuprim.core.data import Dataset
 from neuprim.runs.fit import Fitted, compile_kernels, complete, start
+from neuprim.tasks.relight.judging import baselines
 
 RESULTS = Path(__file__).parent / "results" / "relight_quality.json"
 PLAIN = "model.colour.visibility=none"
@@ -114,7 +115,7 @@ def main() -> None:
         known = {f"{part}: {e['name']}": e["ms_a_step"] / 1e3 for part in wanted for e in recorded.get(part, [])} if args.go_on else {}
         names = {f"{part}: {name}": words for (part, name), words in everything.items()}
         paces = {**pace({name: words for name, words in names.items() if name not in known}, dataset), **known}
-        recorded |= {"cpu": cpu_name(), "cores": core_count(), "seconds": args.seconds, "baselines": dataset.baselines()}  # type: ignore[attr-defined]
+        recorded |= {"cpu": cpu_name(), "cores": core_count(), "seconds": args.seconds, "baselines": baselines(dataset)}
         for part, own in wanted.items():
             recorded[part] = [e for e in recorded.get(part, []) if args.go_on or e["name"] not in own]
         for seed in range(args.seeds):

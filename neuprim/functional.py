@@ -173,10 +173,7 @@ def _settings(settings: dict[str, Any]) -> RenderSettings:
     for name in settings:
         if name not in names:
             raise ConfigError(f"rasterize: unknown setting {name!r}{nearest(name, names)}")
-    try:
-        knobs = RenderSettings(**settings)
-    except TypeError as error:
-        raise ConfigError(f"rasterize: settings {settings}: {error}") from error
+    knobs = RenderSettings(**settings)
     backends.check_name(knobs.backend)
     return knobs
 

@@ -18,6 +18,7 @@ __all__ = ["MOVED", "install"]
 
 MOVED = {
     "neuprim.core.camera_file": "neuprim.core.cameras.file",
+    "neuprim.core.choices": "neuprim.core.checked",
     "neuprim.core.cosine": "neuprim.core.model.densities.cosine",
     "neuprim.core.datasets": "neuprim.core.data",
     "neuprim.core.datasets.common": "neuprim.core.data.common",

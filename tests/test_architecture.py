@@ -60,23 +60,23 @@ CORE: dict[str, set[str]] = {
     "errors": set(),
     "notices": set(),
     "io": {"errors"},
-    "settings": {"errors"},
-    "choices": {"errors"},
+    "checked": {"errors"},
+    "settings": {"checked"},
     "metrics": {"errors"},
     "cameras": {"errors"},
     "compute": {"io"},
     "environment": {"errors", "io"},
-    "model": {"cameras", "compute", "errors", "settings"},
+    "model": {"cameras", "checked", "compute", "errors", "settings"},
     "volumes": {"compute", "errors", "model"},
-    "data": {"cameras", "compute", "errors", "io", "model", "volumes"},
-    "task": {"data", "environment", "model", "volumes"},
+    "data": {"cameras", "checked", "compute", "errors", "io", "model", "volumes"},
+    "task": {"checked", "data", "environment", "model", "volumes"},
     "conditions": {"errors", "model"},
     "channels": {"data", "errors", "io", "task"},
     "checkpoint": {"errors", "io", "model", "task"},
-    "extensions": {"channels", "conditions", "data", "errors", "model", "settings", "task", "volumes"},
+    "extensions": {"channels", "checked", "conditions", "data", "errors", "model", "settings", "task", "volumes"},
     "render": {"cameras", "compute", "errors", "metrics", "model", "settings"},
-    "train": {"compute", "data", "errors", "model", "render", "task"},
-    "uses": {"errors", "extensions", "task", "train"},
+    "train": {"checked", "compute", "data", "errors", "model", "render", "task"},
+    "uses": {"checked", "errors", "extensions", "task", "train"},
 }
 """The same inside ``core``, folders and single files alike."""
 
@@ -171,6 +171,18 @@ def test_nothing_imports_a_built_in_task_by_name() -> None:
 def test_nobody_imports_the_command_line() -> None:
     outside = [f for f in FILES if f.name != "__main__.py" and not f.is_relative_to(ROOT / "cli")]
     wrong = [str(f.relative_to(ROOT)) for f in outside if any(within(n, "neuprim.cli") for n in imported(f))]
+    assert wrong == []
+
+
+def test_runs_do_not_print() -> None:
+    """What happens is told as events; ``print`` as a default says it past them."""
+    wrong = [
+        f"{f.relative_to(ROOT)}:{node.lineno}"
+        for f in FILES
+        if f.is_relative_to(ROOT / "runs")
+        for node in ast.walk(ast.parse(f.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Name) and node.id == "print"
+    ]
     assert wrong == []
 
 

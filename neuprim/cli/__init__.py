@@ -289,6 +289,7 @@ def _import(args: argparse.Namespace) -> int:
 
 def _inspect(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
+    from neuprim.cli.progress import print_notes
     from neuprim.plugins.inspect import ViewOptions, corners
     from neuprim.runs.inspect import Request, inspect_run
 
@@ -296,7 +297,7 @@ def _inspect(args: argparse.Namespace) -> int:
     names += ["primitives"] * args.primitives + ["primitive"] * (args.primitive is not None)
     options, box = ViewOptions(tuple(args.level), args.primitive), None if args.box is None else corners(args.box)
     more = {"options": options, "against": args.against, "out": args.out, "size": args.size, "up": args.up, "overwrite": args.force}
-    for path in inspect_run(Request(run_dir, names or ["volume"], args.conditions, args.grid, box, **more)):
+    for path in inspect_run(Request(run_dir, names or ["volume"], args.conditions, args.grid, box, **more), print_notes):
         print(path)
     return 0
 

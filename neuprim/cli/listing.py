@@ -80,7 +80,7 @@ def _task(spec: TaskSpec, added: list[PluginReport[SceneExtension]]) -> list[str
 
 def _options(spec: TaskSpec | LossExtension) -> list[str]:
     """What may stand under ``task.options``, with defaults."""
-    return [f"task.options.{name}={default}  {text}" for name, (default, text) in spec.options.items()]
+    return [f"task.options.{name}={option[0]}  {option[1]}" for name, option in spec.options.items()]
 
 
 def _scene(spec: TaskSpec, report: PluginReport[SceneExtension]) -> tuple[str, str]:

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from neuprim.runs.events import Evaluated, Event, Finishing, Note, Preparing, Step
 
-__all__ = ["DrawProgress", "LineProgress", "RunProgress"]
+__all__ = ["DrawProgress", "LineProgress", "RunProgress", "print_notes"]
 
 
 class _Shown:
@@ -132,3 +132,9 @@ class LineProgress:
         if text != self.last[0] or fraction >= self.last[1] + 0.25:
             self.last = (text, fraction)
             self.console.print(f"{text}, {fraction:.0%}" if fraction > 0 else text, highlight=False, soft_wrap=True)
+
+
+def print_notes(event: Event) -> None:
+    """On standard output, for commands whose notes are what they were asked for."""
+    if isinstance(event, Note):
+        print(event.text)

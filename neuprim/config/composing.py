@@ -18,7 +18,8 @@ from neuprim.config.outputs import output_directory
 from neuprim.config.overrides import Assignment, expand_sweep, parse, sweep_names, swept_keys
 from neuprim.config.record import RunConfig, RunSettings
 from neuprim.config.resuming import not_installed
-from neuprim.config.schema import REQUIRED, build, defaults, is_free, like, setting_names
+from neuprim.config.schema import REQUIRED, defaults, is_free, like, setting_names
+from neuprim.core.checked import checked, shown
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.uses import build_settings
 from neuprim.plugins.blame import blamed
@@ -264,7 +265,7 @@ def _plain(node: Any, resolve: bool = True, place: str = "configuration") -> dic
 
 
 def _settings(full: Mapping[str, Any]) -> RunSettings:
-    return build(RunSettings, {k: v for k, v in full.items() if k not in ("scene", "task")})
+    return checked(RunSettings, {k: v for k, v in full.items() if k not in ("scene", "task")})
 
 
 def _check_key(assignment: Assignment, base: Mapping[str, Any], scene_name: str) -> None:
@@ -309,7 +310,7 @@ def _scene(node: Mapping[str, Any], declared: Mapping[str, Any], paths: Sequence
         where = f"scene.{key}"
         if key in paths and value is not None and value != REQUIRED:
             if not isinstance(value, (str, int)) or isinstance(value, bool) or not str(value).strip():
-                raise ConfigError(f"{where}={value!r}: expected a path (quote it: {where}='...')")
+                raise ConfigError(f"{where}={shown(value)}: expected a path (quote it: {where}='...')")
             value = str(Path(str(value)).expanduser().absolute())
         if declared[key] == REQUIRED and (value is None or value == REQUIRED):
             expected = f"expected a directory or file, as {where}=PATH" if key in paths else f"expected {where}=VALUE"

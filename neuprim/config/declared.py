@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from neuprim.config.overrides import Assignment
 from neuprim.config.record import RunSettings
-from neuprim.config.schema import like, setting_names
+from neuprim.config.schema import setting_names
+from neuprim.core.checked import Option, converted, option_type, refuse_unknown, shown
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.uses import OPTIONAL
@@ -18,14 +19,14 @@ if TYPE_CHECKING:
 
 __all__ = ["check_names", "check_preset", "check_typed", "complete_options", "options_of", "unused"]
 
-Options = Mapping[str, tuple[Any, str]]
+Options = Mapping[str, Option]
 
 
 # ---------------------------------------------------------------- task.options
 
 
 def options_of(spec: TaskSpec, loss: LossExtension | None) -> Options:
-    """Name -> (default, help) of all that may stand under ``task.options``: the task's own and those of the loss chosen.
+    """Name -> option of all that may stand under ``task.options``: the task's own and those of the loss chosen.
 
     Raises:
         ConfigError: both have one of the same name, so that it could not be said which is meant.
@@ -41,21 +42,21 @@ def options_of(spec: TaskSpec, loss: LossExtension | None) -> Options:
 
 
 def complete_options(declared: Options, given: Any, owner: str, where: str = "task.options") -> dict[str, Any]:
-    """Every declared option: as given, converted to the type of its default, else the default.
+    """Every declared option: as given, converted to its type, else the default.
 
     Args:
         owner: whose options they are, for messages.
         where: dotted name of the group, for messages.
 
     Raises:
-        ConfigError: no such option, or a value of another type.
+        ConfigError: no such option, or a value that it does not take.
     """
     if not isinstance(given, Mapping):
-        raise ConfigError(f"{where}={'null' if given is None else given}: expected entries, each as {where}.KEY=VALUE")
+        raise ConfigError(f"{where}={shown(given)}: expected entries, each as {where}.KEY=VALUE")
     for key in given:
         if key not in declared:
             raise ConfigError(f"{where}.{key}: {owner} has no such option{_hint(str(key), declared)}")
-    return {key: like(given.get(key, default), default, f"{where}.{key}") for key, (default, _) in declared.items()}
+    return {key: converted(given.get(key, option[0]), option_type(option), f"{where}.{key}") for key, option in declared.items()}
 
 
 def _hint(key: str, declared: Options) -> str:
@@ -123,9 +124,7 @@ def check_names(spec: TaskSpec, settings: RunSettings) -> None:
     if not classes:
         return
     init = {"scale", "points", *(name for cls in classes for name in cls.init_settings)}
-    for key in settings.model.init:
-        if key not in init:
-            raise ConfigError(f"model.init.{key}: no such setting{nearest(key, init)}")
+    refuse_unknown(settings.model.init, init, "model.init")
     try:
         rates = {s.name for s in (*GEOMETRY_SPECS, *(s for cls in classes for s in cls.every_parameter()))}
     except TypeError:  # a field that cannot be made without settings

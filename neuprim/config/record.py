@@ -6,14 +6,15 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
 
-from neuprim.config.schema import build
-from neuprim.core.errors import CheckpointError, ConfigError, nearest
-from neuprim.core.render.backends import check_name
+from neuprim.core.checked import Range, checked, refuse_unknown, verify
+from neuprim.core.errors import CheckpointError, ConfigError
+from neuprim.core.render import backends
 from neuprim.core.settings import RenderSettings
+from neuprim.core.train import population
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.uses import OPTIONAL
 from neuprim.plugins.names import split
@@ -33,14 +34,13 @@ class RunSettings:
     train: TrainSettings = field(default_factory=TrainSettings)
     renderer: RenderSettings = field(default_factory=RenderSettings)
     output_dir: str | None = None
-    seed: int = 0
+    seed: Annotated[int, Range(0, 2**63 - 1, says="a whole number from 0 to 2^63 - 1")] = 0
     resume: bool = False
 
-    def check(self) -> None:
-        """Raises ConfigError for a value out of range."""
-        if not 0 <= self.seed < 2**63:
-            raise ConfigError(f"seed={self.seed}: expected a whole number from 0 to 2^63 - 1")
-        check_name(self.renderer.backend)
+    def __post_init__(self) -> None:
+        verify(self, "")
+        backends.check_name(self.renderer.backend)
+        population.check_name(self.train.population.strategy)
 
 
 @dataclass
@@ -123,11 +123,9 @@ class RunConfig:
     @classmethod
     def _from_dict(cls, data: Mapping[str, Any]) -> RunConfig:
         known = ["task", "scene", "preset", *(f.name for f in dataclasses.fields(RunSettings)), "overrides", "non_default", "made_by"]
-        for key in data:
-            if key not in known:
-                raise ConfigError(f"{key}: no such setting" + nearest(str(key), known))
+        refuse_unknown(data, known, "")
         task, scene = _node(data, "task"), _node(data, "scene")
-        common = build(RunSettings, {f.name: data[f.name] for f in dataclasses.fields(RunSettings) if f.name in data})
+        common = checked(RunSettings, {f.name: data[f.name] for f in dataclasses.fields(RunSettings) if f.name in data})
         if common.output_dir is None:
             raise ConfigError("output_dir: missing; expected a directory")
         overrides, non_default = data.get("overrides", []), data.get("non_default", {})

@@ -162,4 +162,4 @@ def check_clear_errors(t: Subject) -> None:
             t.require("no_such_setting" in text, where, repr(text), "a message that names the setting")
             t.require("\n" not in text, where, repr(text), "a message of one line")
             continue
-        t.require(False, where, "it was taken", "ConfigError (neuprim.core.choices.choose does it)")
+        t.require(False, where, "it was taken", "ConfigError (neuprim.core.checked.choose does it)")

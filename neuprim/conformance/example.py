@@ -15,7 +15,7 @@ from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.backends import ORACLE
 
-__all__ = ["Example", "between", "ring_camera", "sample"]
+__all__ = ["between", "example", "ring_camera", "sample"]
 
 WIDTH, HEIGHT = 10, 9  # below the window of SSIM, which then costs nothing
 DISTANCE = 2.5
@@ -60,28 +60,32 @@ class _Views(ViewSet):
         return self.images[index]
 
 
-class Example(Dataset):
+def example(conditions: tuple[ConditionSpec, ...], channels: int = 3) -> Dataset:
     """Six training and two test views of 10 x 9 pixels, background grey, sRGB; conditions and channels as the task declares them."""
+    generator = torch.Generator().manual_seed(7)
+    ring = [ring_camera(1.1 * i, 0.6 * math.sin(2.0 * i)) for i in range(8)]
+    train, test = (_Views(n, c, conditions, generator, channels) for n, c in (("train", ring[:6]), ("test", ring[6:])))
 
-    def __init__(self, conditions: tuple[ConditionSpec, ...], channels: int = 3) -> None:
-        generator = torch.Generator().manual_seed(7)
-        self.name, self.channels, self.color_space, self.data_source = "conformance example", channels, "srgb", "generated"
-        ring = [ring_camera(1.1 * i, 0.6 * math.sin(2.0 * i)) for i in range(8)]
-        self.train, self.test = (_Views(n, c, conditions, generator, channels) for n, c in (("train", ring[:6]), ("test", ring[6:])))
-        self.conditions = conditions
-        self.extent = camera_extent(ring[:6])
-        self.background, self.random_background, self.downsampling = torch.full((channels,), 0.3), False, "none"
-        self.up, self.center = torch.tensor([0.0, 0.0, 1.0]), torch.zeros(3)
-        self.bounds = torch.tensor([[-0.8] * 3, [0.8] * 3])
-
-    def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
+    def start(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
         means = 1.4 * (torch.rand(count, 3, generator=generator) - 0.5)
         found = {}
-        for spec in self.conditions:
+        for spec in conditions:
             if spec.shape == ():
                 low, high = between(spec)
                 found[spec.name] = low + (high - low) * torch.rand(count, generator=generator)
-        return PointCloud(means, 0.2 + 0.6 * torch.rand(count, self.channels, generator=generator), found)
+        return PointCloud(means, 0.2 + 0.6 * torch.rand(count, channels, generator=generator), found)
+
+    return Dataset(
+        name="conformance example",
+        train=train,
+        test=test,
+        start=start,
+        extent=camera_extent(ring[:6]),
+        background=torch.full((channels,), 0.3),
+        channels=channels,
+        data_source="generated",
+        bounds=torch.tensor([[-0.8] * 3, [0.8] * 3]),
+    )
 
 
 def _truth(channels: int) -> Lowered:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neuprim.config import RunSettings, preset_settings, task_choices
-from neuprim.conformance.example import Example
+from neuprim.conformance.example import example
 from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.data import Dataset, View
 from neuprim.core.errors import NonFiniteError
@@ -59,7 +59,7 @@ class Subject:
     def with_channels(self, channels: int) -> Subject:
         """The same on a synthetic data set of so many colour channels."""
         other = copy(self)
-        other.dataset = Example(self.task.conditions, channels)
+        other.dataset = example(self.task.conditions, channels)
         return other
 
     # ------------------------------------------------------------ verdicts
@@ -97,7 +97,7 @@ class Subject:
     @cached_property
     def dataset(self) -> Dataset:
         """The task's own example, or one with the conditions and channels it declares."""
-        return self.task.example() if self.task.example is not None else Example(self.task.conditions, len(self.task.channels) or 3)
+        return self.task.example() if self.task.example is not None else example(self.task.conditions, len(self.task.channels) or 3)
 
     def fields(self) -> tuple[DensityField, ColourField]:
         """Freshly built fields."""

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from neuprim.conformance.subject import Subject
+from neuprim.conformance.subject import ConformanceError, Subject
 from neuprim.core import checkpoint
 from neuprim.core.channels import channels_of
 from neuprim.core.data import Dataset
@@ -20,8 +20,18 @@ from neuprim.core.render import render
 from neuprim.core.task import Supervision
 from neuprim.core.train.trainer import Trainer
 from neuprim.core.uses import loss_settings
+from neuprim.plugins.judging import TaskFault, clips_of, diagnosed, facts_of, judged, mask_of, orbit_of
 
-__all__ = ["check_dataset", "check_determinism", "check_display", "check_learning", "check_loss", "check_resume", "check_save_load"]
+__all__ = [
+    "check_dataset",
+    "check_determinism",
+    "check_display",
+    "check_judging",
+    "check_learning",
+    "check_loss",
+    "check_resume",
+    "check_save_load",
+]
 
 _STEPS = 4  # before the kill, and again after it; the population changes twice in each half
 
@@ -60,6 +70,27 @@ def check_display(t: Subject) -> None:
     apart = torch.cat([channels.display(row[None]) for row in image])
     off = float((shown - apart).abs().max())
     t.require(off < 1e-4, "display of an image", f"{off:.3g} off its rows one by one", "the same, as single primitives have colours too")
+
+
+def check_judging(t: Subject) -> None:
+    """What the task measures, films and keeps of its example is what a run can write down, and its orbit has every condition to draw."""
+    task, data = t.task, t.dataset
+    try:
+        clips_of(task, data)
+        facts_of(task, data)
+        for i in range(len(data.test)):
+            truth = data.test.pixels(i).over(data.background)
+            mask_of(task, data, i)
+            judged(task, data, i, 0.5 * truth, truth)
+        diagnosed(task, data, t.model(torch.float32))
+        around = orbit_of(task, data, 3)
+    except TaskFault as error:  # it says what was found and what was expected
+        raise ConformanceError(f"task {task.name!r}: {t.check}: {error}") from error
+    for view in around:
+        for spec in task.conditions:
+            t.require(
+                spec.name in view.conditions, f"orbit: view {view.name}: condition {spec.name!r}", "none", "one, or it cannot be drawn"
+            )
 
 
 def check_loss(t: Subject) -> None:

@@ -56,10 +56,13 @@ class FormError(NeuprimError):
     """A field handed over tensors that the renderer or the training cannot take; the message names field, method and tensor."""
 
 
-def nearest(name: str, choices: Iterable[str], limit: int = 3) -> str:
-    """``"; did you mean 'a' or 'b'?"`` for the valid names closest to ``name``, or the list of all when none is close."""
+def nearest(name: str, choices: Iterable[str], limit: int = 3, prefix: str = "") -> str:
+    """``"; did you mean 'a' or 'b'?"`` for the valid names closest to ``name``, or the list of all when none is close.
+
+    ``prefix`` is what users type before each of them.
+    """
     options = sorted(set(choices))
     close = difflib.get_close_matches(name, options, n=limit, cutoff=0.5)
     if close:
-        return "; did you mean " + " or ".join(repr(c) for c in close) + "?"
-    return "; valid: " + ", ".join(options) if options else ""
+        return "; did you mean " + " or ".join(repr(prefix + c) for c in close) + "?"
+    return "; valid: " + ", ".join(prefix + o for o in options) if options else ""

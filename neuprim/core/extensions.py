@@ -7,18 +7,18 @@ through the same groups as anybody's.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from torch import Tensor
 
 from neuprim.core.channels import Channels, stored_channels
+from neuprim.core.checked import Option, Range, converted
 from neuprim.core.conditions import export_frames
 from neuprim.core.data import Dataset
-from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.settings import RenderSettings
 from neuprim.core.task import Loss, SceneSpec, TaskSpec
@@ -92,35 +92,21 @@ class ExportJob:
         Raises:
             ConfigError: it is something else.
         """
-        return self._number(name, low, high, f"a number from {low:g} to {high:g}")
+        value: float | None = converted(self.options[name], Annotated[float, Range(low, high)] | None, name)
+        return value
 
     def count(self, name: str, low: int, high: int) -> int | None:
         """As :meth:`number`, a whole one."""
-        value = self._number(name, low, high, f"a whole number from {low} to {high}", whole=True)
-        return None if value is None else int(value)
-
-    def _number(self, name: str, low: float, high: float, expected: str, whole: bool = False) -> float | None:
-        value = self.options[name]
-        if value is None:
-            return None
-        number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-        if not number or not low <= value <= high or (whole and not float(value).is_integer()):
-            raise ConfigError(f"{name}={value}: expected {expected}")
-        return float(value)
+        value: int | None = converted(self.options[name], Annotated[int, Range(low, high)] | None, name)
+        return value
 
     def choice(self, name: str, *offered: str) -> str:
         """An option that is one of those offered; raises as :meth:`number`."""
-        value = self.options[name]
-        if value not in offered:
-            raise ConfigError(f"{name}={value}: expected {' or '.join(offered)}")
-        return str(value)
+        return str(converted(self.options[name], Literal[offered], name))
 
     def flag(self, name: str) -> bool:
         """An option that is true or false; raises as :meth:`number`."""
-        value = self.options[name]
-        if not isinstance(value, bool):
-            raise ConfigError(f"{name}={value}: expected true or false")
-        return value
+        return bool(converted(self.options[name], bool, name))
 
 
 @dataclass(frozen=True)
@@ -187,16 +173,16 @@ class Inspector:
     """A way of showing a density in ``neuprim inspect --show NAME``; group ``neuprim.inspectors``.
 
     Attributes:
-        add: (pyvista plotter, :class:`~neuprim.plugins.inspect.field.FieldFrame`) draws one frame into the plotter; called again with
-            the next frame after the plotter's actors of the last one were removed.
-        shows: "sigma" for the extinction on the frame's grid, drawn a second time from the ground truth where there is one; "model"
+        layers: a :class:`~neuprim.plugins.inspect.field.FieldFrame` -> a list of layers of :mod:`neuprim.plugins.inspect.layers`, which
+            a window, a picture, a film and a page draw; called once per frame and panel.
+        shows: "sigma" for the extinction on the frame's grid, asked a second time with the ground truth where there is one; "model"
             for the primitives themselves; "primitive" for a single one, with a camera of its own; "both" for what needs the truth.
     """
 
     api: int
     name: str
     summary: str
-    add: Callable[[Any, Any], None]
+    layers: Callable[[Any], Sequence[Any]]
     shows: Literal["sigma", "model", "primitive", "both"] = "sigma"
 
 
@@ -221,7 +207,7 @@ class LossExtension:
 
     Attributes:
         make: the settings under ``train``, and this loss's options as "options" -> the loss.
-        options: name -> (default, one line of help), set as ``task.options.NAME`` while the loss is chosen; as
+        options: name -> (default, one line of help), perhaps with a type, set as ``task.options.NAME`` while the loss is chosen; as
             :attr:`~neuprim.core.task.TaskSpec.options`.
         uses: the settings of :data:`neuprim.core.uses.OPTIONAL` under ``train`` that ``make`` reads.
     """
@@ -230,5 +216,5 @@ class LossExtension:
     name: str
     summary: str
     make: Callable[[Mapping[str, Any]], Loss]
-    options: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
+    options: Mapping[str, Option] = field(default_factory=dict)
     uses: tuple[str, ...] = ()

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from neuprim.core.errors import ConfigError
+from neuprim.core.checked import Range, text, verify
 
 __all__ = ["RenderSettings", "SortOrder"]
 
@@ -33,29 +33,16 @@ class RenderSettings:
         threads: worker threads of the cpu backend, 0 for all cores; results are bit-identical for any count.
     """
 
-    backend: str = "auto"
+    backend: Annotated[str, text("auto or the name of a backend")] = "auto"
     sort: SortOrder = "center"
-    samples: int = 1
-    alpha_max: float = 0.99
-    alpha_min: float = 1.0 / 255.0
-    transmittance_min: float = 1e-4
-    near: float = 0.01
-    depth_floor: float = 1e-4
+    samples: Annotated[int, Range(1, 16, says="a whole number of rays per pixel side, 1 to 16")] = 1
+    alpha_max: Annotated[float, Range(above=0, at_most=0.9999)] = 0.99
+    alpha_min: Annotated[float, Range(at_least=0, below=1)] = 1.0 / 255.0
+    transmittance_min: Annotated[float, Range(at_least=0, below=1)] = 1e-4
+    near: Annotated[float, Range(above=0, says="a positive distance")] = 0.01
+    depth_floor: Annotated[float, Range(above=0, below=1)] = 1e-4
     depth: bool = False
-    threads: int = 0
+    threads: Annotated[int, Range(at_least=0, says="0 (all cores) or a positive count")] = 0
 
     def __post_init__(self) -> None:
-        checks = (
-            ("alpha_max", 0.0 < self.alpha_max <= 0.9999, "a number in (0, 0.9999]"),
-            ("alpha_min", 0.0 <= self.alpha_min < 1.0, "a number in [0, 1)"),
-            ("transmittance_min", 0.0 <= self.transmittance_min < 1.0, "a number in [0, 1)"),
-            ("near", self.near > 0.0, "a positive distance"),
-            ("depth_floor", 0.0 < self.depth_floor < 1.0, "a number in (0, 1)"),
-            ("threads", self.threads >= 0, "0 (all cores) or a positive count"),
-            ("sort", self.sort in ("center", "entry"), "center or entry"),
-            ("samples", 1 <= self.samples <= 16, "a whole number of rays per pixel side, 1 to 16"),
-            ("backend", isinstance(self.backend, str) and bool(self.backend), "auto or the name of a backend"),
-        )
-        for name, ok, expected in checks:
-            if not ok:
-                raise ConfigError(f"renderer.{name}={getattr(self, name)!r}: expected {expected}")
+        verify(self, "renderer")

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from torch import Tensor
 
-from neuprim.core.data import Dataset, View
+from neuprim.core.checked import Option
+from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.context import SceneContext
 from neuprim.core.environment import Environment, Illumination
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField, Field
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.source import VolumeSource
 
 __all__ = ["API_VERSION", "Illuminate", "Loss", "SceneContext", "SceneSpec", "Supervision", "TaskSpec"]
@@ -44,7 +46,7 @@ Display = Callable[[Tensor], Tensor]
 """(H, W, C) colours in the data set's own colour space -> (H, W, 3) sRGB values 0..1, each pixel by itself."""
 
 Illuminate = Callable[[Environment, int, Mapping[str, Any]], Illumination]
-"""(light from all around, number of lights that stand for it, what the data set said in :meth:`Dataset.facts`) -> frames to add up."""
+"""(light from all around, number of lights that stand for it, the "data" of the model's header: :attr:`TaskSpec.facts`) -> frames to add up."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,8 @@ class TaskSpec:
         check: (what ``build`` gets) raises :class:`~neuprim.core.errors.ConfigError` for choices the task does not have, before
             any data is loaded.
         options: name -> (default, one line of help) of the task's own settings, the only ones under ``task.options``; values are
-            converted to the default's type. ``task/NAME.yaml`` may say other defaults.
+            converted to the default's type, or to what stands third: ``Annotated[float, Range(0, 1)]``, ``("soft", "hard")``
+            (:mod:`neuprim.core.checked`). ``task/NAME.yaml`` may say other defaults.
         uses: the shared settings of :data:`neuprim.core.uses.OPTIONAL` that ``build`` (``model.…``) and ``loss`` (``train.…``) read.
             Others are refused when somebody sets them.
         environment: what an image of the light all around means to the task (``neuprim render --environment``); None for tasks that
@@ -108,8 +111,25 @@ class TaskSpec:
     """What pictures show: (H, W, C) colours in the data set's colour space -> (H, W, 3) sRGB values 0..1. It must take each pixel by
     itself, as it also gets the colours of primitives, as an image one pixel high. None: three channels are red, green and blue, one is
     grey, and of others the first three are shown."""
-    options: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
+    options: Mapping[str, Option] = field(default_factory=dict)
     uses: tuple[str, ...] = ()
+    mask: Callable[[Dataset, int], Tensor | None] = lambda dataset, index: None
+    """(data set, index of a test view) -> (H, W) bool, the part of the view whose error is worth reporting on its own; None: no such part."""
+    judge: Callable[[Dataset, int, Tensor, Tensor], Mapping[str, float]] = lambda dataset, index, rendered, truth: {}
+    """(data set, index of a test view, rendered (H, W, C), truth (H, W, C)) -> further numbers by name, which ``metrics.json`` gives per
+    view and as means over the views that have them. Both images are in the data set's colour space, over its background. Means are plain,
+    but ``mse_NAME`` becomes ``psnr_pooled_NAME``, the PSNR of the mean over views, each of which counts by its ``pixels_NAME`` where it
+    says so; ``pixels_NAME`` becomes a sum."""
+    diagnose: Callable[[Dataset, Primitives], Mapping[str, Any]] = lambda dataset, model: {}
+    """(data set, model) -> further JSON-able numbers for ``metrics.json``: the model against what is known of the scene."""
+    clips: Callable[[Dataset], Sequence[Clip]] = lambda dataset: ()
+    """Films to make of the test views, or of views kept for films."""
+    facts: Callable[[Dataset], Mapping[str, Any]] = lambda dataset: {}
+    """JSON-able facts that drawing a model may need when the data are gone; kept in the model's header under "data", beside "up" and
+    "center"."""
+    orbit: Callable[[Dataset, int], list[View]] = Dataset.orbit
+    """(data set, number of frames) -> views circling the scene, with every condition of the task; see
+    :meth:`~neuprim.core.data.dataset.Dataset.orbit`, which is taken without one."""
 
     def parameter_names(self) -> set[str]:
         """Names of the parameters that the task's fields have at any settings.

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from neuprim.core.checked import Option
 from neuprim.core.errors import ConfigError
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 
@@ -66,10 +67,10 @@ def _group(
     name: str,
     values: Mapping[str, Any],
     uses: tuple[str, ...],
-    declared: Mapping[str, tuple[Any, str]],
+    declared: Mapping[str, Option],
     options: Mapping[str, Any],
     owner: str,
 ) -> Declared:
     used = {k: v for k, v in values.items() if f"{name}.{k}" not in OPTIONAL or f"{name}.{k}" in uses}
-    own = {key: options.get(key, default) for key, (default, _) in declared.items()}
+    own = {key: options.get(key, option[0]) for key, option in declared.items()}
     return Declared({**used, "options": Declared(own, owner, "task.options", "options")}, owner, name, "uses")

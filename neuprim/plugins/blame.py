@@ -5,22 +5,21 @@ A :class:`~neuprim.core.errors.NeuprimError` passes as it is, and a crash in neu
 
 from __future__ import annotations
 
-import sys
-import tempfile
-import traceback
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from neuprim.core.data.check import DatasetFault
-from neuprim.core.errors import DataError, NeuprimError
+from neuprim.core.errors import DISK, DataError, NeuprimError
+from neuprim.plugins import crashes
+from neuprim.plugins.judging import TaskFault
 from neuprim.plugins.mechanism import Group, PluginError, PluginInfo
 from neuprim.plugins.names import normalised, split
 from neuprim.plugins.registry import LOSSES, SCENES, TASKS
-from neuprim.plugins.tracebacks import written
 
-__all__ = ["Suspects", "blamed", "origin_of"]
+__all__ = ["Suspects", "blamed", "origin_of", "reported"]
 
 _OURS = "neuprim"
 StackFrame = tuple[str, str, int, str]
@@ -38,36 +37,6 @@ def origin_of(group: Group[Any], word: str, module: str = "") -> PluginInfo:
     return min(found, key=lambda info: not info.built_in, default=nobody)
 
 
-class blamed:
-    """Around a call of one function of a plugin, whose crash is then an error in one line; may be entered more than once.
-
-    Args:
-        origin: the plugin.
-        what: e.g. ``"build of task 'glow'"``.
-        folder: for the file with the traceback, usually ``RUN_DIR/logs``; a temporary file takes its place while the directory around
-            it holds nothing, because a run refuses to write into one that does.
-
-    Raises:
-        PluginError: the function raised something other than a :class:`~neuprim.core.errors.NeuprimError`, or does not take the
-            arguments that it gets. Functions of neuprim's own that a plugin lends (a loss, say) are not its fault.
-    """
-
-    def __init__(self, origin: PluginInfo, what: str, folder: Path | None = None) -> None:
-        self.origin, self.what, self.folder = origin, what, folder
-
-    def __enter__(self) -> blamed:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        if not _a_crash(error) or self.origin.built_in:
-            return
-        called = _frames(trace)[1:]  # the first one is the caller's
-        theirs = [frame for frame in called if _top(frame[0]) in Party(self.what, self.origin).modules]
-        if called and _top(called[0][0]) == _OURS and not theirs:
-            return
-        raise PluginError(_line(self.what, self.origin, error, theirs, self.folder)) from error
-
-
 @dataclass
 class Party:
     """A plugin that has a part in a run, and the top-level modules that its code is in."""
@@ -78,6 +47,84 @@ class Party:
 
     def __post_init__(self) -> None:
         self.modules |= {_top(self.origin.target)} - {""}
+        self.file = f"{self.origin.distribution}-{self.what}"  # what its tracebacks' names begin with
+
+    @property
+    def who(self) -> str:
+        """For example ``"task 'glow' of neuprim-glow 0.1"``."""
+        return f"{self.what} of {self.origin.origin}"
+
+    def among(self, called: Sequence[StackFrame]) -> list[StackFrame]:
+        """The frames that are in its code."""
+        return [frame for frame in called if _top(frame[0]) in self.modules]
+
+
+class _Guard:
+    """Around calls of plugins, whose crashes are then told in a line; may be entered more than once."""
+
+    folders: Sequence[Path] = ()
+    line = "{who}: {error}{place}; traceback: {path}"
+    lost: str | None = "{who}: {error}{place}; its traceback could not be written anywhere"  # None: then the crash is not hidden
+
+    def accused(self, error: BaseException, called: Sequence[StackFrame]) -> Party | None:
+        """The plugin whose fault it is, if it is one's; ``called`` is what the guarded lines called, outermost first."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Any:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if not isinstance(error, (Exception, SystemExit)) or isinstance(error, NeuprimError):
+            return
+        called = _frames(trace)[1:]  # the first one is the caller's
+        party = self.accused(error, called)
+        if party is None or party.origin.built_in:
+            return
+        path = crashes.written(error, f"{party.who} ({party.origin.target})", party.file, self.folders)
+        line = self.line if path is not None else self.lost
+        if line is not None:
+            said = ": ".join(part for part in (type(error).__name__, " ".join(str(error).split())) if part)
+            place = "".join(f" ({Path(file).name} line {number}, in {name})" for _, file, number, name in party.among(called)[-1:])
+            raise PluginError(line.format(who=party.who, error=said, place=place, path=path)) from error
+
+
+class blamed(_Guard):
+    """Around a call of one function of a plugin.
+
+    Args:
+        origin: the plugin.
+        what: e.g. ``"build of task 'glow'"``.
+        folder: for the file with the traceback, usually ``RUN_DIR/logs``.
+
+    Raises:
+        PluginError: the function raised something other than a :class:`~neuprim.core.errors.NeuprimError`, or does not take the
+            arguments that it gets. Functions of neuprim's own that a plugin lends (a loss, say) are not its fault.
+    """
+
+    def __init__(self, origin: PluginInfo, what: str, folder: Path | None = None) -> None:
+        self.party, self.folders = Party(what, origin), _absolute(folder)
+
+    def accused(self, error: BaseException, called: Sequence[StackFrame]) -> Party | None:
+        lent = called and _top(called[0][0]) == _OURS and not self.party.among(called)
+        return None if lent else self.party
+
+
+class reported(blamed):
+    """Around the work of an exporter or inspector; raises as :class:`blamed`, but refusals of a disk pass.
+
+    Args:
+        folders: for the file with the traceback; where none of them nor the temporary files' takes it, the traceback is not hidden.
+    """
+
+    line, lost = "{who} crashed: {error}; traceback in {path}", None
+
+    def __init__(self, group: Group[Any], name: str, folders: Sequence[Path]) -> None:
+        origin = origin_of(group, name)
+        super().__init__(origin, f"{group.kind} {origin.name!r}")
+        self.folders, self.party.file = folders, f"{group.kind}-{origin.name}"
+
+    def accused(self, error: BaseException, called: Sequence[StackFrame]) -> Party | None:
+        return None if isinstance(error, OSError) and error.errno in DISK else super().accused(error, called)
 
 
 class Suspects:
@@ -97,44 +144,39 @@ class Suspects:
         self.loss = Party(f"the loss of task {task!r}", home) if loss is None else Party(f"loss {loss!r}", origin_of(LOSSES, loss))
 
     def know(self, dataset: object) -> None:
-        """Code of the data set that the scene's loader made is the scene's, whichever module it is in."""
-        parts = (dataset, getattr(dataset, "train", None), getattr(dataset, "test", None))
-        self.scene.modules |= {_top(type(part).__module__) for part in parts} - {_OURS, "builtins"}
+        """Code that the scene's loader put into its data set is the scene's, whichever module it is in."""
+        views = (getattr(dataset, name, None) for name in ("train", "test", "extra"))
+        start = getattr(getattr(dataset, "start", None), "__module__", None)
+        modules = [*(type(part).__module__ for part in views), *([start] if isinstance(start, str) else [])]
+        self.scene.modules |= {_top(module) for module in modules} - {_OURS, "builtins"}
 
     def watch(self, folder: Path | None = None) -> _Watch:
         """Around neuprim's own code that calls plugins here and there: whose code a crash is in is read off the traceback.
 
-        A :class:`~neuprim.core.data.check.DatasetFault` becomes a DataError that names the scene's package.
+        A :class:`~neuprim.core.data.check.DatasetFault` becomes a DataError that names the scene's package, and a
+        :class:`~neuprim.plugins.judging.TaskFault` a PluginError that names the task's.
         """
         return _Watch(self, folder)
 
 
-class _Watch:
+class _Watch(_Guard):
     def __init__(self, suspects: Suspects, folder: Path | None) -> None:
-        self.suspects, self.folder = suspects, folder
-
-    def __enter__(self) -> None:
-        return None
+        self.suspects, self.folders = suspects, _absolute(folder)
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        scene = self.suspects.scene
         if isinstance(error, DatasetFault):
-            raise DataError(f"{scene.what} of {scene.origin.origin}: {error}") from error
-        if not _a_crash(error):
-            return
-        called = _frames(trace)[1:]
-        for frame in reversed(called):
-            for party in (self.suspects.task, scene, self.suspects.loss):  # of one package, the most general
-                if not party.origin.built_in and _top(frame[0]) in party.modules:
-                    theirs = [f for f in called if _top(f[0]) in party.modules]
-                    raise PluginError(_line(party.what, party.origin, error, theirs, self.folder)) from error
+            raise DataError(f"{self.suspects.scene.who}: {error}") from error
+        if isinstance(error, TaskFault):
+            raise PluginError(f"{self.suspects.task.who}: {error}") from error
+        super().__exit__(kind, error, trace)
+
+    def accused(self, error: BaseException, called: Sequence[StackFrame]) -> Party | None:
+        parties = (self.suspects.task, self.suspects.scene, self.suspects.loss)  # of one package, the most general
+        return next((p for frame in reversed(called) for p in parties if not p.origin.built_in and p.among([frame])), None)
 
 
-# ---------------------------------------------------------------- reading and writing tracebacks
-
-
-def _a_crash(error: BaseException | None) -> bool:
-    return isinstance(error, (Exception, SystemExit)) and not isinstance(error, NeuprimError)
+def _absolute(folder: Path | None) -> list[Path]:
+    return [] if folder is None else [folder.absolute()]
 
 
 def _frames(trace: TracebackType | None) -> list[StackFrame]:
@@ -149,22 +191,3 @@ def _frames(trace: TracebackType | None) -> list[StackFrame]:
 
 def _top(module: str) -> str:
     return module.partition(":")[0].partition(".")[0]
-
-
-def _line(what: str, origin: PluginInfo, error: BaseException | None, theirs: list[StackFrame], folder: Path | None) -> str:
-    text = " ".join(str(error).split())
-    place = f" ({Path(theirs[-1][1]).name} line {theirs[-1][2]}, in {theirs[-1][3]})" if theirs else ""
-    return f"{what} of {origin.origin}: {type(error).__name__}{': ' * bool(text)}{text}{place}; {_kept(what, origin, error, folder)}"
-
-
-def _kept(what: str, origin: PluginInfo, error: BaseException | None, folder: Path | None) -> str:
-    """Writes the traceback; says where."""
-    python = ".".join(map(str, sys.version_info[:3]))
-    content = f"{what} of {origin.origin} ({origin.target}), Python {python}\n\n{''.join(traceback.format_exception(error))}"
-    begun = folder is not None and folder.parent.is_dir() and any(folder.parent.iterdir())
-    path = written(
-        content,
-        f"{origin.distribution}-{what}",
-        [*([folder.absolute()] if begun and folder is not None else []), Path(tempfile.gettempdir())],
-    )
-    return "its traceback could not be written anywhere" if path is None else f"traceback: {path}"

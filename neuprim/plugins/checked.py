@@ -41,7 +41,7 @@ def checked_loss(loss: Loss, guard: blamed) -> Loss:
             value, parts = loss(rendered, truth, frame)
         wrong = _fault(value, parts, rendered)
         if wrong:
-            raise PluginError(f"{guard.what} of {guard.origin.origin}: returned {wrong}")
+            raise PluginError(f"{guard.party.who}: returned {wrong}")
         return value, parts
 
     return call

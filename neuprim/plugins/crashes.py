@@ -1,53 +1,42 @@
-"""What happens when a plugin crashes while it works: one line that names its package, and the traceback in a file."""
+"""Files that keep the traceback of a plugin's crash, so that the user reads one line: see :mod:`neuprim.plugins.blame`."""
 
 from __future__ import annotations
 
+import re
+import sys
 import tempfile
+import time
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from neuprim.core.errors import DISK, NeuprimError
-from neuprim.plugins.blame import origin_of
-from neuprim.plugins.registry import Group, PluginError
-from neuprim.plugins.tracebacks import written
 from neuprim.version import __version__
 
-__all__ = ["is_ours", "reported"]
+__all__ = ["written"]
 
 
-def is_ours(group: Group[Any], name: str) -> bool:
-    """Whether a plugin is neuprim's own, so that a bug in it is a bug of neuprim."""
-    return origin_of(group, name).built_in
-
-
-@contextmanager
-def reported(group: Group[Any], name: str, folders: Sequence[Path]) -> Iterator[None]:
-    """Around a call of a plugin's own code: whatever it raises by mistake becomes a PluginError.
-
-    Errors of neuprim and refusals of a disk pass through, and so does everything from a plugin that is neuprim's own: its bugs keep
-    their traceback.
+def written(error: BaseException, who: str, name: str, folders: Sequence[Path]) -> Path | None:
+    """The file with the traceback, in the first of the folders that can be written, else with the temporary files; None if nowhere.
 
     Args:
-        folders: where the traceback is written: to the first of these that can be; if none can, to the system's folder for such files.
-            Where that cannot be written to either, the traceback is not hidden.
-
-    Raises:
-        PluginError: names the plugin, its package with the version, the error, and the file.
+        who: what it says first.
+        name: its own begins so.
+        folders: each is passed over while the directory around it holds nothing, because a run refuses to write into one that does.
     """
-    try:
-        yield
-    except NeuprimError:
-        raise
-    except (Exception, SystemExit) as error:
-        info = origin_of(group, name)
-        if info.built_in or (isinstance(error, OSError) and error.errno in DISK):
-            raise
-        text = f"{group.kind} {info.name!r} of {info.origin}, neuprim {__version__}\n\n{''.join(traceback.format_exception(error))}"
-        path = written(text, f"{group.kind}-{info.name}", [*folders, Path(tempfile.gettempdir())])
-        if path is None:
-            raise
-        said = ": ".join(part for part in (type(error).__name__, " ".join(str(error).split())) if part)
-        raise PluginError(f"{group.kind} {info.name!r} of {info.origin} crashed: {said}; traceback in {path}") from error
+    text = f"{who}, neuprim {__version__}, Python {sys.version.split()[0]}\n\n{''.join(traceback.format_exception(error))}"
+    stem = f"{re.sub(r'[^A-Za-z0-9_-]+', '_', name).strip('_')}-{time.strftime('%Y%m%d-%H%M%S')}"
+    begun = [folder for folder in folders if folder.parent.is_dir() and any(folder.parent.iterdir())]
+    for folder in (*begun, Path(tempfile.gettempdir())):
+        for number in range(1, 100):  # several in one second
+            path = folder / (f"{stem}.txt" if number == 1 else f"{stem}-{number}.txt")
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+                with open(path, "x", encoding="utf-8", newline="\n") as file:
+                    file.write(text)
+                return path
+            except FileExistsError:
+                if not folder.is_dir():
+                    break
+            except OSError:
+                break
+    return None

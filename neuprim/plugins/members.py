@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Any
 
+from neuprim.core.checked import converted, option_type
+from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import Exporter, Inspector, LossExtension, SceneExtension
 from neuprim.core.io.channel_names import names_fault
 from neuprim.core.model.fields import ConditionSpec, Field
@@ -25,13 +27,13 @@ _TEXTS: dict[type, tuple[str, ...]] = {
     Inspector: ("name", "summary"),
 }
 _CALLS: dict[type, tuple[str, ...]] = {
-    TaskSpec: ("build", "loss", "check"),
+    TaskSpec: ("build", "loss", "check", "mask", "judge", "diagnose", "clips", "facts", "orbit"),
     SceneSpec: ("load",),
     SceneExtension: (),
     ConditionSpec: ("parse",),
     LossExtension: ("make",),
     Exporter: ("write",),
-    Inspector: ("add",),
+    Inspector: ("layers",),
 }
 
 
@@ -56,6 +58,8 @@ def fault(spec: Any) -> str | None:
         return _one(spec.scene, SceneSpec, "scene")
     if isinstance(spec, ConditionSpec):
         return _condition(spec)
+    if isinstance(spec, Inspector):
+        return _inspector(spec)
     return _exporter(spec) if isinstance(spec, Exporter) else None
 
 
@@ -64,6 +68,18 @@ def _condition(spec: ConditionSpec) -> str | None:
     numbers = isinstance(ends, tuple | list) and len(ends) == 2 and all(isinstance(end, int | float) for end in ends)
     if not numbers or not ends[0] < ends[1]:
         return f"range is {ends!r}; expected a lower and a higher number"
+    return None
+
+
+def _inspector(spec: Inspector) -> str | None:
+    try:
+        signature = inspect.signature(spec.layers)
+    except (TypeError, ValueError):  # of compiled code that does not say
+        return None
+    try:
+        signature.bind(None)
+    except TypeError:
+        return f"layers is a function of {signature}; expected one of a frame alone, which returns layers"
     return None
 
 
@@ -129,10 +145,14 @@ def _declared(spec: TaskSpec | LossExtension, *groups: str) -> str | None:
     for name, entry in spec.options.items():
         if not isinstance(name, str) or not name.isidentifier():
             return f"options has {name!r}; expected a name of letters, digits and _"
-        if not isinstance(entry, tuple | list) or len(entry) != 2 or not isinstance(entry[1], str):
-            return f"options[{name!r}] is {entry!r}; expected (default, one line of help)"
+        if not isinstance(entry, tuple | list) or len(entry) not in (2, 3) or not isinstance(entry[1], str):
+            return f"options[{name!r}] is {entry!r}; expected (default, one line of help), and perhaps a type"
         if not isinstance(entry[0], bool | int | float | str | list | Mapping | None):
             return f"options[{name!r}] has a default of type {type(entry[0]).__name__}; expected what a YAML file can hold"
+        try:
+            converted(entry[0], option_type(tuple(entry)), f"options[{name!r}]")
+        except ConfigError as error:
+            return f"the default of {error}"
     known = [name for name in OPTIONAL if name.startswith(groups)]
     if not isinstance(spec.uses, tuple | list):
         return f"uses is of type {type(spec.uses).__name__}; expected a tuple of setting names"

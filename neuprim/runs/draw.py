@@ -22,6 +22,7 @@ from neuprim.core.io.files import write_npy
 from neuprim.core.io.film import write_film
 from neuprim.core.model.fields import Conditions
 from neuprim.core.task import TaskSpec
+from neuprim.plugins.judging import facts_of, orbit_of
 from neuprim.runs.measure import draw, draw_sum
 from neuprim.runs.open import LOGS, load_dataset, load_run
 
@@ -83,7 +84,7 @@ def render_run(
         dataset = load_dataset(config, task, run_dir=run_dir)
         suspects.know(dataset)
         with watch:
-            views = dataset.orbit(frames) if camera == "orbit" else [dataset.test.view(i) for i in range(len(dataset.test))]
+            views = orbit_of(task, dataset, frames) if camera == "orbit" else [dataset.test.view(i) for i in range(len(dataset.test))]
     if size is not None:
         views = [replace(v, camera=v.camera.resized(*size)) for v in views]
     if lights:  # these replace the views' own; the first stands for all where only their presence counts
@@ -155,7 +156,7 @@ def _illumination(
         raise ConfigError(f"--environment {choice.path}: task {task.name!r} has no light that it could replace")
     facts = header.get("data")
     if facts is None:  # written before models kept them
-        facts = load_dataset(config, task).facts()
+        facts = facts_of(task, load_dataset(config, task))
     if not isinstance(facts, dict):
         raise DataError(f"the model's header: data is {type(facts).__name__}; expected an object")
     up = Record(facts, "the model's header: data").array("up", (3,), "3 numbers")

@@ -18,8 +18,7 @@ from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
 from neuprim.core.io.drafts import Draft, drafted, refuse_taken
 from neuprim.core.model.fields import ConditionSpec
-from neuprim.plugins.blame import origin_of
-from neuprim.plugins.crashes import reported
+from neuprim.plugins.blame import origin_of, reported
 from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin, load_exporter
 from neuprim.runs.export_record import record_export
 from neuprim.runs.open import load_run, open_run

@@ -9,6 +9,7 @@ import torch
 from neuprim.core.data import Clip, View
 from neuprim.core.io import images
 from neuprim.core.io.files import write_json
+from neuprim.plugins.judging import clips_of, orbit_of
 from neuprim.report import error_map, write_report
 from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import draw, measure, summary
@@ -21,14 +22,14 @@ _ORBIT_FRAMES = 36
 
 def finish(fitted: Fitted, directory: Path) -> None:
     """Writes ``metrics.json``, ``renders/`` and the report of a run whose model is on disk in ``directory``."""
-    config, dataset, channels, model = fitted.config, fitted.dataset, fitted.channels, fitted.model
+    config, task, dataset, channels, model = fitted.config, fitted.task, fitted.dataset, fitted.channels, fitted.model
     fitted.unlock()
     count = len(dataset.test)
     shown = {round(i * (count - 1) / max(min(count, _SHOWN_VIEWS) - 1, 1)) for i in range(min(count, _SHOWN_VIEWS))}
     folder = directory / "renders"
     folder.mkdir(exist_ok=True)
 
-    clips = dataset.clips()
+    clips = clips_of(task, dataset)
     reels = {i: clip for clip in clips if clip.source is None for i in clip.views}
     pictures: list[torch.Tensor] = []
 
@@ -48,7 +49,7 @@ def finish(fitted: Fitted, directory: Path) -> None:
             images.write_png(folder / f"{stem}_truth.png", channels.display(truth))
             images.write_png(folder / f"{stem}_error.png", torch.from_numpy(error_map(rendered, truth)))
 
-    views = measure(model, dataset, config.renderer, channels, keep)
+    views = measure(model, task, dataset, config.renderer, channels, keep)
     for clip in clips:
         if clip.source is None:
             continue  # drawn above
@@ -56,7 +57,8 @@ def finish(fitted: Fitted, directory: Path) -> None:
             truth = clip.source.pixels(i).over(dataset.background)
             film(clip, i, draw(model, clip.source.view(i), config.renderer, dataset.background), truth)
     size = (directory / "model.safetensors").stat().st_size
-    write_json(directory / "metrics.json", summary(config, model, dataset, channels, views, size, fitted.training))
-    frames = [channels.display(draw(model, v, config.renderer, dataset.background)) for v in dataset.orbit(_ORBIT_FRAMES)]
+    write_json(directory / "metrics.json", summary(config, model, task, dataset, channels, views, size, fitted.training))
+    views_around = orbit_of(task, dataset, _ORBIT_FRAMES)
+    frames = [channels.display(draw(model, v, config.renderer, dataset.background)) for v in views_around]
     images.write_animation(folder / "orbit.webp", frames, fps=12.0)
-    write_report(directory, fitted.task.conditions)
+    write_report(directory, task.conditions)

@@ -19,6 +19,7 @@ from neuprim.core.train.trainer import StepReport, Trainer, initial_model
 from neuprim.core.uses import build_settings, loss_settings
 from neuprim.plugins.blame import Suspects, blamed
 from neuprim.plugins.checked import check_fields, checked_loss
+from neuprim.plugins.judging import clips_of, facts_of
 from neuprim.plugins.mechanism import PluginError
 from neuprim.plugins.registry import load_loss
 from neuprim.runs.curve import curve_psnr, next_evaluation
@@ -57,9 +58,9 @@ class Fitted:
     def metrics(self) -> dict[str, Any]:
         """The content of ``metrics.json``, measured on the test views; the model's size is that of its tensors."""
         self.unlock()
-        views = measure(self.model, self.dataset, self.config.renderer, self.channels)
+        views = measure(self.model, self.task, self.dataset, self.config.renderer, self.channels)
         size = 4 * sum(value.numel() for value in self.model.params.values())
-        return summary(self.config, self.model, self.dataset, self.channels, views, size, self.training)
+        return summary(self.config, self.model, self.task, self.dataset, self.channels, views, size, self.training)
 
 
 def fit(config: RunConfig, events: Events = silent, dataset: Dataset | None = None) -> Fitted:
@@ -100,6 +101,8 @@ def start(config: RunConfig, events: Events = silent, dataset: Dataset | None = 
     if suspects is not None:
         suspects.know(dataset)
     check_dataset(dataset, task.conditions)
+    clips_of(task, dataset)  # what the task cannot make of these data must not cost a training
+    facts_of(task, dataset)
     channels = channels_of(task, dataset)
     if channels.partial:
         events(Note(f"shown: {channels.shown}; task {task.name!r} has no display that shows them all"))
@@ -135,7 +138,7 @@ def make_loss(config: RunConfig, task: TaskSpec) -> Loss:
     with blamed(party.origin, party.what, config.output_dir / LOGS) as guard:
         made = (task.loss if chosen is None else chosen.make)(loss_settings(chosen or task, config.train, config.options))
     if not callable(made):
-        raise PluginError(f"{party.what} of {party.origin.origin}: made a {type(made).__name__}; expected a function")
+        raise PluginError(f"{party.who}: made a {type(made).__name__}; expected a function")
     return checked_loss(made, guard)
 
 

@@ -19,14 +19,17 @@ from neuprim.core.io.film import write_film
 from neuprim.core.model.fields import Conditions
 from neuprim.core.volumes.grid import POINTS_LIMIT, agreement, density_grid, lattice
 from neuprim.core.volumes.truth import DensityTruth
-from neuprim.plugins.crashes import is_ours, reported
+from neuprim.plugins.blame import reported
 from neuprim.plugins.inspect.against import open_truth, pair, write_volume
 from neuprim.plugins.inspect.field import FieldFrame, ViewOptions
 from neuprim.plugins.inspect.frames import box_of, condition_frames, in_words, round_up
 from neuprim.plugins.inspect.headless import has_display, prepare_headless, require_pyvista
+from neuprim.plugins.inspect.layer_checks import fault
+from neuprim.plugins.inspect.layers import Layer
 from neuprim.plugins.inspect.page import write_page
 from neuprim.plugins.inspect.window import Window, panels_of
-from neuprim.plugins.registry import INSPECTORS, load_inspector
+from neuprim.plugins.registry import INSPECTORS, PluginError, load_inspector
+from neuprim.runs.events import Events, Note, silent
 from neuprim.runs.open import open_run
 
 __all__ = ["OUTPUTS", "Request", "inspect_run"]
@@ -51,7 +54,6 @@ class Request:
         against: an OpenVDB file or folder, or "scene".
         up: "x", "y" or "z"; None: the scene's setting, or z.
         overwrite: whether files that exist may be replaced.
-        say: prints a line.
     """
 
     run_dir: Path
@@ -65,17 +67,19 @@ class Request:
     size: tuple[int, int] | None = None
     up: str | None = None
     overwrite: bool = False
-    say: Callable[[str], None] = print
 
 
-def inspect_run(request: Request) -> list[Path]:
+def inspect_run(request: Request, events: Events = silent) -> list[Path]:
     """Does it, and returns the files that were written; none where a window was shown.
 
     Several frames become numbered files for .png and .vdb, an animation for .webp, .gif and .mp4, and a slider in a page or a window.
 
+    Args:
+        events: told, as notes, what is shown: the truth and each frame's agreement with it, the grid, warnings.
+
     Raises:
         ConfigError, DataError, CheckpointError: the user's words or files, files in the way.
-        PluginError: an inspector that crashed.
+        PluginError: an inspector that crashed, or returned what cannot be drawn.
         BackendUnavailable: pyvista is missing, VTK cannot draw here, or there is no display and no ``out``.
     """
     kind = "" if request.out is None else request.out.suffix.lower()
@@ -90,9 +94,9 @@ def inspect_run(request: Request) -> list[Path]:
             prepare_headless()
     if request.against is None and any(i.shows == "both" for i in inspectors):
         raise ConfigError("--show difference: there is no ground truth; give --against FILE.vdb, DIR or scene")
-    film = _Film(request)
+    film = _Film(request, events)
     if film.channels.partial and any(i.shows == "model" for i in inspectors):
-        request.say(f"shown: {film.channels.shown}")
+        events(Note(f"shown: {film.channels.shown}"))
     if kind == ".html":
         assert request.out is not None
         write_page(request.out, film, inspectors)
@@ -110,14 +114,21 @@ def inspect_run(request: Request) -> list[Path]:
 
 
 def _watched(inspector: Inspector, name: str, request: Request) -> Inspector:
-    """The inspector, whose crashes are reported."""
+    """The inspector under the name that the user gave it; its crashes are reported, and so is what cannot be drawn."""
     folders = [request.run_dir / "logs", *([] if request.out is None else [request.out.absolute().parent])]
+    guard = reported(INSPECTORS, name, folders)
+    if guard.party.origin.built_in:
+        return inspector
 
-    def add(plotter: Any, frame: FieldFrame) -> None:
-        with reported(INSPECTORS, name, folders):
-            inspector.add(plotter, frame)
+    def layers(frame: FieldFrame) -> Sequence[Layer]:
+        with guard:
+            found = inspector.layers(frame)
+        wrong = fault(found)
+        if wrong:
+            raise PluginError(f"{guard.party.who}: {wrong}")
+        return found
 
-    return inspector if is_ours(INSPECTORS, name) else replace(inspector, add=add)
+    return replace(inspector, name=name, layers=layers)
 
 
 def _paths(out: Path, count: int) -> list[Path]:
@@ -154,7 +165,7 @@ def _each(request: Request, film: _Film, write: Callable[[Path, FieldFrame], Any
 class _Film:
     """The frames that were asked for, made one at a time; box and scale are the same for all."""
 
-    def __init__(self, request: Request) -> None:
+    def __init__(self, request: Request, events: Events) -> None:
         run = open_run(request.run_dir)
         self.model = run.model
         self.truth: DensityTruth | None = None
@@ -162,11 +173,11 @@ class _Film:
         self.up = request.up or str(run.scene.get("up", "z"))
         self.up = self.up if self.up in ("x", "y", "z") else "z"
         self.options, self.name = request.options, request.run_dir.resolve().name
-        wanted = condition_frames(run.task.conditions, request.conditions, request.say)
+        wanted = condition_frames(run.task.conditions, request.conditions, lambda text: events(Note(text)))
         pairs: list[tuple[Conditions, int]] = [(conditions, -1) for conditions in wanted]
         if request.against is not None:
             self.truth, words = open_truth(request.against, run.volume)
-            request.say(words)
+            events(Note(words))
             pairs = pair(wanted, self.truth, bool(request.conditions))
         self.pairs = pairs
         for path in [] if request.out is None else _paths(request.out, len(pairs)):
@@ -175,13 +186,11 @@ class _Film:
         if request.grid**3 > POINTS_LIMIT:
             raise ConfigError(f"--grid {request.grid}: expected at most {round(POINTS_LIMIT ** (1 / 3))}")
         self.matrix, self.shape = lattice(box, request.grid)
-        self.numbers = [self._compare(i, request) for i in range(len(self))]
+        self.numbers = [self._compare(i, events) for i in range(len(self))]
         self.top, self.gain, self.focus = self._scale(box)
         low, high = ([round(x, 4) for x in corner] for corner in np.asarray(box).tolist())
-        request.say(
-            f"extinction of {self.model.count} primitives on {' x '.join(map(str, self.shape))} points from {low} to {high} scene units, "
-            "in 1/scene unit, each primitive clamped at 0 from below"
-        )
+        on = f"{' x '.join(map(str, self.shape))} points from {low} to {high} scene units"
+        events(Note(f"extinction of {self.model.count} primitives on {on}, in 1/scene unit, each primitive clamped at 0 from below"))
 
     def __len__(self) -> int:
         return len(self.pairs)
@@ -191,7 +200,7 @@ class _Film:
             return np.asarray(self.truth.bounds.numpy())
         return box_of(self.model, [conditions for conditions, _ in self.pairs])
 
-    def _compare(self, index: int, request: Request) -> dict[str, float] | None:
+    def _compare(self, index: int, events: Events) -> dict[str, float] | None:
         """The frame's agreement with the truth on the grid that the data set itself compares on, whatever is shown."""
         if self.truth is None:
             return None
@@ -200,7 +209,7 @@ class _Film:
         found = density_grid(self.model, conditions, matrix, shape).numpy()
         numbers = agreement(self.truth.grid(number, matrix, shape).numpy(), found)
         words = "nothing to compare with" if numbers is None else "  ".join(f"{k} {v:.4f}" for k, v in numbers.items())
-        request.say(f"{self.truth.frames[number].name}  {in_words(conditions)}  {words}")
+        events(Note(f"{self.truth.frames[number].name}  {in_words(conditions)}  {words}"))
         return numbers
 
     def _scale(self, box: np.ndarray) -> tuple[float, float, tuple[float, ...]]:

@@ -1,8 +1,8 @@
-"""The numbers of a fitted model: every held-out view, their means, and what the data set adds.
+"""The numbers of a fitted model: every held-out view, their means, and what the task adds.
 
 PSNR and SSIM compare float images in the data set's own colour space, unclamped and unquantised. A linear data set also gets
 both after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``), if its channels are red, green and blue; a task with a display
-of its own gets both of what that shows instead (``psnr_display``, ``ssim_display``). Where it marks a part of its views (the union of all that a
+of its own gets both of what that shows instead (``psnr_display``, ``ssim_display``). Where it marks a part of a view (the union of all that a
 camera ever sees of a volume), the error there counts on its own: a black background flatters.
 """
 
@@ -21,13 +21,15 @@ from torch import Tensor
 
 from neuprim.config import RunConfig, suspects_of
 from neuprim.core.channels import Channels, channels_of
-from neuprim.core.data import Dataset, View
-from neuprim.core.data.check import check_dataset, check_mask, check_pixels
+from neuprim.core.data import Clip, Dataset, View
+from neuprim.core.data.check import check_dataset, check_pixels
 from neuprim.core.io import images
 from neuprim.core.metrics import means, psnr, ssim, to_json
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, choose, render
+from neuprim.core.task import TaskSpec
+from neuprim.plugins.judging import clips_of, diagnosed, judged, mask_of
 from neuprim.runs.open import LOGS, load_dataset, load_run
 from neuprim.version import __version__
 
@@ -42,8 +44,8 @@ class ViewMetrics:
         psnr, ssim: in the data set's colour space.
         seconds: of the forward pass alone.
         more: further numbers by name: ``psnr_srgb``, ``ssim_srgb`` of linear images, or ``psnr_display``, ``ssim_display`` of what the
-            task's own display shows; ``psnr_mask`` and ``mse_mask`` inside the data set's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without anything on it; what
-            :meth:`~neuprim.core.data.dataset.Dataset.judge` adds.
+            task's own display shows; ``psnr_mask`` and ``mse_mask`` inside the task's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without
+            anything on it; what the task's :attr:`~neuprim.core.task.TaskSpec.judge` adds.
     """
 
     name: str
@@ -86,6 +88,7 @@ def draw_sum(
 
 def measure(
     model: Primitives,
+    task: TaskSpec,
     dataset: Dataset,
     settings: RenderSettings,
     channels: Channels,
@@ -106,10 +109,8 @@ def measure(
         seconds = time.perf_counter() - start
         if pixels.mask is not None:
             rendered = torch.where(pixels.mask[..., None], rendered, truth)
-        counted = dataset.mask(i)
-        if counted is not None:
-            check_mask("test", view, counted)
-        more = _more(rendered, truth, dataset, channels, counted, pixels.mask) | dataset.judge(i, rendered, truth)
+        counted = mask_of(task, dataset, i)
+        more = _more(rendered, truth, dataset, channels, counted, pixels.mask) | judged(task, dataset, i, rendered, truth)
         result.append(ViewMetrics(view.name, psnr(rendered, truth, pixels.mask), ssim(rendered, truth), seconds, more))
         if seen is not None:
             seen(i, view, rendered, truth)
@@ -145,13 +146,14 @@ def evaluate_run(run_dir: Path) -> dict[str, Any]:
         path = run_dir / "model.safetensors"
         training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
         channels = channels_of(task, dataset)
-        views = measure(model, dataset, config.renderer, channels)
-        return summary(config, model, dataset, channels, views, path.stat().st_size, training)
+        views = measure(model, task, dataset, config.renderer, channels)
+        return summary(config, model, task, dataset, channels, views, path.stat().st_size, training)
 
 
 def summary(
     config: RunConfig,
     model: Primitives,
+    task: TaskSpec,
     dataset: Dataset,
     channels: Channels,
     views: Sequence[ViewMetrics],
@@ -175,7 +177,7 @@ def summary(
         **to_json("psnr_worst", worst.psnr),
         "view_worst": worst.name,
         "per_view": [_entry(v) for v in views],
-        **_per_frame(dataset, views),
+        **_per_frame(clips_of(task, dataset), views),
         "primitives": model.count,
         "parameters": model.count * model.parameters_per_primitive,
         "parameters_per_primitive": model.parameters_per_primitive,
@@ -193,7 +195,7 @@ def summary(
         "data_source": dataset.data_source,
         "train_views": len(dataset.train),
         "seed": config.seed,
-        **dataset.diagnose(model),
+        **diagnosed(task, dataset, model),
         "non_default": {key: list(pair) for key, pair in config.non_default.items()},
         "versions": {
             "neuprim": __version__,
@@ -213,13 +215,13 @@ def _entry(view: ViewMetrics) -> dict[str, Any]:
 
 
 def _means(views: Sequence[ViewMetrics]) -> dict[str, Any]:
-    """Means over views of the further numbers, and PSNRs of mean squared errors ("pooled"); see ``Dataset.judge``."""
+    """Means over views of the further numbers, and PSNRs of mean squared errors ("pooled"); see ``TaskSpec.judge``."""
     return means([v.more for v in views])
 
 
-def _per_frame(dataset: Dataset, views: Sequence[ViewMetrics]) -> dict[str, Any]:
-    """Means over the clips of each of their frames, for data sets that have clips of one length."""
-    clips = [[views[i] for i in clip.views] for clip in dataset.clips() if clip.source is None]
+def _per_frame(made: Sequence[Clip], views: Sequence[ViewMetrics]) -> dict[str, Any]:
+    """Means over the clips of the test views of each of their frames, where these are of one length."""
+    clips = [[views[i] for i in clip.views] for clip in made if clip.source is None]
     if not clips or len({len(c) for c in clips}) != 1:
         return {}
     frames = []

@@ -51,7 +51,7 @@ def load_dataset(
         dataset = load(config.scene, context)
     if not isinstance(dataset, Dataset):
         found = f"a {type(dataset).__name__}" if dataset is not None else "None"
-        raise PluginError(f"{scene.what} of {scene.origin.origin}: its loader returned {found}; expected a neuprim.core.data.Dataset")
+        raise PluginError(f"{scene.who}: its loader returned {found}; expected a neuprim.core.data.Dataset")
     return dataset
 
 

@@ -17,6 +17,7 @@ from neuprim.core import checkpoint
 from neuprim.core.errors import CheckpointError
 from neuprim.core.io.files import write_text
 from neuprim.core.render.backends import choose, compiled_ahead
+from neuprim.plugins.judging import facts_of
 from neuprim.plugins.provenance import check_resumed
 from neuprim.runs.compile import compiled, compiling, mark_compiled
 from neuprim.runs.curve import open_curve
@@ -118,12 +119,11 @@ def _save(fitted: Fitted) -> None:
         "color_space": dataset.color_space,
         "channels": list(fitted.channels.names),
         "data_source": dataset.data_source,
-        "data": dataset.facts(),
+        "data": facts_of(fitted.task, dataset),
         **fitted.training,
     }
-    placement = dataset.placement()
-    if placement is not None:
-        extra["world"] = placement.to_json()
+    if dataset.placement is not None:
+        extra["world"] = dataset.placement.to_json()
     checkpoint.save_model(config.output_dir / "model.safetensors", trainer.model, config.task, extra)
 
 

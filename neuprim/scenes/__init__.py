@@ -1,4 +1,4 @@
-"""Built-in solids for generated scenes: closed meshes, what a ray meets, and how a surface reflects a light.
+"""What generated scenes share: closed meshes, what a ray meets, how a surface reflects a light, and how images become a data set on disk.
 
-Tasks that draw images of them bring their own light and cameras.
+Tasks bring their own light and cameras, and say what an image consists of: :class:`~neuprim.scenes.image_set.ImageSet`.
 """

@@ -96,14 +96,13 @@ def test_a_display_that_gives_no_picture_is_named(own: Any, words: Sequence[str]
 
 
 def test_a_data_set_must_have_the_channels_that_its_task_names() -> None:
-    dataset = tiny.TwoPrimitives()
+    dataset = tiny.two_primitives()
     assert channels_of(TASK, dataset).names == ("R", "G", "B")
     assert channels_of(replace(TASK, channels=("a", "b", "c")), dataset).names == ("a", "b", "c")
     with pytest.raises(DataError, match=r"^two: 3 channels; expected 5, which task 'static' names: 450nm, 550 nm"):
         channels_of(replace(TASK, channels=BANDS), dataset)
-    dataset.channels = 5
     with pytest.raises(DataError, match=r"^two: the background has shape \(3,\); expected \(5,\), a number per channel"):
-        channels_of(TASK, dataset)
+        channels_of(TASK, replace(dataset, channels=5))
 
 
 def test_a_model_keeps_its_names_and_old_ones_get_some(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -62,32 +63,39 @@ class Views(ViewSet):
         return self.images[index]
 
 
-class TwoPrimitives(Dataset):
-    def __init__(self, random_background: bool = False) -> None:
-        self.name, self.channels, self.color_space, self.data_source = "two", 3, "srgb", "generated"
-        self.train, self.test = Views(6, 0.0), Views(2, 0.4)
-        self.extent = camera_extent([self.train.view(i).camera for i in range(6)])
-        self.background, self.random_background, self.downsampling = torch.ones(3), random_background, "none"
-        self.up, self.center = torch.tensor([0.0, 0.0, 1.0]), torch.zeros(3)
+def two_primitives(random_background: bool = False, views: Callable[[int, float], Views] = Views, **changes: Any) -> Dataset:
+    """The two known primitives; ``views(count, start)`` makes the sets, ``changes`` are members of the data set."""
+    train, test = views(6, 0.0), views(2, 0.4)
+    members: dict[str, Any] = {
+        "name": "two",
+        "train": train,
+        "test": test,
+        "start": near_the_truth,
+        "extent": camera_extent([train.view(i).camera for i in range(6)]),
+        "background": torch.ones(3),
+        "random_background": random_background,
+        "data_source": "generated",
+    }
+    return Dataset(**{**members, **changes})
 
-    def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
-        side = torch.arange(count) % 2
-        means = truth().geometry.means[side] + 0.2 * (torch.rand(count, 3, generator=generator) - 0.5)
-        return PointCloud(means, torch.full((count, 3), 0.5))
+
+def near_the_truth(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
+    side = torch.arange(count) % 2
+    means = truth().geometry.means[side] + 0.2 * (torch.rand(count, 3, generator=generator) - 0.5)
+    return PointCloud(means, torch.full((count, 3), 0.5))
 
 
 def trainer(dataset: Dataset, iterations: int = 40, seed: int = 0, **changes: Any) -> Trainer:
     """A fresh trainer of 12 primitives; ``changes`` go to the train settings, ``population`` as a dictionary."""
     population = PopulationSettings(**{"strategy": "fixed", "every": 7, "start": 0.0, "stop": 1.0, **changes.pop("population", {})})
     settings = TrainSettings(iterations=iterations, **changes, population=population)
-    settings.check()
     model = initial_model(CosineDensity(4), SphericalHarmonics(1, 3, 0.25), dataset, ModelSettings(primitives=12), seed)
     return Trainer(model, dataset, photometric({"ssim_weight": settings.ssim_weight}), settings, RenderSettings(), seed)
 
 
 def write_blender(folder: Path) -> Path:
     """The same scene as a NeRF-synthetic folder: 6 training and 2 test views with alpha."""
-    dataset = TwoPrimitives()
+    dataset = two_primitives()
     for split, views in (("train", dataset.train), ("test", dataset.test)):
         (folder / split).mkdir(parents=True, exist_ok=True)
         frames = []

@@ -17,9 +17,12 @@ from neuprim.cli import _parsers
 from neuprim.config import compose, compose_all
 from neuprim.core.cameras.file import read_cameras
 from neuprim.core.conditions import read_conditions, split_words
+from neuprim.core.data.check import check_dataset
 from neuprim.core.errors import NeuprimError
+from neuprim.core.io.images import write_png
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.model.fields import ConditionSpec
+from neuprim.core.task import SceneContext
 from neuprim.plugins.registry import load_exporter, survey
 from neuprim.runs.run import run
 from tests.docs.pages import PAGES, ROOT, Block, blocks, commands, name_of
@@ -88,6 +91,23 @@ def has_same_metrics(names: dict[str, Any]) -> None:
     assert len(names["curve"]) > 1 and names["fitted"].trainer.step == 20
 
 
+def has_a_loader_of_photographs(names: dict[str, Any]) -> None:
+    data, folder = names["ball"](16, 9, 1), Path("capture")
+    folder.mkdir()
+    frames = []
+    for i, camera in enumerate(data.train.cameras):
+        write_png(folder / f"camera_{i:03d}.png", data.train.pixels(i).over(data.background))
+        pose = torch.linalg.inv(camera.viewmat) * torch.tensor([1.0, -1.0, -1.0, 1.0])  # OpenGL axes
+        frames.append({"fl_x": camera.fx, "w": 16, "h": 16, "transform_matrix": pose.tolist()})
+    (folder / "cameras.json").write_text(json.dumps({"frames": frames}))
+    read = names["photographs"]({"path": "capture"}, SceneContext(0, Path("cache")))
+    check_dataset(read, ())
+    assert (len(read.train), len(read.test), read.name, read.extent) == (7, 2, "capture", pytest.approx(4.4, rel=0.2))
+    assert torch.allclose(read.train.view(0).camera.viewmat, data.train.cameras[1].viewmat.double(), atol=1e-5)
+    assert torch.allclose(read.center, torch.zeros(3), atol=1e-4)
+    assert 0 < len(read.initial_points(50, torch.Generator()).means) <= 50
+
+
 PREPARE: dict[str, Callable[[Path], None]] = {"docs/data_formats.md": with_run, "docs/vdb.md": with_volumes}
 """Page -> puts the files that its blocks talk about into the working directory."""
 
@@ -95,6 +115,7 @@ AFTER: dict[str, Callable[[dict[str, Any]], None]] = {
     "docs/vdb.md": has_copy,
     "docs/rasterize.md": has_frames,
     "docs/getting_started.md": has_same_metrics,
+    "docs/plugins.md": has_a_loader_of_photographs,
 }
 """Page -> checks what its blocks left behind."""
 
@@ -108,7 +129,7 @@ def test_python_blocks(page: Path, static_run: Path, tmp_path: Path, monkeypatch
     names: dict[str, Any] = {"__name__": "documentation"}
     for block in blocks(page):
         if block.language == "python" and block.skipped is None:
-            exec(compile("\n" * (block.line - 1) + block.text, str(page), "exec"), names)
+            exec(compile("\n" * (block.line - 1) + block.text, str(page), "exec", dont_inherit=True), names)
     AFTER.get(name_of(page), lambda names: None)(names)
 
 

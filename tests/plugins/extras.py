@@ -15,9 +15,9 @@ from neuprim.core.extensions import SceneExtension
 from neuprim.core.task import SceneSpec
 
 def load(settings, context):
-    from tests.core.tiny import TwoPrimitives
+    from tests.core.tiny import two_primitives
     assert settings == {"wobble": 2.0}
-    return TwoPrimitives()
+    return two_primitives()
 
 PLUGIN = SceneExtension(api=1, task="static", scene=SceneSpec("extra", "two ellipsoids", load), config_package="fake_extra.conf")
 """
@@ -42,7 +42,7 @@ PLUGIN = Exporter(api=1, name="extra", summary="nothing at all", write=lambda jo
 """
 INSPECTOR = """
 from neuprim.core.extensions import Inspector
-PLUGIN = Inspector(api=1, name="extra", summary="nothing at all", add=lambda plotter, frame: None)
+PLUGIN = Inspector(api=1, name="extra", summary="nothing at all", layers=lambda frame: [])
 """
 KINDS: dict[str, tuple[Group[Any], str, str, str]] = {
     "task": (TASKS, "extra", TOY.replace('name="toy"', 'name="extra"').replace("TASK", "PLUGIN"), "TaskSpec"),

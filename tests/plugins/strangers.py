@@ -36,8 +36,9 @@ PLUGIN = Exporter(api=1, name="centres", summary="centres as JSON", write=write)
 
 INSPECTOR = """
 from neuprim.core.extensions import Inspector
+from neuprim.plugins.inspect.layers import Points
 
-PLUGIN = Inspector(api=1, name="crumbs", summary="points", add=lambda plotter, frame: plotter.add_points(frame.box))
+PLUGIN = Inspector(api=1, name="crumbs", summary="points", layers=lambda frame: [Points(frame.box)])
 """
 
 

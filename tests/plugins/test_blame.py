@@ -21,11 +21,11 @@ from dataclasses import replace
 
 import torch
 
-from neuprim.core.data import Pixels, PointCloud
+from neuprim.core.data import Dataset, Pixels, PointCloud
 from neuprim.core.errors import DataError
 from neuprim.core.extensions import SceneExtension
 from neuprim.core.task import SceneSpec
-from tests.core.tiny import TwoPrimitives, Views
+from tests.core.tiny import Views, near_the_truth, two_primitives
 
 
 class MyViews(Views):
@@ -38,37 +38,20 @@ class MyViews(Views):
         return super().pixels(index)
 
 
-class Mine(TwoPrimitives):
-    def __init__(self):
-        super().__init__()
-        self.train, self.test = MyViews(6, 0.0), MyViews(2, 0.4)
-        {init}
-
-    def initial_points(self, count, generator):
-        {points}
-        return super().initial_points(count, generator)
-
-    def judge(self, index, rendered, truth):
-        {judge}
-        return {{}}
-
-    def mask(self, index):
-        {mask}
-        return None
-
-    def orbit(self, frames):
-        {orbit}
-        return super().orbit(frames)
+def start(views, count, generator):
+    {points}
+    return near_the_truth(views, count, generator)
 
 
 def load(settings, context):
+    changes = {{}}
     {load}
-    return Mine()
+    return two_primitives(views=MyViews, start=start, **changes)
 
 
 PLUGIN = SceneExtension(api=1, task="static", scene=SceneSpec("mine", "two ellipsoids", load), config_package="fake_scene.conf")
 """
-PLACES = ("view", "pixels", "init", "points", "judge", "mask", "orbit", "load")
+PLACES = ("view", "pixels", "points", "load")
 
 LOSS = """
 from neuprim.core.extensions import LossExtension
@@ -89,7 +72,8 @@ from neuprim.core.model.schema import ParameterSpec
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.task import SceneSpec, TaskSpec
 from neuprim.core.train.losses import l1
-from tests.core.tiny import TwoPrimitives
+from neuprim.core.data import Clip
+from tests.core.tiny import two_primitives
 
 
 class Plain(ColourField):
@@ -120,18 +104,54 @@ def check(model):
     {check}
 
 
+def mask(dataset, index):
+    {mask}
+
+
+def judge(dataset, index, rendered, truth):
+    {judge}
+    return {{}}
+
+
+def diagnose(dataset, model):
+    {diagnose}
+    return {{}}
+
+
+def clips(dataset):
+    {clips}
+    return ()
+
+
+def facts(dataset):
+    {facts}
+    return {{}}
+
+
+def orbit(dataset, frames):
+    {orbit}
+    return dataset.orbit(frames)
+
+
 TASK = TaskSpec(
     api=1,
     name="mine",
     summary="x",
     config_package="fake_task.conf",
-    scenes=(SceneSpec("two", "two ellipsoids", lambda s, c: TwoPrimitives()),),
+    scenes=(SceneSpec("two", "two ellipsoids", lambda s, c: two_primitives()),),
     build=build,
     loss=l1,
     check=check,
     fields={{"CosineDensity": CosineDensity, "Plain": Plain}},
+    mask=mask,
+    judge=judge,
+    diagnose=diagnose,
+    clips=clips,
+    facts=facts,
+    orbit=orbit,
 )
 """
+TASK_PLACES = ("start", "lower", "build", "check", "mask", "judge", "diagnose", "clips", "facts", "orbit")
 
 SMALL = ["renderer.backend=reference", "model.primitives=8", "train.iterations=4", "train.max_seconds=null", "output_dir=r"]
 
@@ -163,7 +183,7 @@ def loss(site: Path, **code: str) -> list[str]:
 
 
 def task(site: Path, **code: str) -> list[str]:
-    text = TASK.format(**{place: code.get(place, "pass") for place in ("start", "lower", "build", "check")})
+    text = TASK.format(**{place: code.get(place, "pass") for place in TASK_PLACES})
     conf = {"__init__.py": "", "task/mine.yaml": "{}", "scene/mine/two.yaml": "{}", "preset/mine/quick.yaml": "{}"}
     files = {"fake_task/__init__.py": text, **{f"fake_task/conf/{k}": v for k, v in conf.items()}}
     install(site, "fake-task", {"mine": "fake_task:TASK"}, files, version="2.0")
@@ -188,18 +208,16 @@ BOOM = "raise ValueError('boom\\n  twice')"
 
 CRASHES = {
     "loader": (scene, "load", "scene 'mine' of fake-scene 0.7", "load"),
-    "constructor": (scene, "init", "scene 'mine' of fake-scene 0.7", "__init__"),
     "view": (scene, "view", "scene 'mine' of fake-scene 0.7", "view"),
     "pixels": (scene, "pixels", "scene 'mine' of fake-scene 0.7", "pixels"),
-    "points": (scene, "points", "scene 'mine' of fake-scene 0.7", "initial_points"),
-    "judge": (scene, "judge", "scene 'mine' of fake-scene 0.7", "judge"),
-    "orbit": (scene, "orbit", "scene 'mine' of fake-scene 0.7", "orbit"),
+    "points": (scene, "points", "scene 'mine' of fake-scene 0.7", "start"),
     "loss factory": (loss, "make", "loss 'mine' of fake-loss 1.2", "make"),
     "loss": (loss, "loss", "loss 'mine' of fake-loss 1.2", "loss"),
     "check": (task, "check", "check of task 'mine' of fake-task 2.0", "check"),
     "build": (task, "build", "build of task 'mine' of fake-task 2.0", "build"),
     "initialiser": (task, "start", "task 'mine' of fake-task 2.0", "start"),
     "field": (task, "lower", "task 'mine' of fake-task 2.0", "lower"),
+    **{place: (task, place, "task 'mine' of fake-task 2.0", place) for place in ("mask", "judge", "diagnose", "clips", "facts", "orbit")},
 }
 
 
@@ -211,7 +229,7 @@ def test_a_crash_is_one_line_and_a_file(kind, place, who, function, site: Path, 
     file = traceback_of(message)
     text = file.read_text()
     assert text.startswith(f"{who} ({package}:") and "Traceback" in text and f", in {function}\n" in text and "ValueError: boom" in text
-    begun = place in ("judge", "orbit", "loss", "lower")  # after a step or two
+    begun = place in ("mask", "judge", "diagnose", "orbit", "loss", "lower")  # after a step or two; clips and facts are looked at before
     assert (file.parent == Path("r/logs").resolve()) == begun == Path("r").exists()
 
 
@@ -232,16 +250,45 @@ def test_a_loader_may_still_refuse_in_its_own_words(site: Path, capsys: pytest.C
         ({"load": "return [1]"}, "its loader returned a list; expected a neuprim.core.data.Dataset"),
         ({"pixels": "return Pixels(torch.zeros(3, 24, 24))"}, "train view v0: rgb is float32 (3, 24, 24); expected float32 (24, 24, 3)"),
         ({"pixels": "p = super().pixels(index); return replace(p, alpha=p.alpha[..., None])"}, "train view v0: alpha is float32 (24, 24, 1)"),
-        ({"init": "self.background = torch.ones(4)"}, "two: background is float32 (4,); expected float32 (3,), one number for each"),
-        ({"init": "self.test.cameras = []"}, "two: the test split is empty"),
+        ({"load": "changes['background'] = torch.ones(4)"}, "two: background is float32 (4,); expected float32 (3,), one number for each"),
+        ({"load": "made = two_primitives(); made.test.cameras = []; return made"}, "two: the test split is empty"),
         ({"points": "return PointCloud(torch.zeros(4, 3), torch.zeros(5, 3))"}, "two: starting points: colors is float32 (5, 3); expected float32 (4, 3)"),
         ({"pixels": "if index == 1: return Pixels(torch.zeros(2, 2, 3))"}, "train view v1: rgb is float32 (2, 2, 3); expected float32 (24, 24, 3)"),
-        ({"mask": "return torch.zeros(2, 2, dtype=torch.bool)"}, "test view v0: mask is bool (2, 2); expected bool (24, 24)"),
+        ({"load": "Dataset(name='two')"}, "TypeError: Dataset.__init__() missing 5 required keyword-only arguments: 'train', 'test', 'start'"),
+        ({"load": "class Mine(Dataset): pass"}, "TypeError: class Mine(Dataset): a data set is made by calling neuprim.core.data.Dataset(name="),
     ],
 )  # fmt: skip
 def test_broken_promises_name_the_scenes_package(code: dict[str, str], text: str, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     message = refusal([*scene(site, **code), "train.iterations=6"], capsys)
     assert message.startswith("scene 'mine' of fake-scene 0.7: ") and text in message
+
+
+@pytest.mark.parametrize(
+    ("code", "text"),
+    [
+        ({"mask": "import torch; return torch.zeros(2, 2, dtype=torch.bool)"}, "test view v0: mask is bool (2, 2); expected bool (24, 24)"),
+        ({"judge": "return [1]"}, "judge of test view v0: found a list; expected a dictionary with texts as keys"),
+        ({"judge": "return {'error': rendered.mean()}"}, "judge of test view v0: error is tensor("),
+        ({"judge": "return {'error': float('nan')}"}, "judge of test view v0: error is nan; expected a number"),
+        ({"judge": "return {'psnr': 3.0}"}, "judge of test view v0: psnr is a name that all views' numbers have"),
+        ({"diagnose": "return {'shape': {1, 2}}"}, "diagnose: shape cannot be written as JSON (Object of type set is not"),
+        ({"diagnose": "return {'error': float('inf')}"}, "diagnose: error cannot be written as JSON (Out of range float values"),
+        ({"clips": "return [3]"}, "clips: found a int in the list; expected a neuprim.core.data.Clip"),
+        ({"clips": "return None"}, "clips: found a NoneType; expected a list of neuprim.core.data.Clip"),
+        ({"clips": "return [Clip('round', ['v0'])]"}, "clips: 'round' has view 'v0'; expected indices below 2"),
+        ({"clips": "return [Clip('round', [0, 2])]"}, "clips: 'round' has view 2; expected indices below 2"),
+        ({"clips": "return [Clip('round', [])]"}, "clips: 'round' has no views; expected indices below 2"),
+        ({"facts": "return None"}, "facts: found a NoneType; expected a dictionary"),
+        ({"orbit": "return []"}, "orbit: found no views; expected some"),
+        ({"orbit": "return [3]"}, "orbit: found a int in the list; expected a neuprim.core.data.View"),
+    ],
+)
+def test_broken_promises_of_judging_name_the_tasks_package(
+    code: dict[str, str], text: str, site: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    message = refusal(task(site, **code), capsys)
+    assert message.startswith("task 'mine' of fake-task 2.0: ") and text in message
+    assert Path("r").exists() != ({"clips", "facts"} >= code.keys()), "what needs no model is looked at before training"
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from neuprim.conformance import CHECKS, ConformanceError, named_checks
-from neuprim.conformance.example import Example
+from neuprim.conformance.example import example
 from neuprim.core.cameras.rays import AnyCamera
-from neuprim.core.data import Pixels
+from neuprim.core.data import Clip, Dataset, Pixels
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
@@ -246,20 +246,15 @@ def timed(colour: type = Timed, parse: Callable[[str], list[Tensor]] = number, s
     return using(colour=colour, conditions=(ConditionSpec("time", (), "s", (0.0, 1.0), parse, sweep=sweep),), **more)
 
 
-class WithoutTime(Example):
-    def __init__(self) -> None:
-        super().__init__(())
+def bare() -> Dataset:
+    """Three channels, and no conditions."""
+    return example(())
 
 
-class ThreeChannels(Example):
-    def __init__(self) -> None:
-        super().__init__(())
-
-
-class Misfit(Example):
-    def __init__(self) -> None:
-        super().__init__(())
-        self.train.images[0] = Pixels(torch.zeros(4, 4, 3))  # type: ignore[attr-defined]
+def misfit() -> Dataset:
+    found = example(())
+    found.train.images[0] = Pixels(torch.zeros(4, 4, 3))  # type: ignore[attr-defined]
+    return found
 
 
 # ---------------------------------------------------------------- losses
@@ -319,6 +314,7 @@ def vague(model: Mapping[str, Any]) -> None:
 
 MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("members", "build is of type int", replace(TASK, build=3)),  # type: ignore[arg-type]
+    ("members", "judge is of type int; expected a function", replace(TASK, judge=3)),  # type: ignore[arg-type]
     ("members", "TaskSpec.fields", replace(TASK, fields=None)),
     ("files", "scene/static/ghost.yaml", replace(TASK, scenes=(*TASK.scenes, GHOST))),
     ("files", "train.rates.W1", replace(TASK, fields={"SphericalHarmonics": SphericalHarmonics})),
@@ -333,12 +329,12 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("initialisers", "density.parameters: 'W1': init: two draws with one seed", using(Lazy)),
     ("initialisers", "density.parameters: 'b2': init: start value: found shape (12,); expected (12, 1)", using(WrongStart)),
     ("initialisers", "density.parameters: 'b2': init: found the context's means, scales or colors changed in place", using(Meddler)),
-    ("dataset", "view train0: condition 'time'", timed(example=WithoutTime)),
-    ("dataset", "view train0: pixels: found (4, 4, 3)", using(example=Misfit)),
+    ("dataset", "view train0: condition 'time'", timed(example=bare)),
+    ("dataset", "view train0: pixels: found (4, 4, 3)", using(example=misfit)),
     (
         "display",
         "conformance example: 3 channels; expected 2, which task 'static' names: a, b",
-        using(channels=("a", "b"), example=ThreeChannels),
+        using(channels=("a", "b"), example=bare),
     ),
     ("display", "display gave torch.float32 of shape (9, 10, 2)", using(display=lambda image: image[..., :2])),
     ("display", "found its argument changed in place", using(display=lambda image: image.mul_(0.5))),
@@ -348,6 +344,20 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("loss", "no gradient", using(loss=detached)),
     ("loss", "loss part 'l1'", using(loss=wordy)),
     ("loss", "stopped by IndexError", using(loss=maskless)),
+    ("judging", "test view test0: mask is float32 (9, 10); expected bool", using(mask=lambda d, i: d.test.pixels(i).alpha)),
+    (
+        "judging",
+        "judge of test view test0: error is tensor(",
+        using(judge=lambda d, i, rendered, truth: {"error": (rendered - truth).mean()}),
+    ),
+    ("judging", "diagnose: means cannot be written as JSON", using(diagnose=lambda d, model: {"means": model.params["means"]})),
+    ("judging", "clips: 'all' has view 2; expected indices below 2", using(clips=lambda d: [Clip("all", range(3))])),
+    ("judging", "facts: extent cannot be written as JSON", using(facts=lambda d: {"extent": d.center})),
+    (
+        "judging",
+        "orbit: view orbit_000: condition 'time': found none",
+        timed(orbit=lambda d, n: [replace(v, conditions={}) for v in d.orbit(n)]),
+    ),
     ("lowered_forms", "density field Transposed lowered to Cosine: b2 has shape (1, 12); expected (12, 1) or (12,)", using(Transposed)),
     (
         "lowered_forms",

@@ -116,7 +116,7 @@ def test_what_it_wrote_starts_a_model_where_it_was(tmp_path: Path) -> None:
     path = export_run(run, "gaussian-ply", tmp_path / "g.ply", ["views=orbit", "size=moments"]).files[0]
     field = load_task("static").fields["SphericalHarmonics"](degree=1)  # type: ignore[index]
     settings = ModelSettings(primitives=9, init={"points": str(path)})
-    fresh = initial_model(CosineDensity(3), field, tiny.TwoPrimitives(), settings, 0)  # type: ignore[arg-type]
+    fresh = initial_model(CosineDensity(3), field, tiny.two_primitives(), settings, 0)  # type: ignore[arg-type]
     assert torch.allclose(fresh.params["means"], marked.PLACES, atol=0.01)
     assert torch.allclose(fresh.params["log_scales"], marked.RADII.log()[:, None], atol=0.1)
     assert torch.allclose(fresh.params["sh_dc"], open_run(run).model.params["sh_dc"], atol=1e-3)

@@ -16,7 +16,7 @@ from neuprim.core.volumes.grid import density_grid
 from neuprim.plugins.export import vdb as exporter
 from neuprim.runs.export import export_run
 from neuprim.runs.open import open_run
-from tests.core.openvdb_oracle import compare, environment, other_python
+from tests.core.io.vdb.openvdb_oracle import compare, environment, other_python
 from tests.plugins import marked
 
 
@@ -92,7 +92,7 @@ def test_errors_are_those_of_the_runs_own_comparison(moving: Path, tmp_path: Pat
 
     report = export_run(moving, "vdb", tmp_path / "frames")
     run = open_run(moving)
-    expected = compare_with_truth(run.model, run.volume().shoot, [0.0, 0.5, 1.0])["sigma_frames"]  # type: ignore[union-attr]
+    expected = compare_with_truth(run.model, run.volume().capture, [0.0, 0.5, 1.0])["sigma_frames"]  # type: ignore[union-attr]
     assert len(expected) == 3
     for entry in expected:
         name = f"frame_{entry['frame']:04d}"

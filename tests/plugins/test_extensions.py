@@ -164,7 +164,14 @@ MEMBERS = [
     ("exporter", 'options={"size": (1, "of it")}', "default='../x'", "Exporter.default is '../x'; expected the name of a file or folder"),
     ("exporter", 'options={"size": (1, "of it")}', "suffixes='.json'", "Exporter.suffixes is '.json'; expected a tuple"),
     ("exporter", 'options={"size": (1, "of it")}', "suffixes=('.JSON',)", "expected a tuple of such as '.json', in lower case"),
-    ("inspector", "add=lambda plotter, frame: None", "add='x'", "Inspector.add is of type str; expected a function"),
+    ("inspector", "layers=lambda frame: []", "layers='x'", "Inspector.layers is of type str; expected a function"),
+    ("inspector", "layers=lambda frame: []", "add=print", "Inspector.__init__() got an unexpected keyword argument 'add'"),
+    (
+        "inspector",
+        "layers=lambda frame: []",
+        "layers=lambda plotter, frame: None",
+        "Inspector.layers is a function of (plotter, frame); expected one of a frame alone, which returns layers",
+    ),
 ]
 
 

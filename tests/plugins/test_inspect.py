@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import base64
-import json
 import re
 import sys
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +19,16 @@ from neuprim.core.volumes.grid import density_at, density_grid, lattice
 from neuprim.plugins.inspect import ViewOptions, headless, views
 from neuprim.plugins.inspect.field import FieldFrame
 from neuprim.plugins.inspect.frames import box_of, condition_frames, corners, in_words, round_up
-from neuprim.plugins.inspect.page import encoded
+from neuprim.plugins.inspect.layers import Scale
+from neuprim.plugins.inspect.packing import encoded
 from neuprim.plugins.inspect.shapes import ellipsoids
 from neuprim.plugins.registry import load_task
 from neuprim.runs import inspect as inspecting
+from neuprim.runs.events import Event, Note
 from neuprim.runs.inspect import Request, inspect_run
 from neuprim.runs.open import load_dataset, load_run
 from tests.plugins import runs
+from tests.plugins.pages import array, layers_of
 from tests.systems import posix
 
 BUILT_IN = {i.name: i for i in (views.VOLUME, views.ISOSURFACE, views.SLICES, views.PRIMITIVES, views.PRIMITIVE, views.DIFFERENCE)}
@@ -47,8 +47,9 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def look(run_dir: Path, **words: Any) -> tuple[list[Path], list[str]]:
-    said: list[str] = []
-    return inspect_run(Request(run_dir, say=said.append, **words)), said
+    heard: list[Event] = []
+    paths = inspect_run(Request(run_dir, **words), heard.append)
+    return paths, [event.text for event in heard if isinstance(event, Note)]
 
 
 # ---------------------------------------------------------------- frames and boxes
@@ -124,7 +125,8 @@ def test_colours_are_the_models() -> None:
 def test_ellipsoids_have_their_radii_and_orientation() -> None:
     geometry = frame_of().geometry
     geometry.log_scales[0], geometry.quats[0] = torch.tensor([0.1, 0.2, 0.4]).log(), torch.tensor([0.9, 0.3, -0.2, 0.5])
-    points, faces = ellipsoids(geometry, 2)
+    axes = (geometry.rotations * geometry.scales[:, None, :]).transpose(1, 2)
+    points, faces = ellipsoids(geometry.means.numpy(), axes.numpy(), 2)
     assert faces.max() == len(points) - 1
     for n, part in enumerate(np.split(points, 2)):
         y = ((torch.from_numpy(part) - geometry.means[n]) @ geometry.rotations[n]) / geometry.scales[n]
@@ -157,7 +159,7 @@ def test_its_own_volume_agrees_with_the_model(run_dir: Path, tmp_path: Path) -> 
 
 def test_the_numbers_are_those_of_the_data_set(run_dir: Path, tmp_path: Path) -> None:
     config, task, model, _ = load_run(run_dir)
-    expected = {f["frame"]: f for f in load_dataset(config, task).diagnose(model)["sigma_frames"]}
+    expected = {f["frame"]: f for f in task.diagnose(load_dataset(config, task), model)["sigma_frames"]}
     for against in (str(run_dir.parent / "files"), "scene"):
         _, said = look(run_dir, conditions={"time": "0:1:20"}, grid=8, against=against, out=tmp_path / "x.vdb", overwrite=True)
         assert len(expected) == 3 and len(said) == 5
@@ -178,31 +180,37 @@ def test_a_page_holds_the_grids(run_dir: Path, tmp_path: Path) -> None:
     files = str(run_dir.parent / "files")
     words = {"conditions": {"time": "0,1"}, "grid": 12, "against": files, "show": ["slices", "primitives"]}
     (path,), _ = look(run_dir, out=tmp_path / "p.html", **words)
-    text = path.read_text()
-    assert not re.search(r"https?://|src=|@import", text), "a page needs no network"
-    found = re.search(r'type="application/json">(.*?)</script>', text, re.DOTALL)
-    assert found
-    data = json.loads(found[1])
-    assert data["first"] == "slices" and data["modes"] == ["volume", "isosurface", "slices", "difference", "primitives"]
+    assert not re.search(r"https?://|src=|@import", path.read_text()), "a page needs no network"
+    data = layers_of(path)
+    assert data["first"] == "slices" and list(data["views"]) == ["volume", "isosurface", "slices", "difference", "primitives"]
     assert [f["title"] for f in data["frames"]] == ["time 0", "time 1"]
-
-    def unpacked(name: str, kind: Any) -> np.ndarray:
-        return np.frombuffer(zlib.decompress(base64.b64decode(data["frames"][1][name])), kind)
-
-    low, high = np.array(data["box"])
-    matrix = torch.eye(4, dtype=torch.float64) * data["step"]
-    matrix[3, 3], matrix[:3, 3] = 1, torch.from_numpy(low + data["step"] / 2)
-    shape = tuple(data["shape"])
-    assert low + data["step"] * np.array(shape) == pytest.approx(high)
+    frame = data["frames"][1]
+    (model,), (truth,) = (frame["layers"]["slices"][side] for side in ("model", "truth"))
+    low, shape = np.array(model["low"]), tuple(model["shape"])
+    assert [low.tolist(), (low + model["size"]).tolist()] == pytest.approx(np.array(data["box"]))
+    matrix = torch.eye(4, dtype=torch.float64) * model["step"]
+    matrix[3, 3], matrix[:3, 3] = 1, torch.from_numpy(low + model["step"] / 2)
     expected = density_grid(runs.model(), {"time": torch.tensor(1.0)}, matrix, shape).numpy()
-    stored = (unpacked("sigma", np.uint8).reshape(shape, order="F") / 255.0) ** 2 * data["top"]
-    assert expected.max() > 1 and np.abs(stored - np.minimum(expected, data["top"])).max() < 0.01 * data["top"]
-    assert unpacked("truth", np.uint8).max() > 0 and unpacked("prims", "<f4").shape == (2 * 15,)
+    top = model["scale"]["high"]
+    stored = (array(frame, model["grid"], "u1").reshape(shape, order="F") / 255.0) ** 2 * top
+    assert model["code"] == "root" and expected.max() > 1 and np.abs(stored - np.minimum(expected, top)).max() < 0.01 * top
+    assert array(frame, truth["grid"], "u1").max() > 0
+    (shown,) = (layer for layer in frame["layers"]["primitives"]["model"] if layer["kind"] == "ellipsoids")
+    assert array(frame, shown["rows"], "<f4").shape == (2 * 15,)
+    grids = {layer["grid"] for view in frame["layers"].values() for side in view.values() for layer in side if "grid" in layer}
+    assert len(grids) == 3, "the model's, the truth's and their difference, each once, however many views show it"
 
 
-def test_eight_bits_keep_thin_matter() -> None:
+def test_eight_bits_keep_thin_matter_and_zero() -> None:
     sigma = np.array([0.0, 0.001, 0.5, 1.0, 7.0], np.float32)
-    assert encoded(sigma, 1.0).tolist() == [0, 8, 180, 255, 255]
+    stored, code = encoded(sigma, Scale(0.0, 1.0))
+    assert (stored.tolist(), code) == ([0, 8, 180, 255, 255], "root")
+    stored, code = encoded(np.array([-3.0, -1.0, -0.01, 0.0, 0.01, 0.25, 2.0]), Scale(-1.0, 1.0))
+    assert (stored.tolist(), code) == ([1, 1, 115, 128, 141, 192, 255], "signed")
+    assert (encoded(np.array([2.0, 3.0, 4.0]), Scale(2.0, 4.0))[0].tolist(), encoded(sigma, Scale(-2.0, 0.0))[1]) == (
+        [0, 128, 255],
+        "linear",
+    )
 
 
 # ---------------------------------------------------------------- refusals
@@ -215,7 +223,7 @@ def test_eight_bits_keep_thin_matter() -> None:
         (["--show", "volum", "--out", "x.html"], "did you mean 'volume'"),
         (["--show", "difference", "--out", "x.html"], "no ground truth; give --against"),
         (["--against", "nowhere", "--out", "x.vdb"], "no such file or folder"),
-        (["--primitive", "0", "--out", "x.html"], "not in a page"),
+        (["--primitive", "2", "--out", "x.html"], "the model has 2 primitives, 0 to 1"),
         (["--grid", "9999", "--out", "x.vdb"], "expected at most 1024"),
         (["--box=0,0", "--out", "x.vdb"], "lower and the upper corner"),
         (["--time", "2", "--out", "x.vdb"], "expected a time in 0..1"),

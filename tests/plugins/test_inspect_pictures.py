@@ -35,7 +35,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def look(run_dir: Path, **words: Any) -> list[Path]:
-    return inspect_run(Request(run_dir, **{"grid": 24, "size": (240, 200), "say": lambda text: None, **words}))
+    return inspect_run(Request(run_dir, **{"grid": 24, "size": (240, 200), **words}))
 
 
 def pixels(path: Path) -> np.ndarray:

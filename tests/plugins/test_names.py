@@ -30,6 +30,7 @@ from neuprim.plugins.registry import (
 from tests.plugins.extras import EXPORTER, INSPECTOR, LOSS, SCENE, add
 from tests.plugins.fakes import TOY, TOY_FILES, install, install_groups, site, toy
 from tests.plugins.marked import static_model, write_run
+from tests.plugins.pages import layers_of
 
 __all__ = ["site", "toy"]
 
@@ -159,13 +160,18 @@ def test_what_is_listed_says_how_to_choose_it(site: Path, toy: Path, capsys: pyt
     assert "  greedy-task:static  (greedy-task 0.3)" in capsys.readouterr().out
 
 
-def test_a_page_does_not_take_anothers_view_for_its_own(site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_page_keeps_anothers_view_apart_from_its_own(site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, name, source = TAKEN["inspector"]
-    install(site, "my-views", {name: "my_views:PLUGIN"}, {"my_views/__init__.py": source}, group=INSPECTORS.entry_points)
-    run = str(write_run(tmp_path / "run", static_model(), ["task=static", "scene=solids"]))
-    assert main(["inspect", run, "--show", "volume,my-views:slices", "--grid", "8", "--out", str(tmp_path / "x.html")]) == 2
-    assert "--show slices: not in a page" in capsys.readouterr().err
-    assert main(["inspect", run, "--show", "volume,slices", "--grid", "8", "--out", str(tmp_path / "x.html")]) == 0
+    other = source.replace("lambda frame: []", "lambda frame: [Text('of another')]")
+    files = {"my_views/__init__.py": f"from neuprim.plugins.inspect.layers import Text\n{other}"}
+    install(site, "my-views", {name: "my_views:PLUGIN"}, files, group=INSPECTORS.entry_points)
+    run, page = str(write_run(tmp_path / "run", static_model(), ["task=static", "scene=solids"])), tmp_path / "x.html"
+    assert main(["inspect", run, "--show", "volume,my-views:slices", "--grid", "8", "--out", str(page)]) == 0
+    (frame,) = layers_of(page)["frames"]
+    assert [layer["kind"] for layer in frame["layers"]["slices"]["model"]] == ["slices"]
+    assert frame["layers"]["my-views:slices"]["model"] == [{"kind": "text", "text": "of another", "corner": "lower_right"}]
+    assert main(["inspect", run, "--show", "volume,slices", "--grid", "8", "--out", str(page), "--force"]) == 0
+    assert "my-views:slices" not in page.read_text()
     assert "--show my-views:slices chooses the other" in capsys.readouterr().err
 
 

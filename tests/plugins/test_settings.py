@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 from neuprim.cli import main
 from neuprim.config import RunConfig, compose
 from neuprim.conformance import ConformanceError, named_checks
+from neuprim.core.checked import Range
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.task import Supervision
@@ -104,6 +105,21 @@ def check(model):
     assert toys("task.options.gain=5").options == {"gain": 5.0}
     with pytest.raises(ConfigError, match=r"task.options.gain=6.0: expected at most 5"):
         toys("task.options.gain=6")
+
+
+def test_an_option_may_say_its_bounds_and_choices(toy: Path) -> None:
+    source = (toy / "__init__.py").read_text()
+    imports = "from typing import Annotated\nfrom neuprim.core.checked import Range\n"
+    more = (
+        '"gain": (1.0, "of the amplifier", Annotated[float, Range(above=0, at_most=5)]), "form": ("soft", "of the knee", ("soft", "hard"))'
+    )
+    (toy / "__init__.py").write_text(imports + source.replace('"gain": (1.0, "of the amplifier")', more))
+    assert toys("task.options.gain=5", "task.options.form=hard").options == {"gain": 5.0, "form": "hard"}
+    with pytest.raises(ConfigError, match=r"^task\.options\.gain=6: expected a number above 0 and at most 5$"):
+        toys("task.options.gain=6")
+    with pytest.raises(ConfigError, match=r"^task\.options\.form=wet: expected soft or hard$"):
+        toys("task.options.form=wet")
+    assert main(["tasks"]) == 0
 
 
 # ---------------------------------------------------------------- options of losses
@@ -214,7 +230,7 @@ def test_run_directories_from_before_still_load(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("task", ["static", "dynamic", "relight"])
 def test_names_of_initial_values_and_rates_are_checked_before_data(task: str) -> None:
-    with pytest.raises(ConfigError, match=r"model.init.alhpa: no such setting; did you mean 'alpha'"):
+    with pytest.raises(ConfigError, match=r"model.init.alhpa: no such setting; did you mean 'model.init.alpha'"):
         compose([f"task={task}", "model.init.alhpa=0.3"], False)
     with pytest.raises(ConfigError, match=r"train.rates.mean: no such parameter; did you mean 'means'"):
         compose([f"task={task}", "train.rates.mean=0.3"], False)
@@ -262,6 +278,11 @@ def test_conformance_notices_settings_that_are_read_and_not_declared() -> None:
         ({"options": {"gain": (1.0, None)}}, "options['gain'] is (1.0, None); expected (default, one line of help)"),
         ({"options": {"a b": (1.0, "x")}}, "options has 'a b'; expected a name"),
         ({"options": {"gain": (object, "x")}}, "options['gain'] has a default of type type; expected what a YAML file can hold"),
+        (
+            {"options": {"gain": (2.0, "x", Annotated[float, Range(0, 1)])}},
+            "the default of options['gain']=2.0: expected a number from 0 to 1",
+        ),
+        ({"options": {"gain": ("soft", "x", ("hard", "even"))}}, "the default of options['gain']=soft: expected hard or even"),
         ({"uses": 3}, "uses is of type int; expected a tuple"),
         ({"uses": ("model.primitives",)}, "uses has 'model.primitives'; expected some of model.neurons"),
         ({"uses": ("neurons",)}, "uses has 'neurons'; expected some of"),
@@ -311,7 +332,7 @@ def test_a_loss_sees_view_mask_alpha_and_progress() -> None:
     from tests.core import tiny
 
     seen: list[tuple[Tensor, Tensor, Supervision]] = []
-    data: Dataset = tiny.TwoPrimitives(random_background=True)
+    data: Dataset = tiny.two_primitives(random_background=True)
     mask = torch.ones(tiny.SIZE, tiny.SIZE, dtype=torch.bool)
     mask[:, 12:] = False
     data.train.images = [replace(p, mask=mask) for p in data.train.images]  # type: ignore[attr-defined]

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import json
 import re
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -36,6 +34,7 @@ from neuprim.runs.inspect import Request, inspect_run
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, load_run, read_metrics
 from tests.plugins.fakes import site
+from tests.plugins.pages import array, layers_of
 from tests.plugins.spectral import NAMES, fit, forget, install_spectral
 
 __all__ = ["site"]
@@ -158,9 +157,10 @@ def test_webp_is_a_picture_of_the_display(trained: Path, tmp_path: Path) -> None
 
 def test_the_inspectors_page_has_the_displays_colours(trained: Path, tmp_path: Path) -> None:
     said: list[str] = []
-    inspect_run(Request(trained, ("primitives",), grid=8, out=tmp_path / "page.html", say=said.append))
-    data = json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', (tmp_path / "page.html").read_text(), re.S)[1])  # type: ignore[index]
-    found = np.frombuffer(zlib.decompress(base64.b64decode(data["frames"][0]["prims"])), "<f4").reshape(-1, 15)[:, 12:]
+    inspect_run(Request(trained, ("primitives",), grid=8, out=tmp_path / "page.html"), lambda event: said.append(event.text))
+    (frame,) = layers_of(tmp_path / "page.html")["frames"]
+    (shown,) = (layer for layer in frame["layers"]["primitives"]["model"] if layer["kind"] == "ellipsoids")
+    found = array(frame, shown["rows"], "<f4").reshape(-1, 15)[:, 12:]
     _, task, model, _ = load_run(trained)
     assert task.display is not None
     values = model.params["logit"].sigmoid()
@@ -231,7 +231,7 @@ def test_without_a_display_it_is_said_what_is_shown(site: Path, tmp_path: Path, 
     assert lines == [f"shown: {SHOWN}; --format exr and npy hold all channels"]
     render_run(out, "orbit", None, "exr", tmp_path / "exr", 1, {}, tell=lines.append)
     assert len(lines) == 1
-    inspect_run(Request(out, ("primitives",), grid=8, out=tmp_path / "page.html", say=lines.append))
+    inspect_run(Request(out, ("primitives",), grid=8, out=tmp_path / "page.html"), lambda event: lines.append(event.text))
     assert f"shown: {SHOWN}" in lines
     monkeypatch.setattr(mesh, "_sample", lambda *a: pytest.fail("too late"))
     with pytest.raises(ConfigError, match=r"5 channels, .* and task 'spectral' has no display that makes these"):

@@ -266,7 +266,7 @@ def test_options_have_their_defaults_and_limits(site: Path, run_dir: Path, tmp_p
     for word, text in (
         ("digits=10", "digits=10: expected a whole number from 0 to 9"),
         ("digits=1.5", "digits=1.5: expected a whole number from 0 to 9"),
-        ("scale=nan", "scale=nan: expected a number"),
+        ("scale=nan", "scale=nan: expected a finite number"),
         ("pretty=1", "pretty=1: expected true or false"),
         ("up=x", "up=x: expected y or z"),
         ("wavelength_shift=0,1", "given twice"),
@@ -335,30 +335,15 @@ def test_a_crash_of_a_reader(site: Path, run_dir: Path, tmp_path: Path) -> None:
 def test_a_crash_of_an_inspector(
     site: Path, run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The window is one that only calls its inspectors, so that this runs without a display or VTK."""
-
-    class Shown:
-        def __init__(self, panels: list[tuple], *_: object) -> None:  # type: ignore[type-arg]
-            self.panels = panels
-
-        def draw(self, frame: object) -> None:
-            for inspector, _ in self.panels:
-                inspector.add(None, frame)
-
-        def close(self) -> None:
-            pass
-
-    monkeypatch.setattr("neuprim.runs.inspect.Window", Shown)
-    monkeypatch.setattr("neuprim.runs.inspect.require_pyvista", lambda: None)
-    monkeypatch.setattr("neuprim.runs.inspect.prepare_headless", lambda: None)
-    add(site, "inspector", INSPECTOR)  # its plotter is None here
-    assert call("inspect", run_dir, "--show", "crumbs", "--grid", "8", "--out", tmp_path / "a.png") == 2
+    add(site, "inspector", INSPECTOR.replace("frame.box", "frame.nowhere"))
+    assert call("inspect", run_dir, "--show", "crumbs", "--grid", "8", "--out", tmp_path / "a.html") == 2
     error = one_line(capsys)
-    assert "inspector 'crumbs' of strange-inspector 0.3 crashed: AttributeError: 'NoneType' object has no attribute 'add_points'" in error
+    assert "inspector 'crumbs' of strange-inspector 0.3 crashed: AttributeError: 'FieldFrame' object has no attribute 'nowhere'" in error
     path = Path(error.strip().rpartition("traceback in ")[2])
-    assert path.parent == run_dir / "logs" and "strange_inspector.py" in path.read_text() and not (tmp_path / "a.png").exists()
-    with pytest.raises(AttributeError):  # neuprim's own
-        inspect_run(Request(run_dir, ["slices"], grid=8, out=tmp_path / "a.png", say=lambda text: None))
+    assert path.parent == run_dir / "logs" and "strange_inspector.py" in path.read_text() and not (tmp_path / "a.html").exists()
+    monkeypatch.setattr("neuprim.plugins.inspect.views.Slices", None)
+    with pytest.raises(TypeError, match="not callable"):  # neuprim's own
+        inspect_run(Request(run_dir, ["slices"], grid=8, out=tmp_path / "a.html"))
 
 
 def test_the_package_of_a_name_that_two_have(site: Path) -> None:
@@ -379,7 +364,7 @@ def test_an_inspector_of_strangers_still_draws(site: Path, run_dir: Path, tmp_pa
     except BackendUnavailable as error:
         pytest.skip(str(error))
     add(site, "inspector", INSPECTOR)
-    request = Request(run_dir, ["crumbs"], grid=8, out=tmp_path / "a.png", size=(80, 60), say=lambda text: None)
+    request = Request(run_dir, ["crumbs"], grid=8, out=tmp_path / "a.png", size=(80, 60))
     (path,) = inspect_run(request)
     with Image.open(path) as picture:
         assert picture.size == (80, 60)

@@ -27,6 +27,7 @@ from neuprim.plugins.members import fault
 from neuprim.plugins.registry import TASKS, list_tasks, load_task
 from neuprim.runs.open import load_run, read_metrics
 from tests.plugins.fakes import site, uninstall
+from tests.plugins.pages import layers_of
 from tests.plugins.spectral import NAMES, PACKAGE, fit, forget, install_spectral
 
 __all__ = ["site"]
@@ -133,7 +134,7 @@ def test_its_exporter_and_inspector(package: Path, tmp_path: Path, capsys: pytes
     assert call(*table, *advice, "most=3", "--out", tmp_path / "a.json") == 0
     assert len(json.loads((tmp_path / "a.json").read_text())) == 3
     for word, text in (
-        ("digits=x", "digits=x: expected a whole number from 0 to 12"),
+        ("digits=x", "digits=x: expected a whole number from 0 to 12, or null"),
         ("digts=3", "digts: no such option of --format spectra; did you mean 'digits'?"),
         ("wavelength-shift=0:1", "--wavelength-shift 0:1: 60 values; expected one value"),
     ):
@@ -141,9 +142,11 @@ def test_its_exporter_and_inspector(package: Path, tmp_path: Path, capsys: pytes
         assert refusal(capsys, *table, *spoken, word, "--force") == text
     assert refusal(capsys, *table, *advice, "--out", tmp_path / "a.txt").endswith("expected a file name that ends in .csv or .json")
 
-    pytest.importorskip("pyvista", exc_type=ImportError)
     view = ["inspect", out, "--show", "bands", "--grid", "8"]
-    assert "--show bands: not in a page" in refusal(capsys, *view, "--out", tmp_path / "page.html")
+    assert call(*view, "--out", tmp_path / "page.html") == 0
+    (frame,) = layers_of(tmp_path / "page.html")["frames"]
+    assert [layer["kind"] for layer in frame["layers"]["bands"]["model"]] == ["points"]
+    pytest.importorskip("pyvista", exc_type=ImportError)
     assert call(*view, "--out", tmp_path / "bands.png") == 0
     with Image.open(tmp_path / "bands.png") as picture:
         assert np.asarray(picture.convert("RGB")).std() > 1
@@ -210,7 +213,7 @@ def test_conformance_finds_it(module: str, old: str, new: str, check: str, text:
 
 
 def test_a_package_that_raises_on_import_breaks_itself_alone(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    install_spectral(site, {"__init__": ("from neuprim.core.choices", 'raise RuntimeError("no licence")\nfrom neuprim.core.choices')})
+    install_spectral(site, {"__init__": ("from neuprim.core.checked", 'raise RuntimeError("no licence")\nfrom neuprim.core.checked')})
     assert call("tasks") == 0
     said = capsys.readouterr().out
     assert said.count("BROKEN") == said.count("RuntimeError: no licence") == 4, "task, loss, exporter and inspector"

@@ -55,7 +55,7 @@ def test_a_short_run_learns(tmp_path: Path) -> None:
 def test_wrong_settings_are_refused_before_data_are_loaded() -> None:
     with pytest.raises(ConfigError, match=r"model.density.deviations: 20.0 standard deviations; expected 0.5 to 10"):
         compose(["task=gaussian", "model.density.deviations=20.0"])
-    with pytest.raises(ConfigError, match="did you mean 'deviations'"):
+    with pytest.raises(ConfigError, match=r"did you mean 'model\.density\.deviations'"):
         compose(["task=gaussian", "+model.density.deviation=2"])
 
 

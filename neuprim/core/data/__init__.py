@@ -1,5 +1,5 @@
 """What a data set hands to the trainer, and what loaders of posed images share."""
 
-from neuprim.core.data.dataset import Clip, Dataset, DataSource, Pixels, PointCloud, View, ViewSet, camera_extent
+from neuprim.core.data.dataset import Clip, Dataset, DataSource, Pixels, PointCloud, StartingPoints, View, ViewSet, camera_extent
 
-__all__ = ["Clip", "DataSource", "Dataset", "Pixels", "PointCloud", "View", "ViewSet", "camera_extent"]
+__all__ = ["Clip", "DataSource", "Dataset", "Pixels", "PointCloud", "StartingPoints", "View", "ViewSet", "camera_extent"]

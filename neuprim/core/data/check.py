@@ -7,7 +7,7 @@ each split, before a run starts.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -17,8 +17,11 @@ from neuprim.core.cameras.rays import AnyCamera, RayCamera
 from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, View, ViewSet
 from neuprim.core.errors import DataError
 from neuprim.core.model.fields import ConditionSpec
+from neuprim.core.volumes.source import Placement
 
-__all__ = ["DatasetFault", "check_dataset", "check_mask", "check_pixels", "check_points"]
+__all__ = ["DatasetFault", "check_dataset", "check_mask", "check_pixels", "check_points", "extra_of"]
+
+Extra = TypeVar("Extra")
 
 
 class DatasetFault(DataError):
@@ -97,18 +100,29 @@ def check_points(cloud: PointCloud, count: int, dataset: Dataset) -> None:
         _floats(f"{where}: condition {name!r}", value, (found,))
 
 
+def extra_of(dataset: Dataset, kind: type[Extra]) -> Extra | None:
+    """``dataset.extra``, for the task that knows what it is.
+
+    Raises:
+        DatasetFault: it is neither None nor of that class.
+    """
+    extra = dataset.extra
+    if extra is None or isinstance(extra, kind):
+        return extra
+    raise DatasetFault(f"{dataset.name}: extra is {_described(extra)}; expected a {kind.__module__}.{kind.__qualname__}, or None")
+
+
 # ---------------------------------------------------------------- members and views
 
 
 def _members(dataset: Dataset) -> None:
-    who = str(getattr(dataset, "name", type(dataset).__name__))
-    for name in ("name", "train", "test", "channels", "color_space", "data_source", "extent", "background", "up", "center"):
-        if not hasattr(dataset, name):
-            raise DatasetFault(f"{who}: {name} is missing; see neuprim.core.data.Dataset")
+    who = str(dataset.name)
     for split in ("train", "test"):
         value = getattr(dataset, split)
         if not isinstance(value, ViewSet):
             raise DatasetFault(f"{who}: {split} is {_described(value)}; expected a neuprim.core.data.ViewSet")
+    if not callable(dataset.start):
+        raise DatasetFault(f"{who}: start is {_described(dataset.start)}; expected a function of (views, count, generator)")
     channels, extent, bounds = dataset.channels, dataset.extent, dataset.bounds
     if not isinstance(channels, int) or channels < 1:
         raise DatasetFault(f"{who}: channels is {channels!r}; expected a whole number, 1 or more")
@@ -121,6 +135,10 @@ def _members(dataset: Dataset) -> None:
     _floats(f"{who}: center", dataset.center, (3,))
     if bounds is not None:
         _floats(f"{who}: bounds", bounds, (2, 3), ", lower and upper corner, or None")
+    if not isinstance(dataset.exposure, (int, float)) or not 0 < dataset.exposure < float("inf"):
+        raise DatasetFault(f"{who}: exposure is {dataset.exposure!r}; expected a positive number")
+    if not isinstance(dataset.placement, Placement | None):
+        raise DatasetFault(f"{who}: placement is {_described(dataset.placement)}; expected a {Placement.__module__}.Placement, or None")
 
 
 def _view(view: View, where: str, conditions: Sequence[ConditionSpec]) -> None:

@@ -3,30 +3,25 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.data import Dataset, PointCloud, ViewSet, camera_extent
+from neuprim.core.data import Dataset, PointCloud, StartingPoints, camera_extent
 from neuprim.core.data.context import SceneContext
 from neuprim.core.data.focus import focus_point
 from neuprim.core.data.initial import initial_points
+from neuprim.core.data.settings import FolderSettings
 from neuprim.core.data.views import ImageFrame, ImageViews
 from neuprim.core.errors import ConfigError, DataError
 
-__all__ = ["IMAGE_SUFFIXES", "PosedImages", "StartingPoints", "every_nth", "find_image", "missing_files", "posed_images", "unique_names"]
+__all__ = ["IMAGE_SUFFIXES", "every_nth", "find_image", "missing_files", "posed_images", "unique_names"]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG", ".EXR")
 _LISTED = 10
-
-Made = TypeVar("Made", bound="PosedImages")
-
-StartingPoints = Callable[[ViewSet, int, torch.Generator], PointCloud]
-"""(training views, count, generator) -> at most ``count`` distinct starting points."""
 
 
 def find_image(folder: Path, text: str) -> Path | None:
@@ -72,70 +67,34 @@ def every_nth(frames: Sequence[ImageFrame], n: int) -> tuple[list[ImageFrame], l
     return [f for i, f in enumerate(frames) if i % n], list(frames[::n])
 
 
-class PosedImages(Dataset):
-    """Image files with poses, and a rule for starting points."""
-
-    train: ImageViews
-    test: ImageViews
-
-    def __init__(
-        self,
-        name: str,
-        train: ImageViews,
-        test: ImageViews,
-        linear: bool,
-        background: Tensor,
-        random_background: bool,
-        downsampling: str,
-        up: Tensor,
-        start: StartingPoints,
-    ) -> None:
-        cameras = [train.view(i).camera for i in range(len(train))]
-        self.name = name
-        self.train = train
-        self.test = test
-        self.channels = 3
-        self.color_space = "linear" if linear else "srgb"
-        self.data_source = "real"
-        self.extent = camera_extent(cameras)
-        self.background = background
-        self.random_background = random_background
-        self.downsampling = downsampling
-        self.up = up
-        self.center = focus_point(cameras).float()
-        self._start = start
-
-    def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
-        """Those of the training views, by the rule that the loader chose."""
-        return self._start(self.train, count, generator)
-
-
 def posed_images(
     where: str,
     name: str,
     train: Sequence[ImageFrame],
     test: Sequence[ImageFrame],
-    settings: Mapping[str, Any],
+    settings: FolderSettings,
     context: SceneContext,
     up: Tensor | None = None,
     points: PointCloud | None = None,
     prefix: str = "",
     start: StartingPoints | None = None,
     to_linear: bool = False,
-    kind: type[Made] = PosedImages,  # type: ignore[assignment]
-) -> Made:
-    """The data set of two splits.
+    exposure: float | Callable[[ImageViews], float] = 1.0,
+    extra: object = None,
+) -> Dataset:
+    """The data set of two splits, whose view sets are :class:`~neuprim.core.data.views.ImageViews`.
 
     Args:
         where: file or folder that errors name.
-        settings: the common settings, already checked.
+        settings: the common settings.
         up: (3,) upward direction; None takes the mean of the cameras' own.
         points: starting points that the format brings, if any.
         prefix: reduction already in the files, e.g. "images_4".
         start: another rule for starting points; None takes ``points``, else the visual hull of the alpha masks, else a box in
             front of the cameras, which suits scenes at rest (:func:`neuprim.core.data.initial.initial_points`).
         to_linear: turn sRGB files into linear light.
-        kind: the class to make.
+        exposure: what linear values are divided by, or how that number follows from the training views.
+        extra: see :class:`~neuprim.core.data.dataset.Dataset`.
 
     Raises:
         DataError: an empty split, an image without alpha beside one with, sRGB beside linear files, or damaged images.
@@ -153,26 +112,34 @@ def posed_images(
                 f"{frame.path}: image has {frame.info.channels} channels, {both[0].path} has {both[0].info.channels}; expected all RGB or all RGBA"
             )
     alpha = both[0].info.channels == 4
-    background = settings["background"]
+    background: str = settings.background
     if background == "auto":
         background = "white" if alpha else "black"
     if background == "random" and not alpha:
         raise ConfigError(f"scene.background is 'random', but the images in {where} have no alpha; expected auto, white or black")
-    factor = settings["downsample"]
+    factor = settings.downsample
     views = [ImageViews(frames, factor, to_linear=to_linear) for frames in (train, test)]
-    if settings["preload"]:
+    if settings.preload:
         for split, images in zip(("training", "test"), views, strict=True):
             images.preload(lambda fraction, split=split: context.progress(f"reading {split} images", fraction))  # type: ignore[misc]
-    return kind(
+    divisor = exposure(views[0]) if callable(exposure) else exposure
+    for images in views:
+        images.scale = 1.0 / divisor
+    cameras = [views[0].view(i).camera for i in range(len(views[0]))]
+    return Dataset(
         name=name,
         train=views[0],
         test=views[1],
-        linear=to_linear or both[0].info.linear,
+        start=start or (lambda views, count, generator: initial_points(views, points, count, generator)),
+        extent=camera_extent(cameras),
+        color_space="linear" if to_linear or both[0].info.linear else "srgb",
         background=torch.full((3,), 0.0 if background == "black" else 1.0),
         random_background=background == "random",
         downsampling=", then ".join(t for t in (prefix, _reduction(both, views[0].view(0).camera, factor)) if t) or "none",
         up=_mean_up([f.camera for f in train]) if up is None else up,
-        start=start or (lambda views, count, generator: initial_points(views, points, count, generator)),
+        center=focus_point(cameras).float(),
+        exposure=divisor,
+        extra=extra,
     )
 
 

@@ -1,11 +1,15 @@
-"""What a data set hands to the trainer: posed images that load lazily, and where matter may be at the start."""
+"""What a loader hands over: two sets of posed images that load lazily, what is known of them, and where matter may be at the start.
+
+A :class:`Dataset` describes and decides nothing: what a model is judged by, which films are made and what its file says about the data
+is the task's, see :class:`~neuprim.core.task.TaskSpec`.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal, final
 
 import torch
 from torch import Tensor
@@ -15,10 +19,9 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Conditions
 
 if TYPE_CHECKING:
-    from neuprim.core.model.primitives import Primitives
     from neuprim.core.volumes.source import Placement
 
-__all__ = ["Clip", "DataSource", "Dataset", "Pixels", "PointCloud", "View", "ViewSet", "camera_extent"]
+__all__ = ["Clip", "DataSource", "Dataset", "Pixels", "PointCloud", "StartingPoints", "View", "ViewSet", "camera_extent"]
 
 DataSource = Literal["real", "generated", "simulated"]
 """Photographs or captures ("real"), our own ray-cast scenes ("generated"), stand-ins for data not given ("simulated")."""
@@ -114,41 +117,62 @@ class Clip:
     source: ViewSet | None = None
 
 
-class Dataset(ABC):
-    """A scene to fit.
+StartingPoints = Callable[[ViewSet, int, torch.Generator], PointCloud]
+"""(training views, count, generator) -> at most ``count`` distinct starting points; the only randomness is the generator's."""
+
+
+@final
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Dataset:
+    """A scene to fit: a description of its images and the images themselves. There is no class to derive from it.
 
     Attributes:
         name: shown in reports.
         train, test: the splits.
+        start: where primitives start, see :data:`StartingPoints`.
+        extent: scene extent in scene units (see :func:`camera_extent`), the unit of position rates and size limits.
+        background: (C,) the colour that evaluation composites over.
         channels: colour channels C.
         color_space: "srgb" (display-referred values as stored in PNG) or "linear".
         data_source: see :data:`DataSource`; printed in every output.
-        extent: scene extent in scene units (see :func:`camera_extent`), the unit of position rates and size limits.
-        background: (C,) the colour that evaluation composites over.
         random_background: whether training composites a random colour instead (needs alpha).
         downsampling: text for reports, e.g. "none", "images_4" or "200x200 from 800x800 by area".
-        up: (3,) the scene's upward direction, for orbits.
-        center: (3,) what the cameras look at, for orbits.
+        up: (3,) the scene's upward direction, for orbits; +z unless said.
+        center: (3,) what the cameras look at, for orbits; the origin unless said.
         bounds: (2, 3) lower and upper corner of a box around everything, scene units; None if the data do not say.
+        exposure: what the linear values of the files were divided by.
+        placement: how scene units follow from the world of the voxel files that the scene was made from; None without such files.
+        extra: what else the scene's own task likes to know, of the class that this task names, e.g. what pixels show or what the images
+            were made from. None is always enough: a task judges by images, cameras and conditions then.
     """
 
     name: str
     train: ViewSet
     test: ViewSet
-    channels: int
-    color_space: Literal["srgb", "linear"]
-    data_source: DataSource
+    start: StartingPoints
     extent: float
     background: Tensor
-    random_background: bool
-    downsampling: str
-    up: Tensor
-    center: Tensor
+    channels: int = 3
+    color_space: Literal["srgb", "linear"] = "srgb"
+    data_source: DataSource = "real"
+    random_background: bool = False
+    downsampling: str = "none"
+    up: Tensor = field(default_factory=lambda: torch.tensor([0.0, 0.0, 1.0]))
+    center: Tensor = field(default_factory=lambda: torch.zeros(3))
     bounds: Tensor | None = None
+    exposure: float = 1.0
+    placement: Placement | None = None
+    extra: object = None
 
-    @abstractmethod
+    def __init_subclass__(cls) -> None:
+        raise TypeError(
+            f"class {cls.__name__}(Dataset): a data set is made by calling neuprim.core.data.Dataset(name=..., train=..., test=..., ...); "
+            "what a class of its own would judge, film or tell is the task's"
+        )
+
     def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
-        """At most ``count`` distinct starting points; the only randomness is ``generator``'s."""
+        """At most ``count`` distinct starting points, by the data set's own rule."""
+        return self.start(self.train, count, generator)
 
     def uniform_points(self, count: int, generator: torch.Generator) -> PointCloud:
         """``count`` mid-grey points, uniform in the box of the data set.
@@ -162,40 +186,11 @@ class Dataset(ABC):
         means = low + torch.rand((count, 3), generator=generator) * (high - low)
         return PointCloud(means, torch.full((count, self.channels), 0.5))
 
-    def clips(self) -> list[Clip]:
-        """Films to make of the test views, or of views kept for films; none by default."""
-        return []
-
-    def mask(self, index: int) -> Tensor | None:
-        """(H, W) bool, the part of a test view whose error is worth reporting on its own; None: no such part."""
-        return None
-
-    def judge(self, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
-        """Further numbers of one test view, by name, which ``metrics.json`` gives per view and as means over the views that have them.
-
-        Means are plain, but ``mse_NAME`` becomes ``psnr_pooled_NAME``, the PSNR of the mean over views, each of which counts by its
-        ``pixels_NAME`` where it says so; ``pixels_NAME`` becomes a sum.
-
-        Args:
-            index: of the test split.
-            rendered, truth: (H, W, C) in the data set's colour space, over its background.
-        """
-        return {}
-
-    def diagnose(self, model: Primitives) -> dict[str, Any]:
-        """Further JSON-able numbers for ``metrics.json`` that only this kind of data can tell."""
-        return {}
-
-    def placement(self) -> Placement | None:
-        """How scene units follow from the world of the voxel files that the scene was made from; None without such files."""
-        return None
-
-    def facts(self) -> dict[str, Any]:
-        """JSON-able facts that drawing the model may need when the data are gone; kept in the model's header under "data"."""
-        return {"up": [float(x) for x in self.up], "center": [float(x) for x in self.center]}
-
     def orbit(self, frames: int) -> list[View]:
-        """Views circling the scene at the training cameras' mean distance and elevation."""
+        """Views circling the scene at the training cameras' mean distance and elevation.
+
+        Conditions that are one number go from their least to their greatest value over the training views; others stay as in the first.
+        """
         cameras = [self.train.view(i).camera for i in range(len(self.train))]
         offsets = torch.stack([c.position for c in cameras]) - self.center.double()
         radius = offsets.norm(dim=-1).mean().item()
@@ -203,8 +198,9 @@ class Dataset(ABC):
         sine = ((offsets @ up) / offsets.norm(dim=-1).clamp_min(1e-12)).mean().clamp(-0.9, 0.9)
         views = orbit(cameras[0], self.center, self.up, radius, torch.asin(sine).item(), frames)
         between = self._scalar_conditions()
+        held = {name: value for name, value in self.train.view(0).conditions.items() if name not in between}
         return [
-            View(f"orbit_{i:03d}", c, {name: low + i / max(frames - 1, 1) * (high - low) for name, (low, high) in between.items()})
+            View(f"orbit_{i:03d}", c, {**held, **{n: low + i / max(frames - 1, 1) * (high - low) for n, (low, high) in between.items()}})
             for i, c in enumerate(views)
         ]
 

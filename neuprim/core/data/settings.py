@@ -1,77 +1,49 @@
-"""Settings of the loaders: what each accepts, checked before any file is touched."""
+"""Settings of the loaders of posed images: what all have in common, declared once."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
-from neuprim.core.errors import ConfigError, DataError, nearest
+from neuprim.core.checked import Range, text, verify
+from neuprim.core.errors import DataError
 
-__all__ = ["BACKGROUNDS", "Setting", "count", "data_folder", "flag", "read_settings", "text"]
+__all__ = ["Background", "EveryNth", "FolderSettings", "HoldOut", "SplitName", "data_folder"]
 
-BACKGROUNDS = ("auto", "white", "black", "random")
+Background = Literal["auto", "white", "black", "random"]
+
+EveryNth = Annotated[int, Range(at_least=2)]
+"""Every n-th image is held out."""
+
+HoldOut = Annotated[int, Range(at_least=2, also=(0,))]
+"""The same, or 0 where a split of its own is there to test on."""
+
+SplitName = Annotated[str, text("the name in transforms_NAME.json")]
 
 
 @dataclass(frozen=True)
-class Setting:
-    """One key of a scene's settings: its default, what it expects in words, and the test of a value."""
+class FolderSettings:
+    """What every loader of a folder with posed images is told; a loader derives a class with its own settings beside these.
 
-    default: Any
-    expected: str
-    accepts: Callable[[Any], bool]
-
-
-def count(default: int, low: int, expected: str) -> Setting:
-    """A whole number of at least ``low``."""
-    return Setting(default, expected, lambda v: isinstance(v, int) and not isinstance(v, bool) and v >= low)
-
-
-def flag(default: bool) -> Setting:
-    return Setting(default, "true or false", lambda v: isinstance(v, bool))
-
-
-def text(default: str | None, expected: str) -> Setting:
-    return Setting(default, expected, lambda v: isinstance(v, str) and bool(v) and "\0" not in v)
-
-
-_COMMON: dict[str, Setting] = {
-    "path": Setting(None, "the data set's folder", lambda v: isinstance(v, (str, Path)) and bool(str(v)) and "\0" not in str(v)),
-    "background": Setting("auto", "one of " + ", ".join(BACKGROUNDS), lambda v: isinstance(v, str) and v in BACKGROUNDS),
-    "downsample": count(1, 1, "a whole number of at least 1"),
-    "preload": flag(True),
-}
-
-
-def read_settings(settings: Mapping[str, Any], own: Mapping[str, Setting]) -> dict[str, Any]:
-    """All settings of a loader, defaults filled in.
-
-    Common to every loader: ``path`` (required), ``background`` ("auto": white for data with alpha, else black; "white";
-    "black"; "random": training composites random colours, evaluation white), ``downsample`` (whole factor, area filter on
-    premultiplied values), ``preload`` (decode all images at once, so that damaged files are found before training).
-
-    Raises:
-        ConfigError: an unknown key or a value that is not accepted, with what was expected.
+    Attributes:
+        path: the data set's folder, ``~`` allowed.
+        background: "auto" (white for data with alpha, else black), "white", "black", or "random" (training composites random colours,
+            evaluation white).
+        downsample: whole factor, area filter on premultiplied values.
+        preload: decode all images at once, so that damaged files are found before training.
     """
-    known = {**_COMMON, **own}
-    for key in settings:
-        if key not in known:
-            raise ConfigError(f"scene.{key} is not a setting of this scene{nearest(str(key), known)}")
-    values = {}
-    for key, setting in known.items():
-        value = settings.get(key)
-        if value is None:
-            value = setting.default
-            if value is None and key == "path":
-                raise ConfigError(f"scene.path is missing; expected {setting.expected}")
-        elif not setting.accepts(value):
-            raise ConfigError(f"scene.{key} is {value!r}; expected {setting.expected}")
-        values[key] = value
-    return values
+
+    path: Annotated[Path, text("the data set's folder")]
+    background: Background = "auto"
+    downsample: Annotated[int, Range(at_least=1)] = 1
+    preload: bool = True
+
+    def __post_init__(self) -> None:
+        verify(self, "scene")
 
 
-def data_folder(path: Any) -> Path:
+def data_folder(path: str | Path) -> Path:
     """The existing folder of the ``path`` setting, ``~`` expanded.
 
     Raises:

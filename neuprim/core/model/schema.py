@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
-from neuprim.core.errors import ConfigError
+from neuprim.core.checked import Range, converted
 
 __all__ = ["InitContext", "ParameterSpec", "Params"]
 
@@ -62,11 +62,8 @@ class InitContext:
         Raises:
             ConfigError: it is something else.
         """
-        value = self.settings.get(name, default)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not (math.isfinite(value) and low < value < high):
-            limits = f" above {low:g}" * math.isfinite(low) + " and" * math.isfinite(low + high) + f" below {high:g}" * math.isfinite(high)
-            raise ConfigError(f"model.init.{name}={value}: expected a number{limits}")
-        return float(value)
+        bounds = Range(above=low, below=high)
+        return float(converted(self.settings.get(name, default), Annotated[float, bounds], f"model.init.{name}"))
 
     def choice(self, name: str, *offered: str) -> str:
         """``settings[name]``, one of those offered; the first by default.
@@ -74,10 +71,7 @@ class InitContext:
         Raises:
             ConfigError: it is something else.
         """
-        value = self.settings.get(name, offered[0])
-        if value not in offered:
-            raise ConfigError(f"model.init.{name}={value}: expected {' or '.join(offered)}")
-        return str(value)
+        return str(converted(self.settings.get(name, offered[0]), Literal[offered], f"model.init.{name}"))
 
 
 @dataclass(frozen=True)

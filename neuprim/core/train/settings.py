@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from neuprim.core.errors import ConfigError
+from neuprim.core.checked import Range, text, verify
 
 __all__ = ["ModelSettings", "PopulationSettings", "TrainSettings"]
+
+Share = Annotated[float, Range(0, 1, says="a fraction of the budget, 0 to 1")]
+NotNegative = Annotated[float, Range(at_least=0)]
 
 
 @dataclass
@@ -24,23 +27,16 @@ class ModelSettings:
         init: free settings of the fields' initialisers, see the preset files.
     """
 
-    primitives: int = 2000
+    primitives: Annotated[int, Range(at_least=1)] = 2000
     density: dict[str, Any] = field(default_factory=dict)
     colour: dict[str, Any] = field(default_factory=dict)
-    neurons: int = 8
-    sh_degree: int = 3
-    sh_every: float = 0.1
+    neurons: Annotated[int, Range(0, 16)] = 8
+    sh_degree: Annotated[int, Range(0, 3)] = 3
+    sh_every: Annotated[float, Range(at_least=0, says="a fraction of the budget, 0 for all bands at once")] = 0.1
     init: dict[str, Any] = field(default_factory=dict)
 
-    def check(self) -> None:
-        for name, ok, expected in (
-            ("primitives", self.primitives >= 1, "at least 1"),
-            ("neurons", 0 <= self.neurons <= 16, "0 to 16"),
-            ("sh_degree", 0 <= self.sh_degree <= 3, "0 to 3"),
-            ("sh_every", self.sh_every >= 0, "a fraction of the budget, 0 for all bands at once"),
-        ):
-            if not ok:
-                raise ConfigError(f"model.{name}={getattr(self, name)}: expected {expected}")
+    def __post_init__(self) -> None:
+        verify(self, "model")
 
 
 @dataclass
@@ -58,15 +54,18 @@ class PopulationSettings:
     """
 
     strategy: str = "relocate"
-    every: int = 200
-    start: float = 0.02
-    stop: float = 0.6
-    fraction: float = 0.05
-    grow_threshold: float = 1e-5
-    prune_threshold: float = 1e-6
-    clone_scale: float = 0.01
-    prune_scale: float = 0.5
-    max_primitives: int = 1_000_000
+    every: Annotated[int, Range(at_least=1)] = 200
+    start: Share = 0.02
+    stop: Share = 0.6
+    fraction: Annotated[float, Range(0, 1)] = 0.05
+    grow_threshold: NotNegative = 1e-5
+    prune_threshold: NotNegative = 1e-6
+    clone_scale: NotNegative = 0.01
+    prune_scale: NotNegative = 0.5
+    max_primitives: Annotated[int, Range(at_least=1)] = 1_000_000
+
+    def __post_init__(self) -> None:
+        verify(self, "train.population")
 
 
 @dataclass
@@ -90,41 +89,21 @@ class TrainSettings:
         eval_every: fraction of the budget between two evaluations on a few held-out views for the curve; 0 for none.
     """
 
-    iterations: int = 30_000
-    max_seconds: float | None = None
-    rates: dict[str, float] = field(default_factory=dict)
-    final_rate: float = 0.05
-    adam_beta2: float = 0.999
-    warmup_steps: int = 0
-    loss: str | None = None
-    ssim_weight: float = 0.2
-    anisotropy_weight: float = 0.0
-    anisotropy_from: int = 100
-    background: str = "auto"
-    checkpoint_every_seconds: float = 60.0
-    log_every: int = 20
-    eval_every: float = 0.1
+    iterations: Annotated[int, Range(at_least=0)] = 30_000
+    max_seconds: Annotated[float, Range(above=0, says="a positive number of seconds")] | None = None
+    rates: dict[str, NotNegative] = field(default_factory=dict)
+    final_rate: Annotated[float, Range(above=0, at_most=1)] = 0.05
+    adam_beta2: Annotated[float, Range(at_least=0, below=1)] = 0.999
+    warmup_steps: Annotated[int, Range(at_least=0)] = 0
+    loss: Annotated[str, text("the name of a loss")] | None = None
+    ssim_weight: Annotated[float, Range(0, 1)] = 0.2
+    anisotropy_weight: NotNegative = 0.0
+    anisotropy_from: Annotated[int, Range(at_least=0)] = 100
+    background: Literal["auto", "white", "black", "random"] = "auto"
+    checkpoint_every_seconds: NotNegative = 60.0
+    log_every: Annotated[int, Range(at_least=1)] = 20
+    eval_every: Annotated[float, Range(at_least=0, says="a fraction of the budget, 0 for no evaluations")] = 0.1
     population: PopulationSettings = field(default_factory=PopulationSettings)
 
-    def check(self) -> None:
-        for name, ok, expected in (
-            ("iterations", self.iterations >= 0, "0 or more"),
-            ("max_seconds", self.max_seconds is None or self.max_seconds > 0, "a positive number of seconds, or null"),
-            ("final_rate", 0 < self.final_rate <= 1, "a number in (0, 1]"),
-            ("adam_beta2", 0 <= self.adam_beta2 < 1, "a number in [0, 1)"),
-            ("ssim_weight", 0 <= self.ssim_weight <= 1, "a number in [0, 1]"),
-            ("log_every", self.log_every >= 1, "at least 1"),
-            ("background", self.background in ("auto", "white", "black", "random"), "auto, white, black or random"),
-        ):
-            if not ok:
-                raise ConfigError(f"train.{name}={getattr(self, name)!r}: expected {expected}")
-        p = self.population
-        for name, ok, expected in (
-            ("strategy", p.strategy in ("fixed", "relocate", "gradient"), "fixed, relocate or gradient"),
-            ("every", p.every >= 1, "at least 1"),
-            ("fraction", 0 <= p.fraction <= 1, "a number in [0, 1]"),
-            ("start", 0 <= p.start <= 1, "a fraction of the budget"),
-            ("stop", 0 <= p.stop <= 1, "a fraction of the budget"),
-        ):
-            if not ok:
-                raise ConfigError(f"train.population.{name}={getattr(p, name)!r}: expected {expected}")
+    def __post_init__(self) -> None:
+        verify(self, "train")

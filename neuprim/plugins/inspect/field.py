@@ -1,4 +1,4 @@
-"""What an inspector draws: one frame of a model's density, on a grid, beside the truth where there is one."""
+"""What an inspector looks at: one frame of a model's density, on a grid, beside the truth where there is one."""
 
 from __future__ import annotations
 
@@ -18,10 +18,9 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Living, Primitives
 from neuprim.core.volumes.grid import density_grid
+from neuprim.plugins.inspect.layers import Scale
 
-__all__ = ["UNIT", "FieldFrame", "ViewOptions"]
-
-UNIT = "extinction [1/scene unit]"
+__all__ = ["FieldFrame", "ViewOptions"]
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,6 @@ class FieldFrame:
         needed: names of the conditions of the model's task.
         truth: (X, Y, Z) float32 ground truth on the grid, or None; computed when called.
         side: "model", or "truth" in the panel that shows the ground truth in the model's place.
-        panel: number of the panel, which makes titles of scalar bars differ.
     """
 
     model: Primitives
@@ -71,12 +69,11 @@ class FieldFrame:
     truth_name: str = ""
     numbers: Mapping[str, float] | None = None
     side: str = "model"
-    panel: int = 0
     _kept: dict[str, np.ndarray] = field(default_factory=dict)  # shared by the panels of a frame
 
-    def in_panel(self, panel: int, side: str) -> FieldFrame:
-        """The same frame, for a panel; what was computed is shared."""
-        return replace(self, panel=panel, side=side)
+    def of_side(self, side: str) -> FieldFrame:
+        """The same frame with its "model" or its "truth" in the model's place; what was computed is shared."""
+        return replace(self, side=side)
 
     @property
     def step(self) -> float:
@@ -93,6 +90,11 @@ class FieldFrame:
         """(2, 3) box that the grid's cells fill, scene units."""
         low = self.origin - self.step / 2
         return np.stack([low, low + self.step * np.array(self.shape)])
+
+    @property
+    def scale(self) -> Scale:
+        """Colours of extinctions, the same for all frames."""
+        return Scale(0.0, self.top, title="extinction", unit="1/scene unit")
 
     @property
     def sigma(self) -> np.ndarray:
@@ -115,7 +117,7 @@ class FieldFrame:
         """
         if self.truth is None:
             raise ConfigError("--show difference: there is no ground truth; give --against")
-        return self.in_panel(0, "model").sigma - self.in_panel(0, "truth").sigma
+        return self.of_side("model").sigma - self.of_side("truth").sigma
 
     @cached_property
     def living(self) -> Living:

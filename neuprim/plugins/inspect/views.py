@@ -1,113 +1,44 @@
-"""The built-in ways of showing a density: each draws one frame into the plotter's current panel."""
+"""The built-in ways of showing a density: functions of one frame that return layers, as anybody's."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import torch
 
 from neuprim.core.extensions import Inspector
 from neuprim.core.task import API_VERSION
-from neuprim.plugins.inspect.field import UNIT, FieldFrame
-from neuprim.plugins.inspect.shapes import ellipsoids, image, padded
+from neuprim.plugins.inspect.field import FieldFrame
+from neuprim.plugins.inspect.layers import Ellipsoids, Isosurfaces, Layer, Lines, Mesh, Scale, Slices, Text, Volume
+from neuprim.plugins.inspect.shapes import cut_ball, level_lines
 
 __all__ = ["DIFFERENCE", "ISOSURFACE", "PRIMITIVE", "PRIMITIVES", "SLICES", "VOLUME"]
 
-COLOURS = "inferno"
 SURFACES = "plasma"  # brighter at its lower end, where the outermost surface is
-_STEPS = 256
+SIGNED = "coolwarm"
+_LIFT = 0.004  # of lines above the surface that they are on, so that it hides none of them; of the semi-axes
 
 FAINT = 1.0 / 255.0
 """Opacity from which an ellipsoid is drawn."""
 
 
-def _bar(frame: FieldFrame, title: str = UNIT) -> dict[str, Any]:
-    """A scalar bar of the frame's own panel; plotters tell bars apart by their titles only."""
-    look = {"title_font_size": 15, "label_font_size": 13, "n_labels": 2, "fmt": "%.3g", "color": "white"}
-    return {"title": title + " " * frame.panel, "width": 0.6, "height": 0.09, "position_x": 0.2, "position_y": 0.02, **look}
+def _volume(frame: FieldFrame) -> list[Layer]:
+    return [Volume(frame.sigma, frame.origin, frame.step, frame.scale, depth=frame.gain)]
 
 
-def _add_bar(plotter: Any, frame: FieldFrame, clim: tuple[float, float], colours: str, title: str = UNIT) -> None:
-    """A scalar bar that does not hang on what is drawn: opaque, and there where nothing else is."""
-    import pyvista
-
-    ends = pyvista.PolyData(np.repeat(frame.box[:1], 2, 0))
-    ends["values"] = np.array(clim, np.float32)
-    plotter.add_mesh(ends, scalars="values", cmap=colours, clim=clim, point_size=1, scalar_bar_args=_bar(frame, title))
-
-
-def _outline(plotter: Any, frame: FieldFrame) -> None:
-    import pyvista
-
-    low, high = frame.box
-    box = pyvista.Box(np.stack([low, high], 1).ravel())
-    plotter.add_mesh(box.outline(), color="#8894a0", line_width=1, lighting=False)
-
-
-def _opacities(frame: FieldFrame, values: np.ndarray) -> np.ndarray:
-    """Opacity over one grid step of |values| times the frame's gain: the density's own law, made visible."""
-    alpha: np.ndarray = 1.0 - np.exp(-np.abs(values) * frame.gain * frame.step)
-    return alpha
-
-
-def _add_volume(plotter: Any, frame: FieldFrame, values: np.ndarray, clim: tuple[float, float], colours: str, title: str) -> None:
-    ramp = np.linspace(*clim, _STEPS)
-    data = image(frame, np.clip(values, *clim))
-    plotter.add_volume(
-        data,
-        scalars="values",
-        cmap=colours,
-        clim=clim,
-        opacity=np.rint(255 * _opacities(frame, ramp)),
-        opacity_unit_distance=frame.step,
-        shade=False,
-        mapper="smart",
-        show_scalar_bar=False,
-    )
-    _add_bar(plotter, frame, clim, colours, title)
-    _outline(plotter, frame)
-
-
-def _volume(plotter: Any, frame: FieldFrame) -> None:
-    _add_volume(plotter, frame, frame.sigma, (0.0, frame.top), COLOURS, UNIT)
-
-
-def _difference(plotter: Any, frame: FieldFrame) -> None:
+def _difference(frame: FieldFrame) -> list[Layer]:
     reach = frame.top / 2  # errors are smaller than what they are errors of
-    _add_volume(plotter, frame, frame.difference, (-reach, reach), "coolwarm", "model - truth [1/scene unit]")
+    scale = Scale(-reach, reach, SIGNED, "model - truth", frame.scale.unit)
+    return [Volume(frame.difference, frame.origin, frame.step, scale, depth=frame.gain)]
 
 
-def levels_of(frame: FieldFrame) -> tuple[float, ...]:
-    """The levels of isosurfaces, 1/scene unit."""
-    return frame.options.levels or tuple(part * frame.top for part in (0.1, 1 / 3, 2 / 3))
+def _isosurface(frame: FieldFrame) -> list[Layer]:
+    levels = frame.options.levels or tuple(part * frame.top for part in (0.1, 1 / 3, 2 / 3))
+    scale = Scale(0.0, frame.top, SURFACES, frame.scale.title, frame.scale.unit)
+    return [Isosurfaces(frame.sigma, frame.origin, frame.step, scale, levels=levels)]
 
 
-def _isosurface(plotter: Any, frame: FieldFrame) -> None:
-    data, levels = padded(frame, frame.sigma), sorted(levels_of(frame))
-    for i, level in enumerate(levels):
-        surface = data.contour([level], scalars="values")
-        if surface.n_points:
-            last = i == len(levels) - 1
-            plotter.add_mesh(
-                surface,
-                scalars="values",
-                cmap=SURFACES,
-                clim=(0.0, frame.top),
-                opacity=0.95 if last else 0.22 + 0.2 * i,
-                smooth_shading=True,
-                specular=0.25,
-                show_scalar_bar=False,
-            )
-    _outline(plotter, frame)
-    _add_bar(plotter, frame, (0.0, frame.top), SURFACES)
-
-
-def _slices(plotter: Any, frame: FieldFrame) -> None:
-    x, y, z = frame.focus
-    cut = image(frame, frame.sigma).slice_orthogonal(x=x, y=y, z=z)
-    plotter.add_mesh(cut, scalars="values", cmap=COLOURS, clim=(0.0, frame.top), lighting=False, scalar_bar_args=_bar(frame))
-    _outline(plotter, frame)
+def _slices(frame: FieldFrame) -> list[Layer]:
+    return [Slices(frame.sigma, frame.origin, frame.step, frame.scale, through=np.array(frame.focus))]
 
 
 def strongest(frame: FieldFrame) -> np.ndarray:
@@ -123,62 +54,34 @@ def opacity_of(frame: FieldFrame) -> np.ndarray:
     return np.asarray(1 - np.exp(-2 * frame.masses / (4.18879 * volume) * volume ** (1 / 3)))
 
 
-def _primitives(plotter: Any, frame: FieldFrame) -> None:
-    import pyvista
-
+def _primitives(frame: FieldFrame) -> list[Layer]:
     chosen = strongest(frame)
-    if len(chosen):
-        points, faces = ellipsoids(frame.geometry[torch.from_numpy(chosen)], 2 if len(chosen) <= 4000 else 1)
-        mesh = pyvista.PolyData(points, np.c_[np.full(len(faces), 3), faces].ravel())
-        mesh.point_data["colour"] = np.rint(255 * np.repeat(frame.colours[chosen], len(points) // len(chosen), 0)).astype(np.uint8)
-        plotter.add_mesh(
-            mesh, scalars="colour", rgb=True, smooth_shading=True, ambient=0.3, diffuse=0.8, specular=0.15, show_scalar_bar=False
-        )
-    _outline(plotter, frame)
+    one = frame.geometry[torch.from_numpy(chosen)]
+    axes = (one.rotations * one.scales[:, None, :]).transpose(1, 2).detach().numpy()
     words = f"{len(chosen)} of {frame.model.count} primitives at their true size\nleft out: opacity below 1/255"
-    plotter.add_text(words, position="lower_right", font_size=8, color="white")
+    colours = np.clip(frame.colours[chosen], 0.0, 1.0)
+    return [Ellipsoids(one.means.detach().numpy(), axes, colours=colours), Text(words)]
 
 
-def cut_open(frame: FieldFrame, position: int, rings: int = 48) -> tuple[Any, np.ndarray]:
-    """A primitive without a quarter of its ellipsoid, as a ``pyvista`` grid, and its unclamped extinction at the grid's points."""
-    import pyvista
-
-    ball = pyvista.SolidSphere(
-        outer_radius=1.0, radius_resolution=rings // 2, theta_resolution=2 * rings, phi_resolution=rings, start_theta=0, end_theta=270
-    )
+def _primitive(frame: FieldFrame) -> list[Layer]:
+    position, (unit, faces, normals) = frame.row(), cut_ball()
     one = frame.geometry[position : position + 1]
     axes = (one.rotations * one.scales[:, None, :])[0].double()
-    unit = torch.from_numpy(np.asarray(ball.points, np.float64))
-    placed = one.means[0].double() + unit @ axes.T
-    ball.points = placed.numpy()
-    return ball, frame.density(int(frame.alive[position]), placed)
-
-
-def _primitive(plotter: Any, frame: FieldFrame) -> None:
-    position = frame.row()
-    solid, sigma = cut_open(frame, position)
-    solid.point_data["values"] = sigma.astype(np.float32)
+    placed = one.means[0].double() + torch.from_numpy(unit) @ axes.T
+    sigma = frame.density(int(frame.alive[position]), placed)
     low, high = float(sigma.min()), float(sigma.max())
     reach = max(abs(low), abs(high)) or 1.0
-    clim = (-reach, reach) if low < 0 else (0.0, reach)
-    surface = solid.extract_surface(algorithm="dataset_surface")
-    plotter.add_mesh(
-        surface,
-        scalars="values",
-        cmap="coolwarm" if low < 0 else COLOURS,
-        clim=clim,
-        ambient=0.5,
-        diffuse=0.6,
-        scalar_bar_args=_bar(frame),
-    )
+    scale = Scale(-reach if low < 0 else 0.0, reach, SIGNED if low < 0 else frame.scale.colours, frame.scale.title, frame.scale.unit)
+    used, surface = np.unique(faces, return_inverse=True)
+    points, sigma, surface = placed.numpy()[used], sigma[used], surface.reshape(faces.shape)
+    found: list[Layer] = [Mesh(points, surface, values=sigma, scale=scale)]
     if low < 0 < high:
-        zero = solid.contour([0.0], scalars="values")
-        if zero.n_points:
-            plotter.add_mesh(zero.extract_feature_edges(), color="black", line_width=2)
+        lifted = points + _LIFT * normals[used] @ axes.numpy().T
+        found.append(Lines(*level_lines(lifted, surface, sigma), colours=np.zeros(3)))
     scales = ", ".join(f"{s:.3g}" for s in frame.geometry.scales[position].tolist())
     center = ", ".join(f"{s:.3g}" for s in frame.geometry.means[position].tolist())
     words = f"primitive {frame.alive[position]}\ncentre ({center})\nradii ({scales})\nextinction {low:.3g} to {high:.3g}, unclamped"
-    plotter.add_text(words, position="upper_right", font_size=8, color="white")
+    return [*found, Text(words, "upper_right")]
 
 
 VOLUME = Inspector(API_VERSION, "volume", "the extinction as a cloud", _volume)

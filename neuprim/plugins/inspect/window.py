@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from neuprim.core.extensions import Inspector
+from neuprim.plugins.inspect.drawing import add_box, add_layers
 from neuprim.plugins.inspect.field import FieldFrame
+from neuprim.plugins.inspect.stands import stand_of
 
 __all__ = ["Window", "panels_of"]
 
 Panel = tuple[Inspector, str]
 _PANEL = (720, 640)
-_DIRECTIONS = {"x": (-0.45, 1.0, -1.6), "y": (1.0, 0.45, 1.6), "z": (1.0, -1.6, 0.45)}
-"""Where the camera stands, from the middle, by the scene's upward axis."""
 
 
 def panels_of(inspectors: Sequence[Inspector], with_truth: bool) -> list[Panel]:
@@ -55,34 +55,22 @@ class Window:
         for panel, (inspector, side) in enumerate(self.panels):
             self._enter(panel)
             self.plotter.renderer.clear_actors()
-            part = frame.in_panel(panel, side)
-            inspector.add(self.plotter, part)
+            part = frame.of_side(side)
+            add_layers(self.plotter, inspector.layers(part), panel)
+            if inspector.shows != "primitive":
+                add_box(self.plotter, part.box)
             self.plotter.add_text(_caption(inspector, part), position="upper_left", font_size=10, color="white", name="caption")
             self.plotter.add_axes(color="white", line_width=2)
         if not self._placed:
             self._place(frame)
 
     def _place(self, frame: FieldFrame) -> None:
-        low, high = frame.box
         linked = [i for i, (inspector, _) in enumerate(self.panels) if inspector.shows != "primitive"]
-        away = np.array(_DIRECTIONS[self._up]) / np.linalg.norm(_DIRECTIONS[self._up])
         for panel, (inspector, _) in enumerate(self.panels):
             self._enter(panel)
-            if inspector.shows == "primitive":
-                one = frame.geometry[frame.row() : frame.row() + 1]
-                center = one.means[0].double().numpy()
-                radius = float(one.length_scale)
-                margin = 1.12
-                # look into the quarter that is missing, between the first two axes of the ellipsoid
-                away_here = one.rotations[0].double().numpy() @ np.array([1.0, -1.0, 0.9])
-                away_here, up = away_here / np.linalg.norm(away_here), one.rotations[0].double().numpy()[:, 2]
-            else:
-                margin, radius = 1.02, float(np.linalg.norm(high - low)) / 2  # the box is seen at an angle
-                center = (low + high) / 2 - 0.08 * radius * np.eye(3)["xyz".index(self._up)]  # the scalar bar is below
-                away_here, up = away, np.eye(3)["xyz".index(self._up)]
-            camera = self.plotter.camera
-            camera.focal_point, camera.up = center, up
-            camera.position = center + away_here * radius * margin / np.sin(np.radians(camera.view_angle) / 2)
+            stand, camera = stand_of(inspector, frame, self._up), self.plotter.camera
+            camera.focal_point, camera.up = stand.focus, stand.up
+            camera.position = stand.focus + stand.away * stand.radius / np.sin(np.radians(camera.view_angle) / 2)
             self.plotter.renderer.reset_camera_clipping_range()
         if len(linked) > 1:
             self.plotter.link_views(linked)

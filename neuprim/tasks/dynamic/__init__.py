@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from neuprim.core.choices import choose
+from neuprim.core.checked import choose
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import DENSITY_OPTIONS
@@ -13,6 +13,7 @@ from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim.core.volumes.source import VolumeSource
+from neuprim.tasks.dynamic import judging
 from neuprim.tasks.dynamic.colour import FREQUENCIES, RENAMED, TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.dynamic.time import parse_times
@@ -82,4 +83,7 @@ TASK = TaskSpec(
     conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_times, sweep="0:1"),),
     fields={"TimeDensity": TimeDensity, "TimeHarmonics": TimeHarmonics},
     uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),
+    mask=judging.mask,
+    diagnose=judging.diagnose,
+    clips=judging.clips,
 )

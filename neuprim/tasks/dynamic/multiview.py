@@ -16,23 +16,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
+from neuprim.core.checked import Accepts, checked
 from neuprim.core.data import Dataset
 from neuprim.core.data.common import posed_images
 from neuprim.core.data.records import Record, read_json
-from neuprim.core.data.settings import Setting, count, data_folder, read_settings, text
+from neuprim.core.data.settings import EveryNth, FolderSettings, SplitName, data_folder
 from neuprim.core.data.transforms import read_frames, split_frames
 from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import DataError
 from neuprim.core.task import SceneContext
 from neuprim.tasks.dynamic.moving import moving_points
 
-__all__ = ["load"]
+__all__ = ["MultiviewSettings", "load"]
 
 _AUTO = "auto"
 _NAMES = ("train", "val", "test")
@@ -48,25 +49,25 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         DataError: missing or damaged files, wrong or missing fields, times that are missing or out of range, impossible
             cameras, empty splits.
     """
-    values = read_settings(settings, _SETTINGS)
-    folder = data_folder(values["path"])
+    asked = checked(MultiviewSettings, settings, "scene")
+    folder = data_folder(asked.path)
     name, single = folder.resolve().name, folder / "transforms.json"
-    files = {split: folder / f"transforms_{split}.json" for split in (values["train_split"], values["test_split"])}
-    if not files[values["train_split"]].is_file() and single.is_file():
+    files = {split: folder / f"transforms_{split}.json" for split in (asked.train_split, asked.test_split)}
+    if not files[asked.train_split].is_file() and single.is_file():
         document = read_json(single)
         records = sorted(document.objects("frames"), key=lambda r: r.text("file_path"))
-        clock = _clock(records, [], values["time_range"])
+        clock = _clock(records, [], asked.time_range)
         records, frames = _frames(folder, document, records, clock)
-        train, test = split_frames(document, records, frames, values["test_every"])
-        return posed_images(str(single), name, train, test, values, context, start=moving_points)
+        train, test = split_frames(document, records, frames, asked.test_every)
+        return posed_images(str(single), name, train, test, asked, context, start=moving_points)
     if not any(path.is_file() for path in files.values()):
-        raise DataError(f"{folder}: has neither {files[values['train_split']].name} nor transforms.json; expected one of them")
+        raise DataError(f"{folder}: has neither {files[asked.train_split].name} nor transforms.json; expected one of them")
     documents = {split: read_json(path) for split, path in files.items()}
     splits = {split: list(document.objects("frames")) for split, document in documents.items()}
-    clock = _clock([r for s in splits.values() for r in s], _others(folder, splits), values["time_range"])
+    clock = _clock([r for s in splits.values() for r in s], _others(folder, splits), asked.time_range)
     read = {split: _frames(folder, documents[split], splits[split], clock)[1] for split in splits}
-    train, test = read[values["train_split"]], read[values["test_split"]]
-    return posed_images(str(folder), name, train, test, values, context, up=torch.tensor([0.0, 0.0, 1.0]), start=moving_points)
+    train, test = read[asked.train_split], read[asked.test_split]
+    return posed_images(str(folder), name, train, test, asked, context, up=torch.tensor([0.0, 0.0, 1.0]), start=moving_points)
 
 
 def _frames(folder: Path, document: Record, records: list[Record], clock: _Range) -> tuple[list[Record], list[ImageFrame]]:
@@ -131,18 +132,24 @@ def _parse_range(value: str) -> _Range:
     return low, high
 
 
-def _is_range(value: Any) -> bool:
-    if value == _AUTO:
-        return True
+def _is_range(value: str) -> bool:
     try:
-        return isinstance(value, str) and bool(_parse_range(value))
+        return value == _AUTO or bool(_parse_range(value))
     except ValueError:
         return False
 
 
-_SETTINGS = {
-    "train_split": text("train", "the name in transforms_NAME.json"),
-    "test_split": text("test", "the name in transforms_NAME.json"),
-    "test_every": count(8, 2, "a whole number of at least 2"),
-    "time_range": Setting("0:1", 'auto, or "LOW:HIGH" in quotes with LOW below HIGH, e.g. "0:1"', _is_range),
-}
+@dataclass(frozen=True)
+class MultiviewSettings(FolderSettings):
+    """What the user may set.
+
+    Attributes:
+        train_split, test_split: names in transforms_NAME.json.
+        test_every: every n-th frame by name is held out where there is one transforms.json.
+        time_range: "LOW:HIGH" of the files' times, mapped to 0..1, or "auto": the lowest and highest time there are.
+    """
+
+    train_split: SplitName = "train"
+    test_split: SplitName = "test"
+    test_every: EveryNth = 8
+    time_range: Annotated[str, Accepts(_is_range, 'auto, or "LOW:HIGH" in quotes with LOW below HIGH, e.g. "0:1"')] = "0:1"

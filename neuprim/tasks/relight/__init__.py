@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from neuprim.core.choices import choose
+from neuprim.core.checked import choose
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, CosineDensity
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import l1
+from neuprim.tasks.relight import judging
 from neuprim.tasks.relight.colour import FORMS, VISIBILITY, LightNetwork
+from neuprim.tasks.relight.data import lighting_of
 from neuprim.tasks.relight.environment import illuminate
 from neuprim.tasks.relight.harmonics import LightHarmonics
 from neuprim.tasks.relight.lights import parse_intensities, parse_lights, typical_light
@@ -48,7 +50,7 @@ def _check(model: Mapping[str, Any]) -> None:
 def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
     if dataset.channels != 3:
         raise ConfigError(f"{dataset.name}: {dataset.channels} colour channels; task relight expects 3, as light_intensity has")
-    falloff = getattr(dataset, "falloff", "none") == "inverse_square"
+    falloff = lighting_of(dataset).falloff == "inverse_square"
     return CosineDensity(model["neurons"], **model["density"]), _colour(model, dataset.channels, falloff, typical_light(dataset, falloff))
 
 
@@ -86,4 +88,10 @@ TASK = TaskSpec(
     fields={"CosineDensity": CosineDensity, "LightNetwork": LightNetwork, "LightHarmonics": LightHarmonics},
     environment=illuminate,
     uses=("model.neurons",),
+    mask=judging.mask,
+    judge=judging.judge,
+    diagnose=judging.diagnose,
+    clips=judging.clips,
+    facts=judging.facts,
+    orbit=judging.orbit,
 )

@@ -7,102 +7,57 @@ its radiant intensity per colour as the files give it, 1 where they do not.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, Literal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
 
-from neuprim.core.data import View
-from neuprim.core.data.common import PosedImages
-from neuprim.core.data.views import ImageViews
+from neuprim.core.data import Clip, Dataset
+from neuprim.core.data.check import extra_of
 from neuprim.core.errors import DataError
-from neuprim.core.metrics import means
-from neuprim.core.metrics.flip import flip_available
-from neuprim.core.model.primitives import Primitives
-from neuprim.tasks.relight.environment import summary
-from neuprim.tasks.relight.measure import scores
 
-__all__ = ["EXPOSURE_PERCENTILE", "Falloff", "PointLit", "bright"]
+if TYPE_CHECKING:
+    from neuprim.core.data.views import ImageViews
+
+__all__ = ["EXPOSURE_PERCENTILE", "Falloff", "Lighting", "bright", "lighting_of"]
 
 Falloff = Literal["none", "inverse_square"]
 
 EXPOSURE_PERCENTILE = 99.5
 """An automatic exposure lets this percentile of the training images' values be 1."""
 
-_MATTER = 1.0 / 255.0  # alpha from which a pixel belongs to the mask
 
-
-class PointLit(PosedImages):
-    """Images with a point light each.
+@dataclass(frozen=True)
+class Lighting:
+    """What relighting likes to know of a data set beside images, cameras and lights: its ``extra``. Every part may be left out.
 
     Attributes:
         falloff: "inverse_square" where images darken with the square of the light's distance, so that a renderer should divide by
             it; "none" where intensities are given as they arrive, or nobody knows.
-        exposure: what the files' linear values were divided by.
+        classes: index of a test view -> (H, W) uint8, what its pixels show, indices of :data:`~neuprim.tasks.relight.measure.CLASSES`;
+            errors are then told by class.
+        parts: beginnings of the names of test views whose scores are also told apart, e.g. those with a new light.
+        baselines: name -> function of a test view's index that gives (H, W, 3) linear light over the exposure, an image that needs no
+            model; a black one is always there.
+        clips: films beside the test views.
     """
 
     falloff: Falloff = "none"
-    exposure: float = 1.0
+    classes: Callable[[int], Tensor] | None = None
+    parts: tuple[str, ...] = ()
+    baselines: Mapping[str, Callable[[int], Tensor]] = field(default_factory=dict)
+    clips: tuple[Clip, ...] = ()
 
-    def expose(self, exposure: float) -> None:
-        """Divide all images by ``exposure`` from now on (instead of an earlier one)."""
-        self.exposure = exposure
-        for views in (self.train, self.test):
-            views.scale = 1.0 / exposure
 
-    def mask(self, index: int) -> Tensor | None:
-        """Pixels of a test view that show matter; None for images without alpha."""
-        alpha = self.test.pixels(index).alpha
-        return None if alpha is None else alpha > _MATTER
+def lighting_of(dataset: Dataset) -> Lighting:
+    """What the data set says of its light, which may be nothing.
 
-    def judge(self, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
-        """See :func:`neuprim.tasks.relight.measure.scores`."""
-        return self._judged(index, rendered, truth, structure=True)
-
-    def _judged(self, index: int, rendered: Tensor, truth: Tensor, structure: bool) -> dict[str, float]:
-        return scores(rendered, truth, structure)
-
-    def diagnose(self, model: Primitives) -> dict[str, Any]:
-        """How light is measured here, and how good a black image would be."""
-        result = {"exposure": self.exposure, "falloff": self.falloff, "baselines": self.baselines()}
-        return result if flip_available() else {**result, "flip_missing": "pip install 'neuprim[flip]'"}
-
-    def baselines(self) -> dict[str, dict[str, Any]]:
-        """Means over the test views of what images that need no model score, by name; SSIM and FLIP are left out, which take long."""
-        return {"black": self.guessed(lambda i, truth: torch.zeros_like(truth))}
-
-    def guessed(self, guess: Callable[[int, Tensor], Tensor]) -> dict[str, Any]:
-        """Means over the test views of what ``guess(index, truth)``, an (H, W, 3) image, scores."""
-        entries = []
-        for i in range(len(self.test)):
-            truth = self.test.pixels(i).over(self.background)
-            entries.append(self._judged(i, guess(i, truth), truth, structure=False))
-        return means(entries)
-
-    def facts(self) -> dict[str, Any]:
-        """Also where the training lights were, as the scene's centre sees them: see :func:`~neuprim.tasks.relight.environment.summary`."""
-        lights = torch.stack([self.train.view(i).conditions["light"] for i in range(len(self.train))])
-        return {**super().facts(), "lights": summary(lights, self.center, self.falloff, self.exposure)}
-
-    def orbit(self, frames: int) -> list[View]:
-        """Views circling the scene while the light circles it the other way, once, at its mean distance and height."""
-        training = [self.train.view(i).conditions for i in range(len(self.train))]
-        up, center = (x.double() / n for x, n in ((self.up, self.up.double().norm()), (self.center, 1.0)))
-        offsets = torch.stack([c["light"] for c in training]).double() - center
-        radius, sine = offsets.norm(dim=-1).mean(), ((offsets @ up) / offsets.norm(dim=-1).clamp_min(1e-12)).mean()
-        helper = torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())]
-        side = torch.linalg.cross(up, helper)
-        side = side / side.norm()
-        other = torch.linalg.cross(up, side)
-        intensity = torch.stack([c["light_intensity"] for c in training]).mean(0)
-        views = []
-        for i, view in enumerate(super().orbit(frames)):
-            turn = -2.0 * math.pi * i / frames
-            across = math.cos(turn) * side + math.sin(turn) * other
-            light = center + radius * (sine * up + (1.0 - sine * sine).clamp_min(0.0).sqrt() * across)
-            views.append(View(view.name, view.camera, {"light": light.float(), "light_intensity": intensity}))
-        return views
+    Raises:
+        DatasetFault: its ``extra`` is something else.
+    """
+    return extra_of(dataset, Lighting) or Lighting()
 
 
 def bright(views: ImageViews, where: str) -> float:

@@ -38,7 +38,8 @@ def summary(lights: Tensor, center: Tensor, falloff: str, exposure: float) -> di
     Args:
         lights: (L, 3) positions, scene units.
         center: (3,) of the scene.
-        falloff, exposure: see :class:`~neuprim.tasks.relight.data.PointLit`.
+        falloff: see :class:`~neuprim.tasks.relight.data.Lighting`.
+        exposure: of the data set.
 
     Returns:
         mean ``distance`` from the centre; ``directions``, at most 256, each as far from those before it as can be, so that they

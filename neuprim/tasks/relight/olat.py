@@ -30,61 +30,56 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, opengl_to_viewmat
+from neuprim.core.checked import Range, checked
+from neuprim.core.data import Dataset
 from neuprim.core.data.common import IMAGE_SUFFIXES, every_nth, find_image, missing_files, posed_images, unique_names
 from neuprim.core.data.records import Record, read_json
-from neuprim.core.data.settings import BACKGROUNDS, Setting, data_folder, flag, read_settings, text
+from neuprim.core.data.settings import Background, FolderSettings, HoldOut, SplitName, data_folder
 from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import ImageInfo, image_info
 from neuprim.core.task import SceneContext
-from neuprim.tasks.relight.data import PointLit, bright
+from neuprim.tasks.relight.data import Lighting, bright
 
-__all__ = ["check", "load", "read", "read_split"]
-
-Made = TypeVar("Made", bound=PointLit)
+__all__ = ["OlatSettings", "load", "read_split"]
 
 
-def load(settings: Mapping[str, Any], context: SceneContext) -> PointLit:
+def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """The scene in the folder ``settings["path"]``, in linear light over the exposure.
 
     Raises:
         ConfigError: unknown or impossible settings.
         DataError: missing or damaged files, wrong or missing fields, impossible cameras, empty splits, black images with exposure=auto.
     """
-    return read(settings, context, PointLit)
-
-
-def check(settings: Mapping[str, Any]) -> None:
-    """Raises ConfigError for unknown or impossible settings, before any file is touched."""
-    read_settings(settings, _SETTINGS)
-
-
-def read(settings: Mapping[str, Any], context: SceneContext, kind: type[Made]) -> Made:
-    """As :func:`load`, with the class to make."""
-    values = read_settings(settings, _SETTINGS)
-    folder = data_folder(values["path"])
-    train = read_split(folder, values["train_split"], values["ignore_corrections"])
-    if values["hold_out"]:
+    asked = checked(OlatSettings, settings, "scene")
+    folder = data_folder(asked.path)
+    train = read_split(folder, asked.train_split, asked.ignore_corrections)
+    if asked.hold_out:
         if len(train) < 2:
-            raise ConfigError(
-                f"scene.hold_out is {values['hold_out']}, but {folder} has only {len(train)} training view; expected at least 2"
-            )
-        train, test = every_nth(train, values["hold_out"])
+            raise ConfigError(f"scene.hold_out is {asked.hold_out}, but {folder} has only {len(train)} training view; expected at least 2")
+        train, test = every_nth(train, asked.hold_out)
     else:
-        test = read_split(folder, values["test_split"], values["ignore_corrections"])
-    up = torch.tensor([0.0, 0.0, 1.0])
-    dataset = posed_images(str(folder), folder.resolve().name, train, test, values, context, up=up, to_linear=True, kind=kind)
-    dataset.falloff = values["falloff"]
-    auto = values["exposure"] == _AUTO
-    dataset.expose(bright(dataset.train, str(folder)) if auto else float(values["exposure"]))
-    return dataset
+        test = read_split(folder, asked.test_split, asked.ignore_corrections)
+    return posed_images(
+        str(folder),
+        folder.resolve().name,
+        train,
+        test,
+        asked,
+        context,
+        up=torch.tensor([0.0, 0.0, 1.0]),
+        to_linear=True,
+        exposure=(lambda views: bright(views, str(folder))) if asked.exposure == "auto" else asked.exposure,
+        extra=Lighting(asked.falloff),
+    )
 
 
 def read_split(folder: Path, split: str, ignore_corrections: bool = False) -> list[ImageFrame]:
@@ -190,20 +185,22 @@ def _intensity(source: Record) -> Tensor:
     return value.float()
 
 
-_AUTO = "auto"
+@dataclass(frozen=True)
+class OlatSettings(FolderSettings):
+    """What the user may set.
 
-_SETTINGS = {
-    "background": Setting("black", "one of " + ", ".join(BACKGROUNDS), lambda v: isinstance(v, str) and v in BACKGROUNDS),
-    "train_split": text("train", "the name in transforms_NAME.json"),
-    "test_split": text("test", "the name in transforms_NAME.json"),
-    "hold_out": Setting(
-        0, "0, or a whole number of at least 2", lambda v: isinstance(v, int) and not isinstance(v, bool) and (v == 0 or v >= 2)
-    ),
-    "falloff": Setting("none", "none or inverse_square", lambda v: v in ("none", "inverse_square")),
-    "exposure": Setting(
-        1.0,
-        "a number above 0, or auto",
-        lambda v: v == _AUTO or (isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and v > 0),
-    ),
-    "ignore_corrections": flag(False),
-}
+    Attributes:
+        train_split, test_split: names in transforms_NAME.json.
+        hold_out: n: evaluate on every n-th training view instead of the test split, for tuning; 0 for that split.
+        falloff: "inverse_square" where the light weakens with the square of its distance, "none" where the images do not show that.
+        exposure: images are divided by this; "auto": by the 99.5th percentile of the training images.
+        ignore_corrections: poses are transform_matrix, even where a frame has the optimised R_opt and T_opt.
+    """
+
+    background: Background = "black"
+    train_split: SplitName = "train"
+    test_split: SplitName = "test"
+    hold_out: HoldOut = 0
+    falloff: Literal["none", "inverse_square"] = "none"
+    exposure: Annotated[float, Range(above=0)] | Literal["auto"] = 1.0
+    ignore_corrections: bool = False

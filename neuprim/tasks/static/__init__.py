@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from neuprim.core.choices import choose
+from neuprim.core.checked import choose
 from neuprim.core.data import Dataset
 from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity

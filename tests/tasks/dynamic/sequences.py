@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from neuprim.core.data import Dataset
 from neuprim.core.io.vdb import Grid, scale_transform
 from neuprim.core.task import SceneContext
-from neuprim.tasks.dynamic.volume.dataset import VolumeDataset
+from neuprim.tasks.dynamic.judging import recording_of
+from neuprim.tasks.dynamic.volume.dataset import Recording
 from neuprim.tasks.dynamic.volume.scene import load
 
 VOXEL = 0.5
@@ -24,8 +26,13 @@ def blob(center: float, names: tuple[str, ...] = ("density", "flames")) -> list[
     return [Grid.from_dense(name, value * (0.2 if name == "flames" else 1.0), transform=transform) for name in names]
 
 
-def dataset(folder: Path, tmp_path: Path, **changes: Any) -> VolumeDataset:
+def dataset(folder: Path, tmp_path: Path, **changes: Any) -> Dataset:
     settings = {"vdb": str(folder), "size": 24, "cameras": 6, "samples": 1, "look": "smoke_fire", **changes}
-    found = load(settings, SceneContext(0, tmp_path / "cache"))
-    assert isinstance(found, VolumeDataset)
+    return load(settings, SceneContext(0, tmp_path / "cache"))
+
+
+def recorded(data: Dataset) -> Recording:
+    """What its images were rendered from."""
+    found = recording_of(data)
+    assert found is not None
     return found

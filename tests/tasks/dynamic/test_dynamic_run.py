@@ -179,9 +179,9 @@ def test_a_simulated_scene_says_so(tmp_path: Path) -> None:
     ("word", "message"),
     [
         ("model.density.time=windows", r"model\.density\.time: 'windows': expected none or some of phase, offset, window, motion"),
-        ("model.density.tme=phase", r"model\.density\.tme: no such setting; did you mean 'time'"),
-        ("model.colour.frequencies=odd", r"model\.colour\.frequencies='odd': expected periods or printed"),
-        ("model.density.divide_above=long", r"model\.density\.divide_above='long': expected a number"),
+        ("model.density.tme=phase", r"model\.density\.tme: no such setting; did you mean 'model.density.time'"),
+        ("model.colour.frequencies=odd", r"model\.colour\.frequencies=odd: expected periods or printed"),
+        ("model.density.divide_above=long", r"model\.density\.divide_above=long: expected a finite number"),
         ("model.colour.powers=1.5", r"model\.colour\.powers=1\.5: expected a whole number"),
         ("model.colour.waves=99", r"model\.colour: .*expected 0\.\.16"),
     ],

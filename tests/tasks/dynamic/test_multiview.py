@@ -188,11 +188,12 @@ def test_images_stay_on_disk_beyond_the_memory_bound(folder: Path, context: Any)
 
 
 def test_settings_that_make_no_sense(folder: Path, scenes: Any, context: Any) -> None:
-    scenes.refused(load, {}, context, "scene.path is missing")
-    scenes.refused(load, {"path": folder, "time": "auto"}, context, "scene.time is not a setting", "time_range")
-    for value in ("1:0", "0", "a:b", "0:nan", "0:1:2", "", 5, True, "0:inf"):
-        scenes.refused(load, {"path": folder, "time_range": value}, context, f"scene.time_range is {value!r}", "LOW:HIGH", "auto")
-    scenes.refused(load, {"path": folder, "test_every": 1}, context, "scene.test_every is 1")
+    scenes.refused(load, {}, context, "scene.path: required and not given")
+    scenes.refused(load, {"path": folder, "time": "auto"}, context, "scene.time: no such setting", "scene.time_range")
+    for value in ("1:0", "'0'", "a:b", "0:nan", "0:1:2", "''", "true", "0:inf"):
+        given = True if value == "true" else value.strip("'")
+        scenes.refused(load, {"path": folder, "time_range": given}, context, f'scene.time_range={value}: expected auto, or "LOW:HIGH"')
+    scenes.refused(load, {"path": folder, "test_every": 1}, context, "scene.test_every=1")
 
 
 def test_files_that_are_missing(folder: Path, scenes: Any, context: Any) -> None:

@@ -165,11 +165,11 @@ def test_every_setting_is_in_the_key() -> None:
     ("arguments", "text"),
     [
         (("smoke_fir", 4, 24, 0), "smoke_fire"),
-        (("smoke_fire", 0, 24, 0), r"scene\.timesteps is 0"),
-        (("smoke_fire", True, 24, 0), r"scene\.timesteps is True"),
-        (("smoke_fire", 4, 8, 0), r"scene\.resolution is 8; expected a whole number from 16 to 192"),
-        (("smoke_fire", 4, 24.5, 0), r"scene\.resolution is 24\.5"),
-        (("smoke_fire", 4, 24, -1), "seed is -1"),
+        (("smoke_fire", 0, 24, 0), r"scene\.timesteps=0: expected a whole number from 1 to 1000"),
+        (("smoke_fire", True, 24, 0), r"scene\.timesteps=true"),
+        (("smoke_fire", 4, 8, 0), r"scene\.resolution=8: expected a whole number from 16 to 192"),
+        (("smoke_fire", 4, 24.5, 0), r"scene\.resolution=24\.5"),
+        (("smoke_fire", 4, 24, -1), "seed=-1"),
     ],
 )
 def test_impossible_settings_are_named(arguments: tuple, text: str, tmp_path: Path) -> None:

@@ -205,9 +205,7 @@ class Lit(tiny.Views):
 def fit(
     loss: str, change: Any, iterations: int = 60, intensity: float = 1.0, start: Primitives | None = None
 ) -> tuple[Trainer, list[float]]:
-    dataset = tiny.TwoPrimitives()
-    dataset.train = Lit(6, 0.0, change, intensity)
-    dataset.background, dataset.color_space = torch.zeros(3), "linear"
+    dataset = tiny.two_primitives(train=Lit(6, 0.0, change, intensity), background=torch.zeros(3), color_space="linear")
     field = LightNetwork(3, visibility=UNSHADOWED)
     first = start or initial_model(CosineDensity(2), field, dataset, ModelSettings(primitives=12, neurons=2), 0)
     settings = TrainSettings(iterations=iterations, population=PopulationSettings(strategy="fixed"))

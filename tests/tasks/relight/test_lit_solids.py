@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 import torch
 
+from neuprim.core.data import Dataset
+from neuprim.core.data.views import ImageViews
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import read_image
 from neuprim.core.task import SceneContext
 from neuprim.scenes.raycast import Scene
-from neuprim.tasks.relight import olat
-from neuprim.tasks.relight.data import bright
-from neuprim.tasks.relight.lit import LitSolids, load
+from neuprim.tasks.relight import judging, olat
+from neuprim.tasks.relight.data import bright, lighting_of
 from neuprim.tasks.relight.lit import generate as generator
+from neuprim.tasks.relight.lit import load
+from neuprim.tasks.relight.lit.dataset import classes
 from neuprim.tasks.relight.lit.generate import INTENSITY, LitSettings, camera_to_world, generate, picture
 from neuprim.tasks.relight.lit.rig import PARTS
 from neuprim.tasks.relight.lit.scene import RADIUS, solids
@@ -47,12 +50,19 @@ def one_scene(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def forty(cache: Path, scene: Scene) -> LitSolids:
+def forty(cache: Path, scene: Scene) -> Dataset:
     """Enough views to mean something."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(generator, "Scene", lambda solids: scene)
         patch.setattr("neuprim.tasks.relight.lit.rig.CIRCLE_FRAMES", FEW_FRAMES)
         return load({"size": 48, "train_views": 40, "test_views": 12}, SceneContext(seed=0, cache_dir=cache))
+
+
+def class_map(dataset: Dataset, index: int) -> torch.Tensor:
+    """Of a test view."""
+    known = lighting_of(dataset).classes
+    assert known is not None
+    return known(index)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -108,11 +118,11 @@ def test_progress_runs_from_nothing_to_all(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "text"),
     [
-        ({"supersample": 2}, "scene.supersample is not a setting.*did you mean 'supersampling'"),
-        ({"size": 0}, "scene.size is 0; expected a whole number from 8"),
-        ({"train_views": True}, "scene.train_views is True"),
-        ({"background": "white"}, "scene.background is 'white'; expected black or random"),
-        ({"hold_out": 1}, "scene.hold_out is 1"),
+        ({"supersample": 2}, "scene.supersample: no such setting; did you mean 'scene.supersampling'"),
+        ({"size": 0}, "scene.size=0: expected a whole number from 8 to 4096"),
+        ({"train_views": True}, "scene.train_views=true: expected a whole number"),
+        ({"background": "white"}, "scene.background=white: expected black or random: nothing but the light"),
+        ({"hold_out": 1}, "scene.hold_out=1: expected 0, or a whole number of at least 2"),
     ],
 )
 def test_impossible_settings_are_refused_before_drawing(settings: dict[str, object], text: str, tmp_path: Path) -> None:
@@ -145,13 +155,14 @@ def test_the_loader_of_the_layout_reads_the_same_pixels_and_lights(cache: Path, 
     pose = np.array(view["transform_matrix"])
     fresh = picture(scene, pose, np.array(view["pl_pos"]), 24, 2)
     np.testing.assert_array_equal(dataset.train.pixels(2).rgb.numpy(), fresh.rgba[..., :3].astype(np.float16).astype(np.float32))
-    np.testing.assert_array_equal(dataset.classes(2, dataset.train).numpy(), fresh.classes)
+    assert isinstance(dataset.train, ImageViews)
+    np.testing.assert_array_equal(classes(dataset.train, 2).numpy(), fresh.classes)
     np.testing.assert_allclose(pose, camera_to_world(pose[:3, 3]), atol=1e-12)
 
 
 def test_the_data_set_says_what_it_is(cache: Path) -> None:
     dataset = load({**SMALL, "background": "random"}, SceneContext(seed=0, cache_dir=cache))
-    assert (dataset.name, dataset.data_source, dataset.color_space, dataset.falloff) == (
+    assert (dataset.name, dataset.data_source, dataset.color_space, lighting_of(dataset).falloff) == (
         "lit_solids",
         "generated",
         "linear",
@@ -163,10 +174,10 @@ def test_the_data_set_says_what_it_is(cache: Path) -> None:
     assert conditions["light"].shape == (3,) and 4.0 <= float(conditions["light"].norm()) <= 5.0
     assert conditions["light_intensity"].tolist() == pytest.approx([INTENSITY] * 3)
     assert all(value.dtype == torch.float32 for value in conditions.values())
-    (clip,) = dataset.clips()
-    assert clip.source is dataset.circle and len(clip.views) == len(dataset.circle) == FEW_FRAMES
-    assert clip.name == "light_round" and dataset.circle.view(1).name == "light_01"
-    views = dataset.orbit(5)
+    (clip,) = judging.clips(dataset)
+    assert clip.source is not None and len(clip.views) == len(clip.source) == FEW_FRAMES
+    assert clip.name == "light_round" and clip.source.view(1).name == "light_01"
+    views = judging.orbit(dataset, 5)
     assert len({v.conditions["light"].numpy().tobytes() for v in views}) == 5
     assert all(4.0 <= float(v.conditions["light"].norm()) <= 5.0 and float(v.conditions["light"][2]) > 2.0 for v in views)
 
@@ -175,19 +186,19 @@ def test_held_out_training_views_are_judged_too(cache: Path) -> None:
     dataset = load({**SMALL, "hold_out": 2}, SceneContext(seed=0, cache_dir=cache))
     assert [dataset.test.view(i).name for i in range(len(dataset.test))] == ["r_0000", "r_0002"] and len(dataset.train) == 2
     truth = dataset.test.pixels(1).rgb
-    assert dataset.judge(1, truth, truth)["psnr_linear_clamped"] == np.inf
-    assert set(dataset.baselines()) == {"black", "no_cast_shadows"}
+    assert judging.judge(dataset, 1, truth, truth)["psnr_linear_clamped"] == np.inf
+    assert set(judging.baselines(dataset)) == {"black", "no_cast_shadows"}
 
 
-def test_classes_agree_with_the_images(forty: LitSolids) -> None:
+def test_classes_agree_with_the_images(forty: Dataset) -> None:
     brightness: dict[str, list[torch.Tensor]] = {name: [] for name in CLASSES}
     free_brightness: dict[str, list[torch.Tensor]] = {name: [] for name in CLASSES}
     for i in range(len(forty.test)):
-        classes, pixels, free = forty.classes(i), forty.test.pixels(i), forty.unshadowed(i)
-        assert pixels.alpha is not None and torch.equal(classes == 0, pixels.alpha < 0.5)
+        shown, pixels, free = class_map(forty, i), forty.test.pixels(i), lighting_of(forty).baselines["no_cast_shadows"](i)
+        assert pixels.alpha is not None and torch.equal(shown == 0, pixels.alpha < 0.5)
         assert (pixels.rgb <= free + 1e-3).all()
         for value, name in enumerate(CLASSES):
-            mine = classes == value
+            mine = shown == value
             brightness[name].append(pixels.rgb[mine].mean(-1))
             free_brightness[name].append(free[mine].mean(-1))
     rgb, free_rgb = ({k: torch.cat(v) for k, v in d.items()} for d in (brightness, free_brightness))
@@ -198,12 +209,12 @@ def test_classes_agree_with_the_images(forty: LitSolids) -> None:
     assert rgb["highlight"].min() > 0.2
 
 
-def test_the_exposure_fits(forty: LitSolids) -> None:
+def test_the_exposure_fits(forty: Dataset) -> None:
     assert bright(forty.train, "") == pytest.approx(1.0, abs=0.15)
 
 
-def test_baselines_rank_as_they_should(forty: LitSolids) -> None:
-    numbers = forty.diagnose(None)  # type: ignore[arg-type]  # nothing here depends on the model
+def test_baselines_rank_as_they_should(forty: Dataset) -> None:
+    numbers = judging.diagnose(forty, None)  # type: ignore[arg-type]  # nothing here depends on the model
     scores = {name: entry["psnr_linear_clamped"] for name, entry in numbers["baselines"].items()}
     assert set(scores) == {"black", "no_cast_shadows", "nearest_light_of_25"}
     assert 8 < scores["black"] < scores["no_cast_shadows"] - 3 < 30 and scores["black"] < scores["nearest_light_of_25"] < 35
@@ -217,25 +228,27 @@ def test_the_nearest_light_to_itself_is_perfect(cache: Path) -> None:
     """Of at most 25 training images all lights are known, so under a seen one the baseline is the truth."""
     dataset = load(SMALL, SceneContext(seed=0, cache_dir=cache))
     assert dataset.test.view(0).name == "new_view_00"
-    assert torch.equal(dataset.nearest_light(0), dataset.test.pixels(0).rgb)
-    assert dataset.judge(0, dataset.nearest_light(0), dataset.test.pixels(0).rgb)["psnr_display"] == np.inf
-    assert dataset.baselines()["nearest_light_of_25"]["psnr_display_infinite"] is True
+    nearest = lighting_of(dataset).baselines["nearest_light_of_25"](0)
+    assert torch.equal(nearest, dataset.test.pixels(0).rgb)
+    assert judging.judge(dataset, 0, nearest, dataset.test.pixels(0).rgb)["psnr_display"] == np.inf
+    assert judging.baselines(dataset)["nearest_light_of_25"]["psnr_display_infinite"] is True
 
 
-def test_judging_names_the_part_and_the_classes(forty: LitSolids) -> None:
+def test_judging_names_the_part_and_the_classes(forty: Dataset) -> None:
     for index in range(len(forty.test)):
         name, truth = forty.test.view(index).name, forty.test.pixels(index).rgb
-        found = forty.judge(index, truth * 0.5, truth)
+        found = judging.judge(forty, index, truth * 0.5, truth)
         assert f"psnr_linear_clamped_{name.rsplit('_', 1)[0]}" in found
         assert sum(v for k, v in found.items() if k.startswith("pixels_")) == truth.shape[0] * truth.shape[1]
 
 
 def test_damaged_class_map_names_the_file(tmp_path: Path) -> None:
     dataset = load(SMALL, SceneContext(seed=0, cache_dir=tmp_path))
+    assert isinstance(dataset.test, ImageViews)
     file = dataset.test.file(1).with_name("new_light_00_classes.png")
     file.write_bytes(b"no png")
     with pytest.raises(DataError, match=r"new_light_00_classes\.png"):
-        dataset.classes(1)
+        class_map(dataset, 1)
 
 
 def test_files_hold_half_floats(cache: Path) -> None:

@@ -13,9 +13,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from neuprim.core.data import Dataset
 from neuprim.core.io.images import linear_to_srgb, srgb_to_linear, write_exr, write_png
 from neuprim.core.task import SceneContext
-from neuprim.tasks.relight.data import PointLit
+from neuprim.tasks.relight import judging
+from neuprim.tasks.relight.data import lighting_of
 from neuprim.tasks.relight.olat import load
 
 SIZE = 12
@@ -67,7 +69,7 @@ def both(folder: Path, change: Edit) -> None:
         edit(folder, change, split)
 
 
-def read(folder: Path, context: SceneContext, **settings: Any) -> PointLit:
+def read(folder: Path, context: SceneContext, **settings: Any) -> Dataset:
     return load({"path": str(folder), **settings}, context)
 
 
@@ -82,14 +84,14 @@ def each(change: Edit) -> Edit:
 def test_the_plainest_variant(folder: Path, context: SceneContext) -> None:
     dataset = read(folder, context)
     assert (len(dataset.train), len(dataset.test), dataset.color_space, dataset.name) == (3, 2, "linear", "scene")
-    assert (dataset.falloff, dataset.exposure, dataset.background.tolist()) == ("none", 1.0, [0.0] * 3)
+    assert (lighting_of(dataset).falloff, dataset.exposure, dataset.background.tolist()) == ("none", 1.0, [0.0] * 3)
     view = dataset.train.view(1)
     assert view.name == "r_1" and view.conditions["light"].tolist() == [2.0, 2.0, 4.0]
     assert view.conditions["light_intensity"].tolist() == [1.0, 1.0, 1.0]
     assert all(v.dtype == torch.float32 and v.shape == (3,) for v in view.conditions.values())
     focal = 0.5 * SIZE / math.tan(0.4)
     assert (view.camera.fx, view.camera.fy, view.camera.cx) == (pytest.approx(focal), pytest.approx(focal), SIZE / 2)
-    mask = dataset.mask(0)
+    mask = judging.mask(dataset, 0)
     assert mask is not None and not mask[0, 0] and mask[5, 5]
 
 
@@ -135,7 +137,7 @@ def test_opaque_photographs(folder: Path, context: SceneContext) -> None:
     pixels = read(folder, context).train.pixels(0)
     assert pixels.alpha is None
     torch.testing.assert_close(pixels.rgb, srgb_to_linear(straight(0)[..., :3].float() / 255))
-    assert read(folder, context).mask(0) is None
+    assert judging.mask(read(folder, context), 0) is None
 
 
 @pytest.mark.parametrize("in_frame", [True, False])
@@ -212,7 +214,7 @@ def test_exposure(folder: Path, context: SceneContext) -> None:
     plain = read(folder, context)
     values = torch.cat([plain.train.pixels(i).rgb.flatten() for i in range(3)])
     dataset = read(folder, context, exposure="auto", falloff="inverse_square")
-    assert dataset.exposure == pytest.approx(values.quantile(0.995).item(), rel=5e-3) and dataset.falloff == "inverse_square"
+    assert dataset.exposure == pytest.approx(values.quantile(0.995).item(), rel=5e-3) and lighting_of(dataset).falloff == "inverse_square"
     torch.testing.assert_close(dataset.test.pixels(0).rgb * dataset.exposure, plain.test.pixels(0).rgb)
     torch.testing.assert_close(dataset.test.pixels(0).alpha, plain.test.pixels(0).alpha)
 
@@ -238,7 +240,7 @@ def test_starting_points_and_orbit(folder: Path, context: SceneContext) -> None:
     dataset = read(folder, context)
     points = dataset.initial_points(20, torch.Generator().manual_seed(0))
     assert 0 < len(points.means) <= 20 and (points.colors > 0.9).all()
-    views = dataset.orbit(4)
+    views = judging.orbit(dataset, 4)
     lights = torch.stack([v.conditions["light"] for v in views])
     assert torch.isfinite(lights).all() and len(lights.unique(dim=0)) == 4
     torch.testing.assert_close(lights[:, 2], lights[:1, 2].expand(4))
@@ -248,11 +250,11 @@ def test_starting_points_and_orbit(folder: Path, context: SceneContext) -> None:
 def test_black_images_are_a_baseline(folder: Path, context: SceneContext) -> None:
     dataset = read(folder, context)
     truth = dataset.test.pixels(0).rgb
-    found = dataset.judge(0, truth * 0.9, truth)
+    found = judging.judge(dataset, 0, truth * 0.9, truth)
     assert found["psnr_linear_clamped"] == pytest.approx(-10 * math.log10((0.1 * truth).square().mean()), abs=1e-3)
     shown = [linear_to_srgb(x) for x in (truth * 0.9, truth)]
     assert found["psnr_display"] == pytest.approx(-10 * math.log10((shown[0] - shown[1]).square().mean()), abs=1e-3)
-    assert dataset.diagnose(None)["baselines"]["black"]["psnr_linear_clamped"] < 20  # type: ignore[arg-type]
+    assert judging.baselines(dataset)["black"]["psnr_linear_clamped"] < 20
 
 
 # What is refused -----------------------------------------------------------------------------------------------------------------------
@@ -312,12 +314,12 @@ def test_wrong_files_are_named(folder: Path, context: SceneContext, scenes: Any,
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"falloff": "linear"}, ("scene.falloff is 'linear'", "none or inverse_square")),
-        ({"exposure": 0}, ("scene.exposure is 0", "auto")),
-        ({"exposure": "bright"}, ("scene.exposure is 'bright'",)),
-        ({"hold_out": 1}, ("scene.hold_out is 1",)),
-        ({"ignore_corrections": "yes"}, ("scene.ignore_corrections is 'yes'", "true or false")),
-        ({"fallof": "none"}, ("scene.fallof is not a setting", "'falloff'")),
+        ({"falloff": "linear"}, ("scene.falloff=linear: expected none or inverse_square",)),
+        ({"exposure": 0}, ("scene.exposure=0: expected a number above 0, or auto",)),
+        ({"exposure": "bright"}, ("scene.exposure=bright: expected a finite number above 0, or auto",)),
+        ({"hold_out": 1}, ("scene.hold_out=1: expected 0, or a whole number of at least 2",)),
+        ({"ignore_corrections": "yes"}, ("scene.ignore_corrections=yes: expected true or false",)),
+        ({"fallof": "none"}, ("scene.fallof: no such setting; did you mean 'scene.falloff'",)),
         ({"test_split": "absent"}, ("transforms_absent.json", "file not found")),
         ({"downsample": 100}, ("scene.downsample is 100",)),
     ],

@@ -113,7 +113,7 @@ def test_every_variant_runs(tmp_path: Path, words: list[str], colour: dict[str, 
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("model.colour.form=add", r"model\.colour\.form='add': expected additive or multiplicative or harmonics"),
+        ("model.colour.form=add", r"model\.colour\.form=add: expected additive, multiplicative or harmonics"),
         ("model.colour.hidden=99", r"model\.colour: .*expected 0\.\.16"),
         ("model.density.time=phase", r"model\.density\.time: no such setting"),
     ],

@@ -147,12 +147,12 @@ def test_without_pycolmap_the_extra_is_named(tmp_path: Path, context: Any, monke
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"image": "images_4"}, ["scene.image", "did you mean 'images'"]),
-        ({"images": 4}, ["scene.images is 4"]),
+        ({"image": "images_4"}, ["scene.image", "did you mean 'scene.images'"]),
+        ({"images": [4]}, ["scene.images=[4]: expected the image folder's name"]),
         ({"images": "images_4"}, ["images_4", "does not exist", "scene.images"]),
         ({"model": "sparse/1"}, ["sparse/1", "no cameras.bin or cameras.txt"]),
-        ({"test_every": 0}, ["scene.test_every is 0"]),
-        ({"hold_out": 3}, ["scene.hold_out is not a setting"]),
+        ({"test_every": 0}, ["scene.test_every=0: expected a whole number of at least 2"]),
+        ({"hold_out": 3}, ["scene.hold_out: no such setting"]),
     ],
 )
 def test_bad_settings(capture: Any, scenes: Any, context: Any, settings: dict[str, Any], words: list[str]) -> None:

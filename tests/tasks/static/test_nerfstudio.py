@@ -215,9 +215,9 @@ def test_same_stems_in_different_folders_get_different_names(capture: Any, conte
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"skip_missin": True}, ["scene.skip_missin", "did you mean 'skip_missing'"]),
-        ({"skip_missing": 1}, ["scene.skip_missing is 1", "true or false"]),
-        ({"test_every": 1}, ["scene.test_every is 1", "at least 2"]),
+        ({"skip_missin": True}, ["scene.skip_missin", "did you mean 'scene.skip_missing'"]),
+        ({"skip_missing": 1}, ["scene.skip_missing=1: expected true or false"]),
+        ({"test_every": 1}, ["scene.test_every=1", "at least 2"]),
         ({"background": "random"}, ["no alpha"]),
     ],
 )

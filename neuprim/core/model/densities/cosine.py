@@ -8,11 +8,12 @@ p = 0 without gain is the paper's primitive; p = 2 with K = 0 is close to a Gaus
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
+from neuprim.core.checked import Range
 from neuprim.core.model.edge import EDGES, NORMS, ball_integral, fade
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
 from neuprim.core.model.geometry import Geometry
@@ -29,8 +30,8 @@ GAIN_LIMIT = 20.0
 products with the other weights stay far from the ends of float32."""
 
 
-DENSITY_OPTIONS: dict[str, tuple[Any, ...] | type] = {"edge": EDGES, "gain": bool, "omega0": float}
-"""What ``model.density`` may say for it, in every task (:mod:`neuprim.core.choices`)."""
+DENSITY_OPTIONS: dict[str, Any] = {"edge": EDGES, "gain": bool, "omega0": Annotated[float, Range(above=0)]}
+"""What ``model.density`` may say for it, in every task (:func:`neuprim.core.checked.choose`)."""
 
 
 class CosineDensity(DensityField):

@@ -14,24 +14,25 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
 
-from neuprim.core.errors import ConfigError, DataError, nearest
+from neuprim.core.checked import Range, converted
+from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.scenes.cached import cached_folder
 from neuprim.tasks.dynamic.simulation.projection import Box
 from neuprim.tasks.dynamic.simulation.scenes import SCENES, Scene, Stage
 from neuprim.tasks.dynamic.simulation.solver import State, advance
 
-__all__ = ["RESOLUTIONS", "SOLVER_VERSION", "THRESHOLD", "TIMESTEPS", "box_of", "cache_key", "grids_of", "simulate"]
+__all__ = ["SOLVER_VERSION", "THRESHOLD", "TIMESTEPS", "Resolution", "box_of", "cache_key", "grids_of", "simulate"]
 
 SOLVER_VERSION = 1
 """Part of the cache's key: to be raised with every change to the solver, the scenes' sources or the files' layout."""
@@ -39,10 +40,11 @@ SOLVER_VERSION = 1
 THRESHOLD = 2e-3
 """Values below are background: nobody sees them, and files stay small."""
 
-RESOLUTIONS = (16, 192)
-"""Least and most cells across the box; advection counts cells in float32, which is exact up to 2^24."""
+Resolution = Annotated[int, Range(16, 192)]
+"""Cells across the box; advection counts cells in float32, which is exact up to 2^24."""
 
 TIMESTEPS = (1, 1000)
+"""Fewest and most frames of a simulation."""
 
 Progress = Callable[[str, float], None]
 
@@ -72,24 +74,16 @@ def simulate(
         DataError: the cache directory cannot be written.
     """
     scene = _scene(name)
-    count = _whole("scene.timesteps", scene.timesteps if frames is None else frames, *TIMESTEPS)
-    _whole("scene.resolution", resolution, *RESOLUTIONS)
-    _whole("seed", seed, 0, 2**63 - 1)
+    count: int = converted(scene.timesteps if frames is None else frames, Annotated[int, Range(*TIMESTEPS)], "scene.timesteps")
+    resolution = converted(resolution, Resolution, "scene.resolution")
+    seed = converted(seed, Annotated[int, Range(0, 2**63 - 1)], "seed")
     final = Path(cache_dir) / f"sim-{name}-{cache_key(scene, count, resolution, seed)}"
-    if _complete(final, name, count):
-        return final
-    try:
-        final.parent.mkdir(parents=True, exist_ok=True)
-        draft = Path(tempfile.mkdtemp(prefix=f".{final.name}-", dir=final.parent))
-        try:
-            draft.chmod(0o755)  # mkdtemp's 0700 would hide a shared cache from its other users
-            _write(scene, count, resolution, seed, draft, progress)
-            _publish(draft, final, name, count)
-        finally:
-            shutil.rmtree(draft, ignore_errors=True)
-    except OSError as error:
-        raise DataError(f"scene {name}: cannot write the simulated frames to {final}: {error}") from error
-    return final
+    files = [f"{name}_{i}.vdb" for i in range(count)]
+
+    def write(folder: Path) -> None:
+        _write(scene, count, resolution, seed, folder, progress)
+
+    return cached_folder(final, files, write, f"scene {name}: cannot write the simulated frames")
 
 
 def cache_key(scene: Scene, frames: int, resolution: int, seed: int) -> str:
@@ -175,28 +169,7 @@ def _finish(writing: Future[None] | None) -> None:
         writing.result()  # raises what the writer raised
 
 
-def _complete(folder: Path, name: str, count: int) -> bool:
-    return all((folder / f"{name}_{i}.vdb").is_file() for i in range(count))
-
-
-def _publish(draft: Path, final: Path, name: str, count: int) -> None:
-    """Give the draft its name. Another process may have been faster: its files are the same ones."""
-    if final.exists() and not _complete(final, name, count):
-        shutil.rmtree(final)  # somebody deleted part of it
-    try:
-        draft.rename(final)
-    except OSError:
-        if not _complete(final, name, count):
-            raise
-
-
 def _scene(name: str) -> Scene:
     if name not in SCENES:
         raise ConfigError(f"scene {name!r} is not simulated{nearest(str(name), SCENES)}")
     return SCENES[name]
-
-
-def _whole(key: str, value: int, lowest: int, highest: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
-        raise ConfigError(f"{key} is {value!r}; expected a whole number from {lowest} to {highest}")
-    return value

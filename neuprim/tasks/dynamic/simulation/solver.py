@@ -9,14 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
+from neuprim.core.checked import Range, verify
 from neuprim.tasks.dynamic.simulation.advection import advect
 from neuprim.tasks.dynamic.simulation.projection import Box, Faces, expansion_flow, project, to_centres, to_faces
 
 __all__ = ["Forcing", "SolverSettings", "Source", "State", "advance", "step"]
+
+
+NotNegative = Annotated[float, Range(at_least=0)]
 
 
 @dataclass(frozen=True)
@@ -40,20 +45,23 @@ class SolverSettings:
         most_steps: steps per frame at most.
     """
 
-    buoyancy: float = 2.0
-    weight: float = 0.1
-    confinement: float = 0.3
-    cooling: float = 0.3
-    radiation: float = 0.0
-    dissipation: float = 0.1
-    drag: float = 0.0
-    burn: float = 2.0
-    heat: float = 0.0
-    soot: float = 0.0
-    expansion: float = 0.0
-    smoothing: float = 0.1
-    cfl: float = 3.0
-    most_steps: int = 2
+    buoyancy: NotNegative = 2.0
+    weight: NotNegative = 0.1
+    confinement: NotNegative = 0.3
+    cooling: NotNegative = 0.3
+    radiation: NotNegative = 0.0
+    dissipation: NotNegative = 0.1
+    drag: NotNegative = 0.0
+    burn: NotNegative = 2.0
+    heat: NotNegative = 0.0
+    soot: NotNegative = 0.0
+    expansion: NotNegative = 0.0
+    smoothing: NotNegative = 0.1
+    cfl: Annotated[float, Range(above=0)] = 3.0
+    most_steps: Annotated[int, Range(at_least=1)] = 2
+
+    def __post_init__(self) -> None:
+        verify(self, "solver")
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +13,13 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from neuprim.core.data import Clip, Dataset, DataSource, Pixels, PointCloud, View, ViewSet, camera_extent
+from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, View, ViewSet, camera_extent
 from neuprim.core.errors import DataError
 from neuprim.core.io import images
-from neuprim.core.model.primitives import Primitives
-from neuprim.core.volumes.source import Placement
-from neuprim.tasks.dynamic.invisible import invisible_fraction
 from neuprim.tasks.dynamic.volume.capture import Capture
-from neuprim.tasks.dynamic.volume.compare import compare_with_truth
 from neuprim.tasks.dynamic.volume.source import placement_of
 
-__all__ = ["MEMORY", "MEMORY_TEST", "FrameViews", "VolumeDataset"]
+__all__ = ["MEMORY", "MEMORY_TEST", "FrameViews", "Recording", "volume_dataset"]
 
 MEMORY = 3 * 2**28
 """Bytes of decoded images that the training split keeps, 768 MiB; beyond them the oldest are read again when needed."""
@@ -77,37 +74,29 @@ class FrameViews(ViewSet):
         return rgba
 
 
-class VolumeDataset(Dataset):
-    """A volume sequence seen by cameras; colours are linear radiance over ``exposure``, the brightest value any camera sees."""
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A volume sequence as cameras saw it: what the dynamic task judges models of it by, a data set's ``extra``.
 
-    train: FrameViews
+    Attributes:
+        name: of the data set.
+        folder: of the rendered images.
+        exposure: the brightest value that any camera sees.
+        weights: per frame, its share of the sequence's extinction.
+        every: every n-th frame is learned from.
+        test: the held-out views, camera by camera, all frames of each.
+    """
+
+    name: str
+    capture: Capture
+    folder: Path
+    exposure: float
+    weights: Sequence[float]
+    every: int
     test: FrameViews
-    channels = 3
-    color_space = "linear"
-    random_background = True
+    _tracks: dict[int, Tensor] = field(default_factory=dict, repr=False)
 
-    def __init__(
-        self, name: str, source: DataSource, capture: Capture, folder: Path, held_out: Sequence[int], up: Tensor, every: int = 1
-    ) -> None:
-        self.name, self.data_source = name, source
-        self.capture, self.folder, self.every = capture, folder, every
-        stored = [_stored(capture.points(folder, frame)) for frame in capture.frames]
-        self.exposure = max(float(s["brightest"]) for s in stored)
-        if not self.exposure > 0:
-            raise DataError(f"{name}: every frame is black from every camera; expected light (check scene.look and scene.grids)")
-        self.weights = [float(s["weight"]) for s in stored]
-        learned = [c for c in range(len(capture.cameras)) if c not in held_out]
-        self.train = FrameViews(capture, folder, learned, self.exposure, every)
-        self.test = FrameViews(capture, folder, held_out, self.exposure, memory=MEMORY_TEST)
-        self.extent = camera_extent(capture.cameras)
-        self.background = torch.zeros(3)
-        camera = capture.cameras[0]
-        self.downsampling = f"rendered at {camera.width}x{camera.height}, {capture.samples}x{capture.samples} rays per pixel"
-        self.up, self.center = up, torch.zeros(3, dtype=torch.float64)
-        self.bounds = torch.from_numpy(capture.bounds)
-        self._masks: dict[int, Tensor] = {}
-
-    def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
+    def points(self, views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
         """Points where some frame absorbs, as many of a frame as it has of the sequence's extinction, with the frame's time."""
         total = np.array(self.weights)
         total[[t for t in range(len(total)) if t % self.every]] = 0.0  # nothing is known of frames that are not learned from
@@ -133,35 +122,59 @@ class VolumeDataset(Dataset):
             times.append(torch.full((wanted,), float(self.test.times[t])))
         return PointCloud(torch.cat(means), torch.cat(colors), {"time": torch.cat(times)})
 
-    def clips(self) -> list[Clip]:
-        frames = len(self.capture.frames)
-        return [Clip(f"cam_{c:02d}", range(i * frames, (i + 1) * frames), 24.0) for i, c in enumerate(self.test.cameras)]
-
-    def mask(self, index: int) -> Tensor:
-        """Pixels that show matter in some frame of the view's camera."""
+    def track(self, index: int) -> Tensor:
+        """(H, W) bool, the pixels that show matter in some frame of a test view's camera; kept, as all frames of a camera share it."""
         frames = len(self.capture.frames)
         camera = index // frames
-        if camera not in self._masks:
+        if camera not in self._tracks:
             alphas = (self.test.pixels(i).alpha for i in range(camera * frames, (camera + 1) * frames))
             union = torch.zeros(self.test.view(index).camera.height, self.test.view(index).camera.width, dtype=torch.bool)
             for alpha in alphas:
                 assert alpha is not None
                 union |= alpha > _MATTER
-            self._masks[camera] = union
-        return self._masks[camera]
+            self._tracks[camera] = union
+        return self._tracks[camera]
 
-    def placement(self) -> Placement:
-        return placement_of(self.capture)
 
-    def diagnose(self, model: Primitives) -> dict[str, Any]:
-        """The model's extinction against the files', and its size against theirs."""
-        return {
-            "exposure": self.exposure,
-            "vdb_bytes": sum(frame.path.stat().st_size for frame in self.capture.frames),
-            "normalisation": self.capture.normalisation.to_json(),
-            "invisible_fraction": invisible_fraction(model, self.test.times),
-            **compare_with_truth(model, self.capture, [float(t) for t in self.test.times]),
-        }
+def volume_dataset(
+    name: str, source: DataSource, capture: Capture, folder: Path, held_out: Sequence[int], up: Tensor, every: int = 1
+) -> Dataset:
+    """A volume sequence seen by cameras; colours are linear radiance over the exposure, the brightest value any camera sees.
+
+    Args:
+        folder: of the images that the capture took.
+        held_out: indices of the cameras of the test split.
+
+    Raises:
+        DataError: every frame is black, or a file is damaged.
+    """
+    stored = [_stored(capture.points(folder, frame)) for frame in capture.frames]
+    exposure = max(float(s["brightest"]) for s in stored)
+    if not exposure > 0:
+        raise DataError(f"{name}: every frame is black from every camera; expected light (check scene.look and scene.grids)")
+    learned = [c for c in range(len(capture.cameras)) if c not in held_out]
+    train = FrameViews(capture, folder, learned, exposure, every)
+    test = FrameViews(capture, folder, held_out, exposure, memory=MEMORY_TEST)
+    recording = Recording(name, capture, folder, exposure, [float(s["weight"]) for s in stored], every, test)
+    camera = capture.cameras[0]
+    return Dataset(
+        name=name,
+        train=train,
+        test=test,
+        start=recording.points,
+        extent=camera_extent(capture.cameras),
+        background=torch.zeros(3),
+        color_space="linear",
+        data_source=source,
+        random_background=True,
+        downsampling=f"rendered at {camera.width}x{camera.height}, {capture.samples}x{capture.samples} rays per pixel",
+        up=up,
+        center=torch.zeros(3, dtype=torch.float64),
+        bounds=torch.from_numpy(capture.bounds),
+        exposure=exposure,
+        placement=placement_of(capture),
+        extra=recording,
+    )
 
 
 def _stored(path: Path) -> dict[str, Any]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from typing import Any
 
+from neuprim.core.checked import hints_of, refuse_unknown
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.tasks.dynamic.volume.optics import Light, Look
-from neuprim.tasks.dynamic.volume.settings import GRIDS
+from neuprim.tasks.dynamic.volume.settings import Axis
 
 __all__ = ["EMBERGEN_FIRE", "LOOKS", "changed", "named_look"]
 
@@ -76,21 +76,11 @@ LOOKS = {
 }
 
 
-def named_look(name: str, up: str = "z") -> Look:
+def named_look(name: str, up: Axis = "z") -> Look:
     """The preset of that name, for sequences with this up axis."""
     if name not in LOOKS:
         raise ConfigError(f"scene.look={name}: no such look{nearest(name, LOOKS)}")
     return LOOKS[name].turned(up)
-
-
-# ---------------------------------------------------------------- changes by the user
-
-_NUMBER, _PAIR, _RGB = "a number", "two numbers, as [0,1]", "three numbers, as [1,0.5,0]"
-_FORMS = {
-    **dict.fromkeys(("extinction", "emission", "flame_extinction"), _NUMBER),
-    **dict.fromkeys(("flame_range", "kelvin"), _PAIR),
-    **dict.fromkeys(("albedo", "ambient"), _RGB),
-}
 
 
 def changed(look: Look, changes: Mapping[str, Any]) -> Look:
@@ -99,58 +89,8 @@ def changed(look: Look, changes: Mapping[str, Any]) -> Look:
     Raises:
         ConfigError: no such setting, a value of another form, or an impossible one.
     """
-    known = [f.name for f in dataclasses.fields(Look)]
-    for key, value in changes.items():
-        where = f"scene.optics.{key}"
-        if key not in known:
-            raise ConfigError(f"{where}: no such setting{nearest(key, known)}")
-        try:
-            change: dict[str, Any] = {key: _light(look, value, where) if key == "light" else _value(key, value, where)}
-            look = dataclasses.replace(look, **change)
-        except ConfigError as error:
-            raise ConfigError(str(error) if str(error).startswith(where) else f"{where}={value}: {error}") from error
-    return look
-
-
-def _value(key: str, value: Any, where: str) -> Any:
-    if key in _FORMS:
-        return _numbers(value, _FORMS[key], where)
-    if key == "gradient":
-        if value is None:
-            return None
-        if not isinstance(value, list) or not value:
-            raise ConfigError(f"{where}={value}: expected colours from bottom to top, as [[1,0,0],[0,0,1]], or null")
-        return tuple(_numbers(color, _RGB, where) for color in value)
-    if key == "extinction_grids":
-        if not isinstance(value, list) or not value or any(name not in GRIDS for name in value):
-            raise ConfigError(f"{where}={value}: expected a list of {', '.join(GRIDS)} (scene.grids says which grid that is)")
-        return tuple(value)
-    choices = ("y", "z") if key == "up" else (*GRIDS, None) if key == "color_grid" else GRIDS
-    if value not in choices:
-        raise ConfigError(f"{where}={value}: expected {' or '.join('null' if c is None else c for c in choices)}")
-    return value
-
-
-def _numbers(value: Any, form: str, where: str) -> Any:
-    """The number, or the tuple of as many as the form says."""
-    count = {_NUMBER: 1, _PAIR: 2, _RGB: 3}[form]
-    found = [value] if count == 1 else value
-    plain = isinstance(found, list) and len(found) == count
-    if not plain or not all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in found):
-        raise ConfigError(f"{where}={value}: expected {form}")
-    return float(value) if count == 1 else tuple(float(v) for v in found)
-
-
-def _light(look: Look, value: Any, where: str) -> Light | None:
-    if value is None:
-        return None
-    parts = ("direction", "irradiance")
-    if not isinstance(value, Mapping) or not value or any(key not in parts for key in value):
-        raise ConfigError(f"{where}={value}: expected {where}.direction=[X,Y,Z], {where}.irradiance=[R,G,B], or null")
-    given = {key: _numbers(v, _RGB, f"{where}.{key}") for key, v in value.items()}
-    missing = [key for key in parts if key not in given]
-    if missing and look.light is None:
-        raise ConfigError(f"{where}.{missing[0]}: required and not given, as the look has no light")
-    if not any(given.get("direction", (1.0,))):
-        raise ConfigError(f"{where}.direction={value['direction']}: expected numbers that are not all 0")
-    return dataclasses.replace(look.light, **given) if look.light else Light(**given)
+    refuse_unknown(changes, hints_of(Look), "scene.optics")
+    light = changes.get("light")
+    if look.light is not None and isinstance(light, Mapping):
+        changes = {**changes, "light": {**vars(look.light), **light}}
+    return dataclasses.replace(look, **changes)

@@ -5,21 +5,34 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from scipy import ndimage
 
-from neuprim.core.errors import ConfigError, DataError, nearest
+from neuprim.core.checked import Accepts, Range, Unbounded, verify
+from neuprim.core.errors import DataError, nearest
 from neuprim.core.io.vdb import DENSE_LIMIT, Bounds, Grid
 from neuprim.tasks.dynamic.volume.blackbody import black_body_rgb
 from neuprim.tasks.dynamic.volume.medium import Medium
 from neuprim.tasks.dynamic.volume.normalise import Normalisation
 from neuprim.tasks.dynamic.volume.rig import AXES
+from neuprim.tasks.dynamic.volume.settings import GRIDS, Axis, Meaning
 from neuprim.tasks.dynamic.volume.transmittance import transmittance
 
 __all__ = ["Light", "Look", "medium_of"]
 
-RGB = tuple[float, float, float]
+NotNegative = Annotated[float, Range(at_least=0)]
+RGB = Annotated[tuple[NotNegative, NotNegative, NotNegative], Accepts(lambda colour: True, "three numbers of at least 0, as [1, 0.5, 0]")]
+Coordinate = Annotated[float, Unbounded("any direction, of any length")]
+Level = Annotated[float, Unbounded("values of a grid, in whatever unit its files have")]
+Kelvin = Annotated[float, Range(above=0, at_most=1e5)]
+Direction = Annotated[tuple[Coordinate, Coordinate, Coordinate], Accepts(any, "three numbers that are not all 0, as [0, 0, 1]")]
+
+
+def _absorbing(names: tuple[str, ...]) -> bool:
+    return bool(names) and set(names) <= set(GRIDS)
+
 
 _STEPS = 1024
 """Entries of the table of black bodies over a look's range of temperatures; linear between them."""
@@ -34,8 +47,11 @@ class Light:
         irradiance: RGB on a plane facing it, in the unit of radiance times steradian.
     """
 
-    direction: tuple[float, float, float]
+    direction: Direction
     irradiance: RGB
+
+    def __post_init__(self) -> None:
+        verify(self, "scene.optics.light")
 
 
 @dataclass(frozen=True)
@@ -70,36 +86,37 @@ class Look:
         up: 'y' or 'z', for the gradient.
     """
 
-    extinction_grids: tuple[str, ...] = ("density", "temperature")
-    extinction: float = 10.0
+    extinction_grids: Annotated[
+        tuple[str, ...], Accepts(_absorbing, f"a list of {', '.join(GRIDS)} (scene.grids says which grid that is)")
+    ] = (
+        "density",
+        "temperature",
+    )
+    extinction: NotNegative = 10.0
     albedo: RGB = (1.0, 1.0, 1.0)
     ambient: RGB = (0.0, 0.0, 0.0)
     light: Light | None = None
-    flame_grid: str = "flames"
-    flame_range: tuple[float, float] = (0.0, 1.0)
-    kelvin: tuple[float, float] = (1000.0, 2000.0)
-    emission: float = 0.0
-    flame_extinction: float = 0.0
-    color_grid: str | None = None
-    gradient: tuple[RGB, ...] | None = None
-    up: str = "z"
+    flame_grid: Meaning = "flames"
+    flame_range: Annotated[tuple[Level, Level], Accepts(lambda ends: ends[0] < ends[1], "two rising numbers, as [0, 1]")] = (0.0, 1.0)
+    kelvin: Annotated[tuple[Kelvin, Kelvin], Accepts(lambda k: k[0] <= k[1], "two rising numbers within 0..1e5, as [1000, 2000]")] = (
+        1000.0,
+        2000.0,
+    )
+    emission: NotNegative = 0.0
+    flame_extinction: NotNegative = 0.0
+    color_grid: Meaning | None = None
+    gradient: Annotated[tuple[RGB, ...], Accepts(bool, "colours from bottom to top, as [[1, 0, 0], [0, 0, 1]]")] | None = None
+    up: Axis = "z"
 
     def __post_init__(self) -> None:
-        lit = self.light.irradiance if self.light else ()
-        weights = (self.extinction, self.emission, self.flame_extinction, *self.albedo, *self.ambient, *lit)
-        if not all(0.0 <= w < math.inf for w in weights):
-            raise ConfigError("look: an extinction, colour or strength is negative or infinite; expected numbers >= 0")
-        if not self.flame_range[0] < self.flame_range[1] or not 0.0 < self.kelvin[0] <= self.kelvin[1] <= 1e5:
-            raise ConfigError(f"look: flame_range {self.flame_range}, kelvin {self.kelvin}; expected rising ones, kelvin within 0..1e5")
-        if self.up not in AXES:
-            raise ConfigError(f"look: up {self.up!r}; expected 'y' or 'z'")
+        verify(self, "scene.optics")
 
     @property
     def grids(self) -> tuple[str, ...]:
         """Names of all grids that the look reads where a file has them."""
         return tuple(dict.fromkeys(n for n in (*self.extinction_grids, self.flame_grid, self.color_grid) if n))
 
-    def turned(self, up: str) -> Look:
+    def turned(self, up: Axis) -> Look:
         """The same look for sequences whose up axis is ``up``; the light turns along."""
         if up == self.up or up not in AXES or self.light is None:
             return replace(self, up=up)

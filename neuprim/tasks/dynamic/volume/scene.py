@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from neuprim.core.checked import checked
 from neuprim.core.data import Dataset, DataSource
 from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import VdbFrame, sequence
 from neuprim.core.task import SceneContext
 from neuprim.tasks.dynamic.simulation import simulate
 from neuprim.tasks.dynamic.volume.capture import Capture
-from neuprim.tasks.dynamic.volume.dataset import VolumeDataset
+from neuprim.tasks.dynamic.volume.dataset import volume_dataset
 from neuprim.tasks.dynamic.volume.grids import GridReader, find_grids
 from neuprim.tasks.dynamic.volume.looks import changed, named_look
 from neuprim.tasks.dynamic.volume.normalise import Normalisation
@@ -41,7 +42,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     asked, name, source, capture, held_out = _prepare(settings, context)
     rendered = capture.take(context.cache_dir, context.progress)
     up = torch.tensor(AXES[asked.up], dtype=torch.float64)
-    return VolumeDataset(name, source, capture, rendered, held_out, up, asked.train_every)
+    return volume_dataset(name, source, capture, rendered, held_out, up, asked.train_every)
 
 
 def load_volume(settings: Mapping[str, Any], context: SceneContext) -> CaptureSource:
@@ -51,11 +52,11 @@ def load_volume(settings: Mapping[str, Any], context: SceneContext) -> CaptureSo
 
 def _prepare(settings: Mapping[str, Any], context: SceneContext) -> tuple[VolumeSettings, str, DataSource, Capture, range]:
     """All that is known before anything is rendered: settings, name, origin, what to render, and the cameras held out."""
-    asked = VolumeSettings.parse(settings)
+    asked = checked(VolumeSettings, settings, "scene")
     _look(asked, AUTO[0])  # a typing error shows before anything is simulated
     folder, name, source = _files(asked, context)
     frames = _frames(folder, asked)
-    reader = find_grids(frames, asked.grids)
+    reader = find_grids(frames, {str(meaning): name for meaning, name in asked.grids.items()})
     look = _look(asked, AUTO["density" not in reader.names])
     reader = reader.absorbing(look.extinction_grids, folder)
     box, hottest = _survey(frames, reader, context.progress)

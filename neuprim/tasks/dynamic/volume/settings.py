@@ -4,16 +4,34 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, get_args
 
-from neuprim.core.errors import ConfigError, DataError, nearest
+from neuprim.core.checked import Accepts, Range, converted, text, verify
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.tasks.dynamic.simulation.generate import TIMESTEPS, Resolution
 
-__all__ = ["GRIDS", "VolumeSettings", "choose_frames"]
+__all__ = ["GRIDS", "Axis", "Meaning", "VolumeSettings", "choose_frames"]
 
-GRIDS = ("density", "temperature", "flames", "color")
+Axis = Literal["y", "z"]
+"""The upward one of a sequence's files."""
+
+Meaning = Literal["density", "temperature", "flames", "color"]
+
+GRIDS: tuple[str, ...] = get_args(Meaning)
 """What a grid may mean; ``scene.grids.MEANING=NAME`` says which grid of the files has it."""
+
+
+def _span(frames: str) -> range | None:
+    """The numbers that "FIRST:LAST" or "FIRST:LAST:STEP" names, LAST included; None for text of another form."""
+    match = re.fullmatch(r"(\d{1,9}):(\d{1,9})(?::(\d{1,9}))?", frames)
+    if match is None or (step := int(match[3] or 1)) < 1 or int(match[1]) > int(match[2]):
+        return None
+    return range(int(match[1]), int(match[2]) + 1, step)
+
+
+Frames = Annotated[str, Accepts(lambda v: v == "all" or _span(v) is not None, "all, FIRST:LAST or FIRST:LAST:STEP, as 0:100:2")]
 
 
 @dataclass(frozen=True)
@@ -36,65 +54,38 @@ class VolumeSettings:
         up: "y" or "z", the upward axis of the files.
     """
 
-    vdb: Path | None = None
+    vdb: Annotated[Path, text("a folder of .vdb files")] | None = None
     simulation: str | None = None
-    resolution: int = 64
-    timesteps: int | None = None
-    frames: str = "all"
-    grids: Mapping[str, str] = field(default_factory=dict)
+    resolution: Resolution = 64
+    timesteps: Annotated[int, Range(2, TIMESTEPS[1])] | None = None
+    frames: Frames = "all"
+    grids: Mapping[Meaning, Annotated[str, text("the name of a grid")]] = field(default_factory=dict)
     look: str = "auto"
     optics: Mapping[str, Any] = field(default_factory=dict)
-    size: int = 64
-    cameras: int = 40
-    field_of_view: float = 27.0
-    samples: int = 2
-    train_every: int = 1
-    up: str = "z"
+    size: Annotated[int, Range(8, 4096)] = 64
+    cameras: Annotated[int, Range(4, 1000)] = 40
+    field_of_view: Annotated[float, Range(1, 120, says="degrees from 1 to 120")] = 27.0
+    samples: Annotated[int, Range(1, 16)] = 2
+    train_every: Annotated[int, Range(1, 1000)] = 1
+    up: Axis = "z"
 
-    @staticmethod
-    def parse(settings: Mapping[str, Any]) -> VolumeSettings:
-        """Settings from a mapping; :class:`ConfigError` for an unknown name or impossible value."""
-        known = [f.name for f in fields(VolumeSettings)]
-        for name in settings:
-            if name not in known:
-                raise ConfigError(f"scene.{name} is not a setting of this scene{nearest(str(name), known)}")
-        made = VolumeSettings(**{**settings, "vdb": Path(settings["vdb"]) if settings.get("vdb") else None})
-        limits = (("resolution", 16, 192), ("size", 8, 4096), ("cameras", 4, 1000), ("samples", 1, 16), ("train_every", 1, 1000))
-        for name, lowest, highest in limits:
-            value = getattr(made, name)
-            if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
-                raise ConfigError(f"scene.{name}={value!r}: expected a whole number from {lowest} to {highest}")
-        if isinstance(made.field_of_view, bool) or not isinstance(made.field_of_view, int | float) or not 1 <= made.field_of_view <= 120:
-            raise ConfigError(f"scene.field_of_view={made.field_of_view!r}: expected degrees from 1 to 120")
-        if made.timesteps is not None and not (isinstance(made.timesteps, int) and 2 <= made.timesteps <= 1000):
-            raise ConfigError(f"scene.timesteps={made.timesteps!r}: expected a whole number from 2 to 1000, or null")
-        if made.up not in ("y", "z"):
-            raise ConfigError(f"scene.up={made.up!r}: expected y or z")
-        for meaning, grid in made.grids.items():
-            if meaning not in GRIDS:
-                raise ConfigError(f"scene.grids.{meaning}: no such meaning{nearest(meaning, GRIDS)}")
-            if not isinstance(grid, str) or not grid:
-                raise ConfigError(f"scene.grids.{meaning}={grid!r}: expected the name of a grid")
-        if made.vdb is None and made.simulation is None:
+    def __post_init__(self) -> None:
+        verify(self, "scene")
+        if self.vdb is None and self.simulation is None:
             raise ConfigError("scene.vdb: required and not given; expected a folder of .vdb files")
-        choose_frames(made.frames, [])
-        return made
 
 
-def choose_frames(text: str, numbers: Sequence[int], where: str = "the sequence") -> list[int]:
-    """Those of the ascending frame ``numbers`` that ``text`` names; all that an empty sequence is asked is whether the text is right.
+def choose_frames(frames: str, numbers: Sequence[int], where: str = "the sequence") -> list[int]:
+    """Those of the ascending ``numbers`` of a sequence that ``scene.frames`` names.
 
     Raises:
         ConfigError: another form than "all", "FIRST:LAST" or "FIRST:LAST:STEP".
         DataError: none of the frames exists.
     """
-    if text == "all":
+    span = _span(converted(frames, Frames, "scene.frames"))
+    if span is None:
         return list(numbers)
-    match = re.fullmatch(r"(\d{1,9}):(\d{1,9})(?::(\d{1,9}))?", text)
-    if match is None or (step := int(match[3] or 1)) < 1 or int(match[1]) > int(match[2]):
-        raise ConfigError(f"scene.frames={text}: expected all, FIRST:LAST or FIRST:LAST:STEP, as 0:100:2")
-    wanted = range(int(match[1]), int(match[2]) + 1, step)
-    chosen = [n for n in numbers if n in wanted]
+    chosen = [n for n in numbers if n in span]
     if numbers and not chosen:
-        raise DataError(f"scene.frames={text}: {where} has frames {numbers[0]} to {numbers[-1]}, and none of these")
+        raise DataError(f"scene.frames={frames}: {where} has frames {numbers[0]} to {numbers[-1]}, and none of these")
     return chosen

@@ -4,6 +4,6 @@
 and ``dataset`` reads it.
 """
 
-from neuprim.tasks.relight.lit.dataset import LitSolids, load
+from neuprim.tasks.relight.lit.dataset import load
 
-__all__ = ["LitSolids", "load"]
+__all__ = ["load"]

@@ -14,26 +14,23 @@ Scene, cameras and lights are fixed: equal settings give equal files whatever th
 
 from __future__ import annotations
 
-import json
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from neuprim.core.cameras import look_at
-from neuprim.core.errors import DataError
-from neuprim.core.io.files import publish_folder
+from neuprim.core.checked import Range, verify
 from neuprim.core.io.images import write_exr
+from neuprim.scenes.image_set import ImageSet, Progress
+from neuprim.scenes.poses import camera_to_world
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.rays import bands, pixel_means
-from neuprim.scenes.settings import check_names, check_whole, settings_key
+from neuprim.scenes.settings import ImageSize, Supersampling, settings_key
 from neuprim.tasks.relight.lit.rig import DISTANCE, LitView, splits
 from neuprim.tasks.relight.lit.scene import RADIUS, solids
 from neuprim.tasks.relight.lit.shading import shade
@@ -50,8 +47,6 @@ INTENSITY = 69.2
 FIELD_OF_VIEW = 2 * float(np.arcsin(RADIUS / DISTANCE[0]))
 """Radians; holds the whole scene from the nearest camera."""
 
-Progress = Callable[[str, float], None]
-
 
 @dataclass(frozen=True)
 class LitSettings:
@@ -63,20 +58,13 @@ class LitSettings:
         supersampling: rays per pixel along each axis.
     """
 
-    size: int = 128
-    train_views: int = 500
-    test_views: int = 100
-    supersampling: int = 2
+    size: ImageSize = 128
+    train_views: Annotated[int, Range(1, 100000)] = 500
+    test_views: Annotated[int, Range(1, 10000)] = 100
+    supersampling: Supersampling = 2
 
     def __post_init__(self) -> None:
-        check_whole(self, {"size": (8, 4096), "train_views": (1, 100000), "test_views": (1, 10000), "supersampling": (1, 16)})
-
-    @staticmethod
-    def parse(settings: Mapping[str, Any], others: Sequence[str] = ()) -> LitSettings:
-        """Settings from a mapping, of which ``others`` are not read here; :class:`ConfigError` for an unknown name or impossible value."""
-        known = [f.name for f in fields(LitSettings)]
-        check_names(settings, [*known, *others])
-        return LitSettings(**{name: value for name, value in settings.items() if name in known})
+        verify(self, "scene")
 
     def key(self) -> str:
         """A short hash of every setting and the generator's version."""
@@ -104,18 +92,30 @@ def generate(settings: LitSettings, cache_dir: Path, progress: Progress = lambda
     Raises:
         DataError: the cache directory cannot be written.
     """
-    final = Path(cache_dir) / f"lit_solids-{settings.key()}"
-    try:
-        publish_folder(final, lambda draft: _write(settings, draft, progress), lambda folder: _complete(folder, settings))
-    except OSError as error:
-        raise DataError(f"scene lit_solids: cannot write the generated images to {final}: {error}") from error
-    return final
+    lens = {"camera_angle_x": FIELD_OF_VIEW, "camera_near": DISTANCE[0] - 1.5, "camera_far": DISTANCE[1] + 1.5}
 
+    def draw(scene: Scene, view: LitView, paths: Sequence[Path]) -> None:
+        pose = camera_to_world(view.camera)
+        taken = picture(scene, pose, view.light, settings.size, settings.supersampling)
+        file, unshadowed, classes, *nearest_light = paths
+        write_exr(file, torch.from_numpy(taken.rgba), half=True)
+        write_exr(unshadowed, torch.from_numpy(taken.unshadowed), half=True)
+        Image.fromarray(taken.classes).save(classes)
+        for path in nearest_light:
+            assert view.near_light is not None
+            write_exr(path, torch.from_numpy(picture(scene, pose, view.near_light, settings.size, settings.supersampling).rgba), half=True)
 
-def camera_to_world(eye: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4, 4) camera-to-world matrix, OpenGL axes, of a camera at ``eye`` (3,) that looks at the origin, z up."""
-    view = look_at(torch.from_numpy(np.asarray(eye, dtype=np.float64)), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
-    return torch.linalg.inv(view).numpy() @ np.diag([1.0, -1.0, -1.0, 1.0])
+    return ImageSet(
+        name="lit_solids",
+        key=settings.key(),
+        size=settings.size,
+        splits=splits(settings.train_views, settings.test_views),
+        lens=lens,
+        build=lambda: Scene(solids()),
+        frame=_frame,
+        files=_files,
+        draw=draw,
+    ).generate(cache_dir, progress)
 
 
 def picture(scene: Scene, pose: NDArray[np.float64], light: NDArray[np.float64], size: int, supersampling: int) -> Picture:
@@ -135,56 +135,9 @@ def picture(scene: Scene, pose: NDArray[np.float64], light: NDArray[np.float64],
     return Picture(rgba, unshadowed, classes)
 
 
-def _files(view: LitView, folder: Path) -> Iterator[Path]:
-    yield folder / f"{view.name}.exr"
-    yield folder / f"{view.name}_unshadowed.exr"
-    yield folder / f"{view.name}_classes.png"
-    if view.near_light is not None:
-        yield folder / f"{view.name}_nearest.exr"
-
-
-def _complete(folder: Path, settings: LitSettings) -> bool:
-    views = splits(settings.train_views, settings.test_views)
-    files = (file for split in views for view in views[split] for file in _files(view, folder / split))
-    return all((folder / f"transforms_{split}.json").is_file() for split in views) and all(file.is_file() for file in files)
-
-
-def _write(settings: LitSettings, folder: Path, progress: Progress) -> None:
-    progress("lit_solids: building the scene", 0.0)
-    scene = Scene(solids())
-    text = f"lit_solids: drawing {settings.size}x{settings.size} images"
-    if scene.engine != "embree":
-        text += " (without embreex, which would be faster)"
-    views = splits(settings.train_views, settings.test_views)
-    for split, mine in views.items():
-        (folder / split).mkdir()
-        layout = {
-            "camera_angle_x": FIELD_OF_VIEW,
-            "camera_near": DISTANCE[0] - 1.5,
-            "camera_far": DISTANCE[1] + 1.5,
-            "frames": [_frame(split, view) for view in mine],
-        }
-        (folder / f"transforms_{split}.json").write_text(json.dumps(layout, indent=1), encoding="utf-8")
-
-    def draw(job: tuple[str, LitView]) -> None:
-        split, view = job
-        pose = camera_to_world(view.camera)
-        taken = picture(scene, pose, view.light, settings.size, settings.supersampling)
-        file, unshadowed, classes, *nearest_light = _files(view, folder / split)
-        write_exr(file, torch.from_numpy(taken.rgba), half=True)
-        write_exr(unshadowed, torch.from_numpy(taken.unshadowed), half=True)
-        Image.fromarray(taken.classes).save(classes)
-        for path in nearest_light:
-            assert view.near_light is not None
-            write_exr(path, torch.from_numpy(picture(scene, pose, view.near_light, settings.size, settings.supersampling).rgba), half=True)
-
-    jobs = [(split, view) for split, mine in views.items() for view in mine]
-    pool = ThreadPoolExecutor(min(4, os.cpu_count() or 1))
-    try:
-        for done, _ in enumerate(pool.map(draw, jobs), start=1):
-            progress(text, done / len(jobs))
-    finally:
-        pool.shutdown(cancel_futures=True)  # on an interrupt, wait for the running images only
+def _files(view: LitView) -> list[str]:
+    nearest = [] if view.near_light is None else [f"{view.name}_nearest.exr"]
+    return [f"{view.name}.exr", f"{view.name}_unshadowed.exr", f"{view.name}_classes.png", *nearest]
 
 
 def _frame(split: str, view: LitView) -> dict[str, Any]:

@@ -19,6 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from neuprim.scenes.poses import direction
+
 __all__ = ["CIRCLE_FRAMES", "DISTANCE", "NEAR_LIGHTS", "PARTS", "LitView", "splits"]
 
 DISTANCE = (4.0, 5.0)
@@ -65,9 +67,9 @@ def splits(train_views: int, test_views: int) -> dict[str, list[LitView]]:
             light = lights[seen] if name == "new_view" else new_lights[fresh]
             test.append(LitView(f"{name}_{i:0{max(2, len(str(test_views)) - 1)}d}", camera, light, _nearest(known, light)))
     middle = sum(DISTANCE) / 2
-    eye = middle * _direction(math.cos(math.radians(58.0)), -1.1)
+    eye = middle * direction(math.cos(math.radians(58.0)), -1.1)
     turns = [2 * math.pi * i / CIRCLE_FRAMES for i in range(CIRCLE_FRAMES)]
-    circle = [LitView(f"light_{i:02d}", eye, middle * _direction(math.cos(math.radians(45.0)), turn)) for i, turn in enumerate(turns)]
+    circle = [LitView(f"light_{i:02d}", eye, middle * direction(math.cos(math.radians(45.0)), turn)) for i, turn in enumerate(turns)]
     return {"train": train, "test": test, "circle": circle}
 
 
@@ -80,12 +82,7 @@ def _draw(key: int, count: int) -> tuple[list[NDArray[np.float64]], list[NDArray
 def _position(numbers: NDArray[np.float64], polar: float) -> NDArray[np.float64]:
     """Three numbers 0..1 as a point whose direction is uniform on the cap of half-angle ``polar`` about the zenith."""
     cosine = 1.0 - numbers[0] * (1.0 - math.cos(polar))
-    return (DISTANCE[0] + numbers[2] * (DISTANCE[1] - DISTANCE[0])) * _direction(cosine, 2 * math.pi * numbers[1])
-
-
-def _direction(cosine: float, azimuth: float) -> NDArray[np.float64]:
-    across = math.sqrt(max(1.0 - cosine * cosine, 0.0))
-    return np.array([across * math.cos(azimuth), across * math.sin(azimuth), cosine])
+    return (DISTANCE[0] + numbers[2] * (DISTANCE[1] - DISTANCE[0])) * direction(cosine, 2 * math.pi * numbers[1])
 
 
 def _nearest(lights: list[NDArray[np.float64]], light: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,30 +8,38 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from neuprim.core.cameras import Camera, opengl_to_viewmat
+from neuprim.core.checked import checked
 from neuprim.core.data import Dataset
 from neuprim.core.data.common import every_nth, find_image, missing_files, posed_images, unique_names
 from neuprim.core.data.records import read_json
-from neuprim.core.data.settings import Setting, data_folder, read_settings, text
+from neuprim.core.data.settings import FolderSettings, HoldOut, SplitName, data_folder
 from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import image_info
 from neuprim.core.task import SceneContext
 
-__all__ = ["load"]
+__all__ = ["BlenderSettings", "load"]
 
-_SETTINGS = {
-    "train_split": text("train", "the name in transforms_NAME.json"),
-    "test_split": text("test", "the name in transforms_NAME.json"),
-    "hold_out": Setting(
-        0, "0, or a whole number of at least 2", lambda v: isinstance(v, int) and not isinstance(v, bool) and (v == 0 or v >= 2)
-    ),
-}
+
+@dataclass(frozen=True)
+class BlenderSettings(FolderSettings):
+    """What the user may set.
+
+    Attributes:
+        train_split, test_split: names in transforms_NAME.json.
+        hold_out: n: evaluate on every n-th training view instead of the test split; 0 for that split.
+    """
+
+    train_split: SplitName = "train"
+    test_split: SplitName = "test"
+    hold_out: HoldOut = 0
 
 
 def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
@@ -41,18 +49,16 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         ConfigError: unknown or impossible settings.
         DataError: missing or damaged files, wrong or missing fields, mixed image sizes, impossible cameras.
     """
-    values = read_settings(settings, _SETTINGS)
-    folder = data_folder(values["path"])
-    train = _read_split(folder, values["train_split"])
-    if values["hold_out"]:
+    asked = checked(BlenderSettings, settings, "scene")
+    folder = data_folder(asked.path)
+    train = _read_split(folder, asked.train_split)
+    if asked.hold_out:
         if len(train) < 2:
-            raise ConfigError(
-                f"scene.hold_out is {values['hold_out']}, but {folder} has only {len(train)} training view; expected at least 2"
-            )
-        train, test = every_nth(train, values["hold_out"])
+            raise ConfigError(f"scene.hold_out is {asked.hold_out}, but {folder} has only {len(train)} training view; expected at least 2")
+        train, test = every_nth(train, asked.hold_out)
     else:
-        test = _read_split(folder, values["test_split"])
-    return posed_images(str(folder), folder.resolve().name, train, test, values, context, up=torch.tensor([0.0, 0.0, 1.0]))
+        test = _read_split(folder, asked.test_split)
+    return posed_images(str(folder), folder.resolve().name, train, test, asked, context, up=torch.tensor([0.0, 0.0, 1.0]))
 
 
 def _read_split(folder: Path, split: str) -> list[ImageFrame]:

@@ -12,31 +12,42 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 
 from neuprim.core.cameras import Camera
+from neuprim.core.checked import checked, text
 from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.common import every_nth, missing_files, posed_images, unique_names
 from neuprim.core.data.distortion import Distortion
-from neuprim.core.data.settings import count, data_folder, flag, read_settings, text
+from neuprim.core.data.settings import EveryNth, FolderSettings, data_folder
 from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.io.images import ImageInfo, image_info
 from neuprim.core.task import SceneContext
 from neuprim.tasks.static.datasets.colmap_files import check_binary_model
 
-__all__ = ["load"]
+__all__ = ["ColmapSettings", "load"]
 
-_SETTINGS = {
-    "images": text("images", "the image folder's name, e.g. images_4"),
-    "model": text("sparse/0", "the model's folder"),
-    "test_every": count(8, 2, "a whole number of at least 2"),
-    "skip_missing": flag(False),
-}
 _PINHOLE = ("SIMPLE_PINHOLE", "PINHOLE")
+
+
+@dataclass(frozen=True)
+class ColmapSettings(FolderSettings):
+    """What the user may set.
+
+    Attributes:
+        images, model: folders of the images and of the reconstruction.
+        test_every: every n-th image is held out.
+        skip_missing: leave out images that are missing; otherwise they are an error.
+    """
+
+    images: Annotated[str, text("the image folder's name, e.g. images_4")] = "images"
+    model: Annotated[str, text("the model's folder")] = "sparse/0"
+    test_every: EveryNth = 8
+    skip_missing: bool = False
 
 
 def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
@@ -48,15 +59,15 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         DataError: missing or damaged files, unsupported or impossible cameras, image sizes that are no reduction of the
             model's, no posed images, empty splits.
     """
-    values = read_settings(settings, _SETTINGS)
-    folder = data_folder(values["path"])
-    model = folder / values["model"]
+    asked = checked(ColmapSettings, settings, "scene")
+    folder = data_folder(asked.path)
+    model = folder / asked.model
     reconstruction = _read_model(model)
-    frames = _read_frames(model, folder / values["images"], reconstruction, values["skip_missing"])
-    train, test = every_nth(frames, values["test_every"])
-    prefix = "" if values["images"] == "images" else values["images"]
+    frames = _read_frames(model, folder / asked.images, reconstruction, asked.skip_missing)
+    train, test = every_nth(frames, asked.test_every)
+    prefix = "" if asked.images == "images" else asked.images
     points = _read_points(reconstruction)
-    return posed_images(str(model), folder.resolve().name, train, test, values, context, points=points, prefix=prefix)
+    return posed_images(str(model), folder.resolve().name, train, test, asked, context, points=points, prefix=prefix)
 
 
 def _pycolmap() -> Any:

@@ -10,20 +10,33 @@ Settings beside the common ones: ``skip_missing`` (default false: absent images 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from neuprim.core.checked import checked
 from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.common import missing_files, posed_images
 from neuprim.core.data.points_file import read_points
 from neuprim.core.data.records import Record, read_json
-from neuprim.core.data.settings import count, data_folder, flag, read_settings
+from neuprim.core.data.settings import EveryNth, FolderSettings, data_folder
 from neuprim.core.data.transforms import read_frames, split_frames
 from neuprim.core.task import SceneContext
 
-__all__ = ["load"]
+__all__ = ["NerfstudioSettings", "load"]
 
-_SETTINGS = {"skip_missing": flag(False), "test_every": count(8, 2, "a whole number of at least 2")}
+
+@dataclass(frozen=True)
+class NerfstudioSettings(FolderSettings):
+    """What the user may set.
+
+    Attributes:
+        skip_missing: leave out frames whose image is missing; otherwise they are an error.
+        test_every: every n-th frame is held out.
+    """
+
+    skip_missing: bool = False
+    test_every: EveryNth = 8
 
 
 def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
@@ -33,15 +46,15 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         ConfigError: unknown or impossible settings.
         DataError: missing or damaged files, wrong or missing fields, impossible cameras, an unknown camera model, empty splits.
     """
-    values = read_settings(settings, _SETTINGS)
-    folder = data_folder(values["path"])
+    asked = checked(NerfstudioSettings, settings, "scene")
+    folder = data_folder(asked.path)
     path = folder / "transforms.json"
     document = read_json(path)
     records = sorted(document.objects("frames"), key=lambda r: r.text("file_path"))
-    records, frames = read_frames(folder, document, records, values["skip_missing"])
-    train, test = split_frames(document, records, frames, values["test_every"])
+    records, frames = read_frames(folder, document, records, asked.skip_missing)
+    train, test = split_frames(document, records, frames, asked.test_every)
     points = _read_points(folder, document) if document.has("ply_file_path") else None
-    return posed_images(str(path), folder.resolve().name, train, test, values, context, points=points)
+    return posed_images(str(path), folder.resolve().name, train, test, asked, context, points=points)
 
 
 def _read_points(folder: Path, document: Record) -> PointCloud:

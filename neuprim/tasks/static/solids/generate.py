@@ -8,28 +8,24 @@ The scene, its cameras and its light are fixed: equal settings give equal files 
 
 from __future__ import annotations
 
-import json
 import math
-import os
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from neuprim.core.cameras import look_at
+from neuprim.core.checked import Range, checked, verify
 from neuprim.core.data import Dataset
-from neuprim.core.errors import DataError
-from neuprim.core.io.files import publish_folder
 from neuprim.core.task import SceneContext
+from neuprim.scenes.image_set import ImageSet, Progress
+from neuprim.scenes.poses import camera_to_world, direction
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.rays import bands, pixel_means
-from neuprim.scenes.settings import check_names, check_whole, settings_key
+from neuprim.scenes.settings import ImageSize, Supersampling, settings_key
 from neuprim.scenes.shapes import build
 from neuprim.tasks.static.solids.shading import encode_srgb, radiance
 
@@ -42,8 +38,6 @@ DISTANCE = 4.0
 FIELD_OF_VIEW = math.radians(40.0)
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
-Progress = Callable[[str, float], None]
-
 
 @dataclass(frozen=True)
 class SolidsSettings:
@@ -55,23 +49,22 @@ class SolidsSettings:
         supersampling: rays per pixel along each axis.
     """
 
-    size: int = 200
-    train_views: int = 80
-    test_views: int = 20
-    supersampling: int = 3
+    size: ImageSize = 200
+    train_views: Annotated[int, Range(1, 10000)] = 80
+    test_views: Annotated[int, Range(1, 10000)] = 20
+    supersampling: Supersampling = 3
 
     def __post_init__(self) -> None:
-        check_whole(self, {"size": (8, 4096), "train_views": (1, 10000), "test_views": (1, 10000), "supersampling": (1, 16)})
-
-    @staticmethod
-    def parse(settings: Mapping[str, Any]) -> SolidsSettings:
-        """Settings from a mapping; :class:`ConfigError` for an unknown name or impossible value."""
-        check_names(settings, [f.name for f in fields(SolidsSettings)])
-        return SolidsSettings(**settings)
+        verify(self, "scene")
 
     def key(self) -> str:
         """A short hash of every setting and the generator's version."""
         return settings_key(self, GENERATOR_VERSION)
+
+
+class _View(NamedTuple):
+    name: str
+    eye: NDArray[np.float64]
 
 
 def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
@@ -81,28 +74,34 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         ConfigError: unknown setting or impossible value.
         DataError: the cache directory cannot be written.
     """
-    folder = generate(SolidsSettings.parse(settings), context.cache_dir, context.progress)
+    folder = generate(checked(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
     from neuprim.tasks.static.datasets import blender
 
-    dataset = blender.load({"path": str(folder)}, context)
-    dataset.name, dataset.data_source = "solids", "generated"
-    return dataset
+    return replace(blender.load({"path": str(folder)}, context), name="solids", data_source="generated")
 
 
 def generate(settings: SolidsSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None) -> Path:
     """Write the data set unless a complete one is there; returns its folder ``cache_dir/solids-KEY``.
 
-    The folder appears under its name only when complete, so an interrupted run leaves nothing that could be taken for a data set.
-
     Raises:
         DataError: the cache directory cannot be written.
     """
-    final = Path(cache_dir) / f"solids-{settings.key()}"
-    try:
-        publish_folder(final, lambda draft: _write(settings, draft, progress), lambda folder: _complete(folder, settings))
-    except OSError as error:
-        raise DataError(f"scene solids: cannot write the generated images to {final}: {error}") from error
-    return final
+    counts = {"train": settings.train_views, "test": settings.test_views}
+
+    def draw(scene: Scene, view: _View, paths: Sequence[Path]) -> None:
+        Image.fromarray(picture(scene, camera_to_world(view.eye), settings.size, settings.supersampling)).save(paths[0])
+
+    return ImageSet(
+        name="solids",
+        key=settings.key(),
+        size=settings.size,
+        splits={split: [_View(f"r_{i}", eye) for i, eye in enumerate(_eyes(split, count))] for split, count in counts.items()},
+        lens={"camera_angle_x": FIELD_OF_VIEW},
+        build=lambda: Scene(build()),
+        frame=lambda split, view: {"file_path": f"./{split}/{view.name}", "transform_matrix": camera_to_world(view.eye).tolist()},
+        files=lambda view: [f"{view.name}.png"],
+        draw=draw,
+    ).generate(cache_dir, progress)
 
 
 def camera_matrices(split: str, count: int) -> list[NDArray[np.float64]]:
@@ -111,21 +110,19 @@ def camera_matrices(split: str, count: int) -> list[NDArray[np.float64]]:
     "train" is a Fibonacci lattice of equal area from 9 degrees below the horizon to 78 above; "test" is another, turning the other way
     from 3 to 64 degrees, so that its views fall between the first's.
     """
+    return [camera_to_world(eye) for eye in _eyes(split, count)]
+
+
+def _eyes(split: str, count: int) -> list[NDArray[np.float64]]:
+    """(3,) positions of the cameras of :func:`camera_matrices`."""
     low, high, phase, turn = {"train": (-0.16, 0.98, 0.0, GOLDEN_ANGLE), "test": (0.05, 0.9, 1.0, -GOLDEN_ANGLE)}[split]
-    matrices = []
-    for i in range(count):
-        z = low + (high - low) * (i + 0.5) / count
-        across, angle = math.sqrt(1 - z * z), phase + i * turn
-        eye = DISTANCE * torch.tensor([across * math.cos(angle), across * math.sin(angle), z], dtype=torch.float64)
-        view = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
-        matrices.append(torch.linalg.inv(view).numpy() @ np.diag([1.0, -1.0, -1.0, 1.0]))
-    return matrices
+    return [DISTANCE * direction(low + (high - low) * (i + 0.5) / count, phase + i * turn) for i in range(count)]
 
 
-def picture(scene: Scene, camera_to_world: NDArray[np.float64], size: int, supersampling: int) -> NDArray[np.uint8]:
+def picture(scene: Scene, pose: NDArray[np.float64], size: int, supersampling: int) -> NDArray[np.uint8]:
     """(size, size, 4) RGBA in sRGB with straight alpha, as Blender stores it: rays are averaged premultiplied and linear, then encoded."""
-    bands_of_rays = bands(camera_to_world, FIELD_OF_VIEW, size, supersampling)
-    mean = np.concatenate([pixel_means(_seen(scene, camera_to_world, d), size, supersampling) for d in bands_of_rays])
+    bands_of_rays = bands(pose, FIELD_OF_VIEW, size, supersampling)
+    mean = np.concatenate([pixel_means(_seen(scene, pose, d), size, supersampling) for d in bands_of_rays])
     alpha = mean[..., 3:]
     straight = (mean[..., :3] / np.maximum(alpha, np.float32(1e-6))).astype(np.float32, copy=False)
     colour = encode_srgb(straight)
@@ -136,40 +133,3 @@ def _seen(scene: Scene, pose: NDArray[np.float64], directions: NDArray[np.float6
     """(N, 4) premultiplied linear RGBA of N rays."""
     rgb, hit = radiance(scene, pose[:3, 3], directions)
     return np.concatenate([rgb, hit[:, None].astype(np.float32)], axis=1)
-
-
-def _splits(settings: SolidsSettings) -> Iterator[tuple[str, int]]:
-    yield "train", settings.train_views
-    yield "test", settings.test_views
-
-
-def _write(settings: SolidsSettings, folder: Path, progress: Progress) -> None:
-    progress("solids: building the scene", 0.0)
-    scene = Scene(build())
-    text = f"solids: drawing {settings.size}x{settings.size} images"
-    if scene.engine != "embree":
-        text += " (without embreex, which would be faster)"
-    jobs: list[tuple[NDArray[np.float64], Path]] = []
-    for split, count in _splits(settings):
-        (folder / split).mkdir()
-        matrices = camera_matrices(split, count)
-        frames = [{"file_path": f"./{split}/r_{i}", "transform_matrix": matrix.tolist()} for i, matrix in enumerate(matrices)]
-        layout = {"camera_angle_x": FIELD_OF_VIEW, "frames": frames}
-        (folder / f"transforms_{split}.json").write_text(json.dumps(layout, indent=1), encoding="utf-8")
-        jobs += [(matrix, folder / split / f"r_{i}.png") for i, matrix in enumerate(matrices)]
-
-    def draw(job: tuple[NDArray[np.float64], Path]) -> None:
-        Image.fromarray(picture(scene, job[0], settings.size, settings.supersampling)).save(job[1])
-
-    pool = ThreadPoolExecutor(min(4, os.cpu_count() or 1))
-    try:
-        for done, _ in enumerate(pool.map(draw, jobs), start=1):
-            progress(text, done / len(jobs))
-    finally:
-        pool.shutdown(cancel_futures=True)  # on an interrupt, wait for the running images only
-
-
-def _complete(folder: Path, settings: SolidsSettings) -> bool:
-    files = [folder / f"transforms_{split}.json" for split, _ in _splits(settings)]
-    files += [folder / split / f"r_{i}.png" for split, count in _splits(settings) for i in range(count)]
-    return all(file.is_file() for file in files)

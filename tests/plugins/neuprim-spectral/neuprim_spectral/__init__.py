@@ -1,16 +1,19 @@
 """Multispectral scenes: five bands of light, whose wavelengths shift from view to view."""
 
-from neuprim.core.choices import choose
+from typing import Annotated
+
+from neuprim.core.checked import Range, choose
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import LossExtension
 from neuprim.core.task import SceneSpec, TaskSpec
 from neuprim_spectral.bands import BANDS, SHIFT, display
 from neuprim_spectral.fields import ShiftedSpectrum, TwoScales
-from neuprim_spectral.files import Files
+from neuprim_spectral.files import files
 from neuprim_spectral.loss import spectral_loss
-from neuprim_spectral.scene import Ball
+from neuprim_spectral.scene import ball
 
 _HELP = "weight of the angle between spectra in the loss, 0 to 1"
+_SHARE = Annotated[float, Range(0, 1)]
 
 
 def _build(model, dataset):
@@ -24,9 +27,6 @@ def _check(model):
         TwoScales(**model["density"])
     except ValueError as error:
         raise ConfigError(f"model.density: {error}") from error
-    angle = model["options"]["angle"]
-    if not 0 <= angle <= 1:
-        raise ConfigError(f"task.options.angle={angle}: expected a number from 0 to 1")
 
 
 TASK = TaskSpec(
@@ -35,17 +35,17 @@ TASK = TaskSpec(
     summary="Five bands of light from blue to near infrared",
     config_package="neuprim_spectral.conf",
     scenes=(
-        SceneSpec("ball", "a ball of three belts, made on the spot", lambda settings, context: Ball(**settings)),
-        SceneSpec("files", "EXR or .npy images of five bands, and cameras.json", lambda settings, context: Files(**settings)),
+        SceneSpec("ball", "a ball of three belts, made on the spot", lambda settings, context: ball(**settings)),
+        SceneSpec("files", "EXR or .npy images of five bands, and cameras.json", lambda settings, context: files(**settings)),
     ),
     build=_build,
     loss=lambda settings: spectral_loss(settings["options"]["angle"]),
     check=_check,
     conditions=(SHIFT,),
-    options={"angle": (0.2, _HELP)},
+    options={"angle": (0.2, _HELP, _SHARE)},
     uses=(),
     fields={"TwoScales": TwoScales, "ShiftedSpectrum": ShiftedSpectrum},
-    example=lambda: Ball(size=12, train_views=5, test_views=2),
+    example=lambda: ball(size=12, train_views=5, test_views=2),
     channels=BANDS,
     display=display,
 )
@@ -55,5 +55,5 @@ SPECTRAL_LOSS = LossExtension(
     name="spectral-angle",
     summary="absolute differences and the angle between spectra",
     make=lambda settings: spectral_loss(settings["options"]["angle_weight"]),
-    options={"angle_weight": (0.2, _HELP)},
+    options={"angle_weight": (0.2, _HELP, _SHARE)},
 )

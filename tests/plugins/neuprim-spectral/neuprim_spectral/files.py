@@ -34,24 +34,24 @@ class FileViews(ViewSet):
         return Pixels(_read(path, size), None, read_mask(mask, size) if mask else None)
 
 
-class Files(Dataset):
-    def __init__(self, path, test_every):
-        if not isinstance(test_every, int) or test_every < 2:
-            raise ConfigError(f"scene.test_every={test_every}: expected a whole number of at least 2")
-        folder = data_folder(path)
-        frames = _frames(folder)
-        train = [f for i, f in enumerate(frames) if i % test_every]
-        test = frames[::test_every]
-        if not train:
-            raise DataError(f"{folder / 'cameras.json'}: {len(frames)} frames; expected at least 2")
-        self.name, self.channels, self.color_space, self.data_source = folder.name, len(BANDS), "linear", "real"
-        self.train, self.test = FileViews(train), FileViews(test)
-        self.extent = camera_extent([view.camera for view, *_ in train])
-        self.up, self.center = torch.tensor([0.0, 0.0, 1.0]), torch.zeros(3)
-        self.background, self.random_background, self.downsampling = torch.zeros(len(BANDS)), False, "none"
-
-    def initial_points(self, count, generator):
-        return initial_points(self.train, None, count, generator)
+def files(path, test_every):
+    if not isinstance(test_every, int) or test_every < 2:
+        raise ConfigError(f"scene.test_every={test_every}: expected a whole number of at least 2")
+    folder = data_folder(path)
+    frames = _frames(folder)
+    train = [f for i, f in enumerate(frames) if i % test_every]
+    if not train:
+        raise DataError(f"{folder / 'cameras.json'}: {len(frames)} frames; expected at least 2")
+    return Dataset(
+        name=folder.name,
+        train=FileViews(train),
+        test=FileViews(frames[::test_every]),
+        start=lambda views, count, generator: initial_points(views, None, count, generator),
+        extent=camera_extent([view.camera for view, *_ in train]),
+        background=torch.zeros(len(BANDS)),
+        channels=len(BANDS),
+        color_space="linear",
+    )
 
 
 def _frames(folder):

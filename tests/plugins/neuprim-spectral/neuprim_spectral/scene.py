@@ -24,24 +24,32 @@ class BallViews(ViewSet):
         return _draw(self.cameras[index], self.bands, self.view(index).conditions["wavelength_shift"])
 
 
-class Ball(Dataset):
-    def __init__(self, size, train_views, test_views, bands=5, space="linear"):
-        for name, value in (("size", size), ("train_views", train_views), ("test_views", test_views), ("bands", bands)):
-            if not isinstance(value, int) or value < 1:
-                raise ConfigError(f"scene.{name}={value}: expected a whole number of at least 1")
-        if space not in ("linear", "srgb"):
-            raise ConfigError(f"scene.space={space}: expected linear or srgb")
-        self.name, self.channels, self.color_space, self.data_source = "ball", bands, space, "generated"
-        self.up, self.center = torch.tensor([0.0, 0.0, 1.0]), torch.zeros(3)
-        template = Camera(torch.eye(4), 1.6 * size, 1.6 * size, size / 2, size / 2, size, size)
-        rings = ((0.4, train_views), (0.5, test_views))  # elevation in radians
-        self.train, self.test = (BallViews(orbit(template, self.center, self.up, 4.0, e, count), bands) for e, count in rings)
-        self.extent = camera_extent(self.train.cameras)
-        self.background, self.random_background, self.downsampling = torch.full((bands,), 0.05), False, "none"
+def ball(size, train_views, test_views, bands=5, space="linear"):
+    for name, value in (("size", size), ("train_views", train_views), ("test_views", test_views), ("bands", bands)):
+        if not isinstance(value, int) or value < 1:
+            raise ConfigError(f"scene.{name}={value}: expected a whole number of at least 1")
+    if space not in ("linear", "srgb"):
+        raise ConfigError(f"scene.space={space}: expected linear or srgb")
+    template = Camera(torch.eye(4), 1.6 * size, 1.6 * size, size / 2, size / 2, size, size)
+    rings = ((0.4, train_views), (0.5, test_views))  # elevation in radians
+    middle, up = torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])
+    train, test = (BallViews(orbit(template, middle, up, 4.0, e, count), bands) for e, count in rings)
 
-    def initial_points(self, count, generator):
+    def start(views, count, generator):
         points = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
-        return PointCloud(0.8 * points, torch.full((count, self.channels), 0.3))
+        return PointCloud(0.8 * points, torch.full((count, bands), 0.3))
+
+    return Dataset(
+        name="ball",
+        train=train,
+        test=test,
+        start=start,
+        extent=camera_extent(train.cameras),
+        background=torch.full((bands,), 0.05),
+        channels=bands,
+        color_space=space,
+        data_source="generated",
+    )
 
 
 def _draw(camera, bands, shift):

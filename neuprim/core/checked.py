@@ -1,0 +1,385 @@
+"""Settings, declared once: their types, bounds and choices stand on the fields of a dataclass, and one function refuses what does not fit.
+
+    @dataclass(frozen=True)
+    class Waves:
+        count: Annotated[int, Range(1, 16)] = 3
+        form: Literal["sine", "cosine"] = "sine"
+
+    checked(Waves, {"cuont": 4}, "model.density")  # model.density.cuont: no such setting; did you mean 'model.density.count'?
+    checked(Waves, {"count": 99}, "model.density")  # model.density.count=99: expected a whole number from 1 to 16
+
+Types are ``bool``, ``int``, ``float``, ``str``, ``Path``, ``list``, ``Literal``, ``tuple``, ``dict``, other settings dataclasses, unions of
+these, and ``Any``. Conversions lose nothing: 1e5 is a whole number, true is not one, and no number is NaN or infinite.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from neuprim.core.errors import ConfigError, nearest
+
+__all__ = [
+    "Accepts",
+    "Option",
+    "Range",
+    "Unbounded",
+    "checked",
+    "choose",
+    "converted",
+    "hints_of",
+    "joined",
+    "kind_of",
+    "option_type",
+    "refuse_unknown",
+    "shown",
+    "text",
+    "verify",
+]
+
+T = TypeVar("T")
+
+Option = tuple[Any, str] | tuple[Any, str, Any]
+"""An option of a task or loss: its default, one line of help, and perhaps its type, as on a settings dataclass, where bounds or choices
+matter; without one, values get the type of the default."""
+
+_KINDS = {bool: "true or false", int: "a whole number", float: "a finite number", str: "text", Path: "a path", list: "a list"}
+
+
+# ---------------------------------------------------------------- what a field says about its values
+
+
+@dataclass(frozen=True)
+class Range:
+    """Bounds of a number: ``Annotated[float, Range(above=0, at_most=1)]``.
+
+    Attributes:
+        at_least, at_most: the lowest and highest value.
+        above, below: instead of these, bounds that are themselves refused.
+        also: values beyond the bounds that have a meaning of their own, e.g. 0 for "none".
+        says: what is expected, where it is more than the bounds ("degrees from 1 to 120").
+    """
+
+    at_least: float | None = None
+    at_most: float | None = None
+    above: float | None = None
+    below: float | None = None
+    also: tuple[float, ...] = ()
+    says: str = ""
+
+    def accepts(self, value: Any) -> bool:
+        return value in self.also or not (
+            (self.at_least is not None and value < self.at_least)
+            or (self.above is not None and value <= self.above)
+            or (self.at_most is not None and value > self.at_most)
+            or (self.below is not None and value >= self.below)
+        )
+
+    def words(self, kind: str) -> str:
+        """E.g. "0, or a whole number of at least 2"."""
+        low, high = (
+            _number(self.at_least if self.above is None else self.above),
+            _number(self.at_most if self.below is None else self.below),
+        )
+        if low and high and self.above is self.below is None:
+            limits = f"from {low} to {high}"
+        else:
+            lower = low and (f"of at least {low}" if self.above is None else f"above {low}")
+            upper = high and (f"at most {high}" if self.below is None else f"below {high}")
+            limits = f"{lower} and {upper}" if lower and upper else lower or (upper and f"of {upper}" if self.below is None else upper)
+        return "".join(f"{_number(value)}, or " for value in self.also) + f"{kind} {limits}".rstrip()
+
+
+def _number(value: float | None) -> str:
+    """As a bound is written; empty for none."""
+    return "" if value is None or math.isinf(value) else str(value) if isinstance(value, int) else f"{value:g}"
+
+
+@dataclass(frozen=True)
+class Accepts:
+    """What no bounds can say: a test of the converted value, and in words what passes it."""
+
+    test: Callable[[Any], bool]
+    says: str
+
+    def accepts(self, value: Any) -> bool:
+        return self.test(value)
+
+    def words(self, kind: str) -> str:
+        return self.says
+
+
+@dataclass(frozen=True)
+class Unbounded:
+    """Why a number has no bounds: every finite one has a meaning."""
+
+    why: str
+
+
+def text(says: str) -> Accepts:
+    """Text or a path that is not empty, without the character that no file name can hold."""
+    return Accepts(_is_text, says)
+
+
+def _is_text(value: Any) -> bool:
+    return bool(str(value)) and "\0" not in str(value)
+
+
+# ---------------------------------------------------------------- settings from plain values
+
+
+def checked(cls: type[T], values: object, where: str = "") -> T:
+    """An instance of the settings dataclass ``cls``.
+
+    Args:
+        values: field name -> value, as read from YAML or the command line; absent fields keep their defaults.
+        where: dotted key of this group, for messages; empty at the root.
+
+    Raises:
+        ConfigError: one line for an unknown or missing key, or a value of the wrong type, beyond its bounds, or none of its choices.
+    """
+    if isinstance(values, cls):
+        return values
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{where}={shown(values)}: expected settings, each as {where}.KEY=VALUE")
+    hints = hints_of(cls)
+    refuse_unknown(values, hints, where)
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+        if field.name not in values and field.default is field.default_factory is dataclasses.MISSING:
+            name = joined(where, field.name)
+            raise ConfigError(f"{name}: required and not given; expected {_words(hints[field.name], name)}")
+    return cls(**{name: converted(values[name], hint, joined(where, name)) for name, hint in hints.items() if name in values})
+
+
+def choose(found: Mapping[str, Any], where: str, offered: Mapping[str, Any]) -> None:
+    """Refuse what a group of free settings must not hold; the values that pass are of the types offered as they are.
+
+    Args:
+        found: what the user and the preset set.
+        where: dotted name of the group, for messages.
+        offered: name -> type, as on a settings dataclass: ``int``, ``Annotated[float, Range(above=0)]``, ``Literal["a", "b"]``; or a tuple
+            of the values to choose from.
+
+    Raises:
+        ConfigError: naming the key, what was found and what is expected.
+    """
+    refuse_unknown(found, offered, where)
+    for key, value in found.items():
+        hint = _offered(offered[key])
+        made = converted(value, hint, joined(where, key))
+        if made != value or (isinstance(made, int) and isinstance(value, float)):
+            # "1e-3" for a number, 3 for text, 4.0 for a whole number: a field that gets the value itself would not read them so
+            raise _Unfit(joined(where, key), value, _words(hint, joined(where, key)))
+
+
+def verify(settings: Any, where: str) -> None:
+    """For ``__post_init__`` of a settings dataclass: what Python code passes is checked, and converted, as what users type.
+
+    Raises:
+        ConfigError: as :func:`checked`.
+    """
+    for name, hint in hints_of(type(settings)).items():
+        value = getattr(settings, name)
+        made = converted(value, hint, joined(where, name))
+        if made is not value:
+            object.__setattr__(settings, name, made)  # frozen ones too, before anybody has seen them
+
+
+def converted(value: Any, hint: Any, where: str) -> Any:
+    """``value`` as the annotated type ``hint``, within its bounds.
+
+    Raises:
+        ConfigError: one line with ``where``, the value and what is expected.
+    """
+    plain, notes = _unwrapped(hint)
+    if get_origin(plain) in (Union, types.UnionType):
+        return _one_of(value, get_args(plain), where)
+    made = _plain(value, plain, notes, where)
+    for note in notes:
+        if isinstance(note, Range | Accepts) and not note.accepts(made):
+            raise _Unfit(where, value, note.says or note.words("a whole number" if plain is int else "a number"))
+    return made
+
+
+def kind_of(default: Any) -> Any:
+    """The type of an option that is declared by its default alone; null accepts anything."""
+    if default is None:
+        return Any
+    if isinstance(default, Mapping):
+        return dict[str, Any]
+    if isinstance(default, list):
+        return Annotated[list, Accepts(lambda value: True, f"a list such as [{', '.join(map(str, default))}]")]
+    return type(default)
+
+
+def option_type(option: Option) -> Any:
+    """What an option's values are converted to."""
+    return _offered(option[2]) if len(option) == 3 else kind_of(option[0])
+
+
+def _offered(kind: Any) -> Any:
+    return Literal[kind] if isinstance(kind, tuple) else kind
+
+
+# ---------------------------------------------------------------- messages
+
+
+class _Unfit(ConfigError):
+    """A value that is not what its field expects."""
+
+    def __init__(self, where: str, value: object, expected: str) -> None:
+        super().__init__(f"{where}={shown(value)}: expected {expected}")
+        self.where, self.expected = where, expected
+
+
+def refuse_unknown(values: Iterable[object], names: Iterable[str], where: str) -> None:
+    """Raises ConfigError for the first of ``values`` that is none of ``names``, with the nearest that are."""
+    known = list(names)
+    for key in values:
+        if key not in known:
+            hint = nearest(str(key), known, prefix=joined(where, "")) or "; there is none"
+            raise ConfigError(f"{joined(where, str(key))}: no such setting{hint}")
+
+
+def joined(where: str, name: str) -> str:
+    """The dotted key of a setting in a group, which is empty at the root."""
+    return f"{where}.{name}" if where else name
+
+
+def shown(value: object) -> str:
+    """A value as users type it; text that reads as something else is quoted, and so is what would break the line."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, str) and (not value.isprintable() or value.lower() in ("", "null", "true", "false") or _reads_as_number(value)):
+        return repr(value)
+    return " ".join(str(value).split()) if not isinstance(value, str) else value
+
+
+def _reads_as_number(value: str) -> bool:
+    try:
+        float(value)
+    except ValueError:
+        return False
+    return True
+
+
+def _words(hint: Any, where: str) -> str:
+    """What a field expects."""
+    plain, notes = _unwrapped(hint)
+    says = next((note.says for note in notes if isinstance(note, Accepts)), "")
+    if says:
+        return says
+    origin, args = get_origin(plain), get_args(plain)
+    if origin in (Union, types.UnionType):
+        return ", or ".join("null" if a is type(None) else _words(a, where) for a in args)
+    if origin is Literal:
+        return _either(args)
+    if origin is tuple:
+        return f"a list, each {_words(args[0], where)}" if args[-1] is ... else f"a list of {', '.join(_words(a, where) for a in args)}"
+    if plain is str:
+        return f"text (quote it: {where}='...')"
+    kind = _KINDS.get(plain, getattr(plain, "__name__", str(plain)))
+    bounds = next((note for note in notes if isinstance(note, Range)), None)
+    return kind if bounds is None else bounds.words(kind)
+
+
+def _either(values: tuple[object, ...]) -> str:
+    words = ["null" if v is None else str(v) for v in values]
+    return words[0] if len(words) == 1 else ", ".join(words[:-1]) + " or " + words[-1]
+
+
+# ---------------------------------------------------------------- types
+
+
+def hints_of(cls: type) -> Mapping[str, Any]:
+    """Field name -> annotated type, of a settings dataclass."""
+    if cls not in _HINTS:
+        hints = get_type_hints(cls, include_extras=True)
+        _HINTS[cls] = {field.name: hints[field.name] for field in dataclasses.fields(cls) if field.init}
+    return _HINTS[cls]
+
+
+_HINTS: dict[type, Mapping[str, Any]] = {}
+
+
+def _unwrapped(hint: Any) -> tuple[Any, tuple[Any, ...]]:
+    """The type without its notes, and these."""
+    return (hint.__origin__, hint.__metadata__) if get_origin(hint) is Annotated else (hint, ())
+
+
+def _one_of(value: Any, options: tuple[Any, ...], where: str) -> Any:
+    """The value as the first of the types that it is one of."""
+    if value is None and type(None) in options:
+        return None
+    refused = []
+    for option in options:
+        if option is not type(None):
+            try:
+                return converted(value, option, where)
+            except _Unfit as error:
+                if error.where != where:  # inside of a group that is the right one
+                    raise
+                refused.append(error.expected)
+    expected = ", or ".join([*refused, *(["null"] if type(None) in options else [])])
+    raise _Unfit(where, value, expected)
+
+
+def _plain(value: Any, kind: Any, notes: tuple[Any, ...], where: str) -> Any:
+    """``value`` as a type without notes; they are for the message alone."""
+    origin, args = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return value
+    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+        return checked(kind, value, where)
+    if origin is Literal:
+        if any(value == a and type(value) is type(a) for a in args):
+            return value
+    elif isinstance(origin, type) and issubclass(origin, Mapping):
+        if isinstance(value, Mapping):
+            return _entries(value, args, where)
+        raise ConfigError(f"{where}={shown(value)}: expected entries, each as {where}.KEY=VALUE")
+    elif origin is tuple:
+        items = args[:1] * len(value) if isinstance(value, list | tuple) and args[-1] is ... else args
+        if isinstance(value, list | tuple) and len(items) == len(value):
+            try:
+                return tuple(converted(v, item, where) for v, item in zip(value, items, strict=True))
+            except _Unfit:  # said of the whole list, below
+                pass
+    elif (made := _scalar(value, kind)) is not None:
+        return made
+    hint = Annotated[kind, *notes] if notes else kind
+    raise _Unfit(where, value, _words(hint, where))
+
+
+def _entries(value: Mapping[Any, Any], args: tuple[Any, ...], where: str) -> dict[str, Any]:
+    names, kind = args
+    if get_origin(names) is Literal:
+        refuse_unknown(value, get_args(names), where)
+    return {str(k): converted(v, kind, joined(where, str(k))) for k, v in value.items()}
+
+
+def _scalar(value: Any, kind: Any) -> Any:
+    """``value`` as a ``kind``, or None where it is none."""
+    truth = isinstance(value, bool)
+    if kind is bool:
+        return value if truth else None
+    if kind is int and isinstance(value, int) and not truth:
+        return value
+    if kind is int and isinstance(value, float) and value.is_integer():
+        return int(value)  # 1e5 is how people write large counts
+    if kind is float and isinstance(value, int | float | str) and not truth:
+        try:
+            number = float(value)  # a string, because YAML 1.1 reads 1e-3 as text
+        except (ValueError, OverflowError):
+            return None
+        return number if math.isfinite(number) else None
+    if kind is str and isinstance(value, str | int) and not truth:
+        return str(value)  # a directory may be called 123
+    if kind is Path and isinstance(value, str | int | Path) and not truth and str(value):  # Path("") would be the working directory
+        return Path(str(value))
+    return value if kind is list and isinstance(value, list) else None

@@ -1,0 +1,379 @@
+import os
+from pathlib import Path
+
+import pytest
+
+from neuprim.config import RunConfig, compose, compose_all, expand_sweep
+from neuprim.core.checked import checked
+from neuprim.core.errors import CheckpointError, ConfigError, DataError
+from neuprim.core.task import SceneContext
+from neuprim.plugins.registry import load_task
+from tests.plugins.fakes import install, site, toy
+
+__all__ = ["site", "toy"]
+
+
+def toys(*words: str) -> RunConfig:
+    return compose(["task=toy", *words])
+
+
+# ---------------------------------------------------------------- composing
+
+
+def test_defaults(toy: Path) -> None:
+    c = toys()
+    assert (c.task, c.scene_name, c.preset) == ("toy", "ball", "quick")
+    assert c.scene == {"size": 20, "smooth": False, "look": "auto", "ratio": 0.5, "steps": [1, 2]}
+    assert c.train.iterations == 7
+    assert c.train.rates == {"means": 1e-3}
+    assert c.model.primitives == 2000
+    assert c.options == {"gain": 1.0}
+    assert c.output_dir == Path("outputs/toy-ball")
+    assert c.non_default == {}
+
+
+def test_user_wins_over_preset_over_defaults(toy: Path) -> None:
+    c = toys("preset=long", "train.iterations=8")
+    assert c.train.iterations == 8
+    assert c.model.primitives == 9
+    assert c.renderer.near == 0.5
+    assert c.non_default == {"preset": ("quick", "long"), "train.iterations": (700, 8)}
+
+
+def test_free_dictionaries_need_no_plus(toy: Path) -> None:
+    c = toys("train.rates.w2=1e-3", "+train.rates.b2=2", "model.init.mode=paper", "model.init.deep={a:[1,2]}", "task.options.gain=3")
+    assert c.train.rates == {"means": 1e-3, "w2": 1e-3, "b2": 2.0}
+    assert c.model.init == {"mode": "paper", "deep": {"a": [1, 2]}}
+    assert c.options == {"gain": 3}
+    assert c.non_default["train.rates.w2"] == (None, 1e-3)
+
+
+def test_values_in_other_spellings(toy: Path) -> None:
+    c = toys("train.iterations=1e3", "train.max_seconds=5", "train.population.strategy=fixed", "scene.steps=[3]", "scene.ratio=1", "seed=5")
+    assert c.train.iterations == 1000
+    assert isinstance(c.train.max_seconds, float)
+    assert c.train.population.strategy == "fixed"
+    assert c.scene["steps"] == [3]
+    assert c.seed == 5
+    assert toys("train.max_seconds=5", "train.max_seconds=null").train.max_seconds is None
+
+
+def test_interpolation_follows_the_override(toy: Path) -> None:
+    assert toys("seed=30", "train.log_every=${seed}").train.log_every == 30
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["train.iteratons=5"], "train.iteratons: no such setting; did you mean 'train.iterations'"),
+        (["iterations=5"], "did you mean 'train.iterations'"),
+        (["train.population.evry=5"], "did you mean 'train.population.every'"),
+        (["scene.sise=5"], "scene.sise: no such setting of scene 'ball'; did you mean 'scene.size'"),
+        (["+train.foo=5"], "train.foo: no such setting"),
+        (["hydra.run.dir=x"], "hydra.run.dir: no such setting"),
+        (["scene/toy=ball"], "scene/toy: no such setting"),
+        (["from_scene.size=3"], "from_scene.size: no such setting"),
+        (["train..rates=3"], "expected KEY=VALUE"),
+        (["scene@foo=ball"], "packages (@)"),
+        (["task=ty"], "task=ty: no such task; did you mean 'toy'?"),
+        (["scene=bal"], "scene=bal: task 'toy' has no such scene; did you mean 'ball'?"),
+        (["scene=[1]"], "expected the name of a scene"),
+        (["preset=lng"], "preset=lng: task 'toy' has no such preset; did you mean 'long'?"),
+        (["train.iterations=abc"], "train.iterations=abc: expected a whole number"),
+        (["train.iterations=1.5"], "train.iterations=1.5: expected a whole number"),
+        (["train.iterations=true"], "train.iterations=true: expected a whole number"),
+        (["train.iterations=-1"], "train.iterations=-1: expected a whole number of at least 0"),
+        (["train.final_rate=nan"], "expected a finite number"),
+        (["train.rates.w2=fast"], "train.rates.w2=fast: expected a finite number"),
+        (["train.rates=3"], "train.rates=3: expected entries"),
+        (["train.population=3"], "train.population=3: expected settings"),
+        (["model=3"], "model is a group of settings"),
+        (["model.neurons=17"], "model.neurons=17: expected a whole number from 0 to 16"),
+        (["renderer.backend=cpuu"], "renderer.backend=cpuu: expected auto, cpu or reference"),
+        (["renderer.backend=gpu"], "renderer.backend=gpu: expected auto, cpu or reference"),
+        (["renderer.backend=3"], "renderer.backend=3: expected"),
+        (["renderer.depth=1"], "renderer.depth=1: expected true or false"),
+        (["renderer.alpha_max=2"], "renderer.alpha_max=2: expected a number above 0 and at most 0.9999"),
+        (["renderer.sort=depth"], "renderer.sort=depth: expected center or entry"),
+        (["renderer.samples=0"], "renderer.samples=0: expected a whole number of rays per pixel side, 1 to 16"),
+        (["scene.size=big"], "scene.size=big: expected a whole number"),
+        (["scene.size=true"], "scene.size=true: expected a whole number"),
+        (["scene.smooth=3"], "scene.smooth=3: expected true or false"),
+        (["scene.look=[1]"], "scene.look=[1]: expected text"),
+        (["scene.steps=1"], "scene.steps=1: expected a list"),
+        (["scene=files"], "scene.path: required and not given; expected a directory or file, as scene.path=PATH"),
+        (["scene=files", "scene.path=null"], "scene.path: required and not given"),
+        (["scene=files", "scene.path=[1]"], "expected a path"),
+        (["seed=-1"], "seed=-1: expected a whole number"),
+        (["resume=maybe"], "resume=maybe: expected true or false"),
+        (["seed=${nothing}"], "nothing"),
+        (["seed"], "'seed': expected KEY=VALUE"),
+        (["=3"], "expected KEY=VALUE"),
+        (["~seed"], "cannot be deleted"),
+        (["seed=1,2"], "several values; add -m"),
+        (["output_dir=a=b"], "quote values that contain"),
+        (["output_dir=''"], "expected a directory"),
+    ],
+)
+def test_one_clear_line(toy: Path, words: list[str], text: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        toys(*words)
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_paths_are_made_absolute_and_survive_any_character(toy: Path) -> None:
+    strange = "a, b = c (d) é"
+    c = toys("scene=files", f"scene.path='{strange}'", f"output_dir='out/{strange}'")
+    assert c.scene["path"] == str(Path.cwd() / strange)
+    assert c.output_dir == Path("out") / strange
+    assert toys("scene=files", "scene.path=123").scene["path"] == str(Path.cwd() / "123")
+    assert toys("scene=files", "scene.path=plain dir/x").scene["path"] == str(Path.cwd() / "plain dir/x")
+
+
+def test_nothing_is_written_and_the_directory_stays(toy: Path) -> None:
+    here = os.getcwd()
+    toys("output_dir=new")
+    assert os.getcwd() == here
+    assert os.listdir(here) == []
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "text"),
+    [
+        ("preset/toy/quick.yaml", "train: {iteratons: 3}", "preset/toy/quick.yaml: train.iteratons: no such setting"),
+        ("preset/toy/quick.yaml", "scene: {size: 3}", "a preset may only set model, train, renderer"),
+        ("preset/toy/quick.yaml", "train: {iterations: [", "do not compose"),
+        ("task/toy.yaml", "scnee: ball", "task/toy.yaml: scnee: no such setting; did you mean 'scene'"),
+        ("task/toy.yaml", "scene: [", "task/toy.yaml cannot be read"),
+        ("task/toy.yaml", "scene: [ball]", "no such scene; did you mean 'ball'"),
+        ("task/toy.yaml", "preset: lng", "no such preset; did you mean 'long'"),
+        ("task/toy.yaml", "options: 3", "options: expected a mapping"),
+        ("scene/toy/ball.yaml", "[1]", "scene/toy/ball.yaml: expected a mapping"),
+        ("scene/toy/ball.yaml", "_paths_: [nope]", "must list keys of the file"),
+    ],
+)
+def test_a_plugins_broken_yaml_is_named(toy: Path, file: str, content: str, text: str) -> None:
+    (toy / "conf" / file).write_text(content)
+    with pytest.raises(ConfigError) as caught:
+        toys()
+    assert text in str(caught.value)
+
+
+@pytest.mark.parametrize("file", ["__init__.py", "task/toy.yaml", "scene/toy/files.yaml", "preset/toy/quick.yaml"])
+def test_a_plugins_missing_file_is_named(toy: Path, file: str) -> None:
+    (toy / "conf" / file).unlink()
+    with pytest.raises(ConfigError, match="toy"):
+        toys()
+
+
+def test_scenes_are_keyed_by_task(toy: Path, site: Path) -> None:
+    other = {
+        "other/__init__.py": (toy / "__init__.py").read_text().replace('"toy"', '"other"').replace("toytask", "other"),
+        "other/conf/__init__.py": "",
+        "other/conf/task/other.yaml": "{scene: ball, preset: only}",
+        "other/conf/scene/other/ball.yaml": "colour: red",
+        "other/conf/scene/other/files.yaml": "{}",
+        "other/conf/preset/other/only.yaml": "{}",
+    }
+    install(site, "neuprim-other", {"other": "other:TASK"}, other)
+    c = compose(["task=other"])
+    assert (c.scene, c.preset) == ({"colour": "red"}, "only")
+    assert "size" in toys().scene
+
+
+# ---------------------------------------------------------------- output directories
+
+
+def test_default_directory_is_numbered(toy: Path) -> None:
+    Path("outputs/toy-ball").mkdir(parents=True)
+    Path("outputs/toy-ball-extra").mkdir()
+    assert toys().output_dir == Path("outputs/toy-ball-2")
+    Path("outputs/toy-ball-7").mkdir()
+    assert toys().output_dir == Path("outputs/toy-ball-8")
+    assert toys("resume=true").output_dir == Path("outputs/toy-ball-7")
+
+
+def test_occupied_directory_is_refused(toy: Path) -> None:
+    Path("full").mkdir()
+    assert toys("output_dir=full").output_dir == Path("full")
+    Path("full/x").write_text("precious")
+    with pytest.raises(ConfigError, match=r"output_dir=full: exists and is not empty.*resume=true"):
+        toys("output_dir=full")
+    assert toys("output_dir=full", "resume=true").output_dir == Path("full")
+    with pytest.raises(ConfigError, match=r"output_dir=full/x/y: .*full/x is a file; expected a directory"):
+        toys("output_dir=full/x/y")
+    with pytest.raises(ConfigError, match="is a file"):
+        toys("output_dir=full/x")
+
+
+# ---------------------------------------------------------------- sweeps
+
+
+def test_expand_sweep() -> None:
+    assert expand_sweep(["a=1,2", "b=3", "c=x,y"]) == [
+        ["a=1", "b=3", "c=x"],
+        ["a=1", "b=3", "c=y"],
+        ["a=2", "b=3", "c=x"],
+        ["a=2", "b=3", "c=y"],
+    ]
+    assert expand_sweep(["a=range(1,4)"]) == [["a=1"], ["a=2"], ["a=3"]]
+    assert expand_sweep(["a=choice(x,y)"]) == [["a=x"], ["a=y"]]
+    assert expand_sweep(["a=[1,2]", "p='x,y=z w'"]) == [["a=[1,2]", "p='x,y=z w'"]]
+    assert expand_sweep(["p='a,b','c=d e'"]) == [["p='a,b'"], ["p='c=d e'"]]
+    assert expand_sweep([]) == [[]]
+
+
+@pytest.mark.parametrize(
+    ("word", "text"),
+    [
+        ("a=interval(0,1)", "cannot be swept"),
+        ("a=glob(*)", "cannot be swept"),
+        ("a=range(0,1000000)", "more than 10000 runs"),
+        ("a=range(3,1)", "no values"),
+        ("output_dir=a,b", "output_dir cannot be swept"),
+        ("a=b=c", "cannot be read"),
+    ],
+)
+def test_impossible_sweeps(word: str, text: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        expand_sweep([word])
+    assert text in str(caught.value)
+
+
+def test_sweep_directories(toy: Path) -> None:
+    runs = compose_all(["task=toy", "model.primitives=200,1000", "train.rates={a:1},{b:2}"])
+    assert [r.model.primitives for r in runs] == [200, 200, 1000, 1000]
+    assert [r.output_dir.parent for r in runs] == [Path("outputs/toy-ball-sweep")] * 4
+    names = [r.output_dir.name for r in runs]
+    assert names[0] == "model.primitives-200_train.rates-_a_1"
+    assert len(set(names)) == 4
+    assert runs[2].overrides == ["task=toy", "model.primitives=1000", "train.rates={a:1}"]
+
+
+def test_sweep_directory_names_never_collide(toy: Path) -> None:
+    runs = compose_all(["task=toy", "scene=files", "scene.path='a/b','a b'", "output_dir='my, sweep'"])
+    assert [r.output_dir.name for r in runs] == ["scene.path-_a_b", "scene.path-_a_b-2"]
+    assert runs[0].output_dir.parent == Path("my, sweep")
+    assert runs[1].scene["path"] == str(Path.cwd() / "a b")
+
+
+def test_sweep_over_presets_and_without_sweep(toy: Path) -> None:
+    runs = compose_all(["task=toy", "preset=quick,long"])
+    assert [r.preset for r in runs] == ["quick", "long"]
+    assert compose_all(["task=toy"])[0].output_dir == Path("outputs/toy-ball")
+
+
+def test_sweep_into_an_occupied_directory_is_refused(toy: Path) -> None:
+    Path("full").mkdir()
+    Path("full/x").write_text("precious")
+    with pytest.raises(ConfigError, match="not empty"):
+        compose_all(["task=toy", "seed=1,2", "output_dir=full"])
+    assert compose_all(["task=toy", "seed=1,2", "output_dir=full", "resume=true"])[0].output_dir == Path("full/seed-1")
+
+
+def test_a_wrong_combination_stops_the_sweep_before_it_starts(toy: Path) -> None:
+    with pytest.raises(ConfigError, match=r"model.neurons=99"):
+        compose_all(["task=toy", "model.neurons=1,99"])
+
+
+# ---------------------------------------------------------------- on disk
+
+
+def test_yaml_round_trip(toy: Path) -> None:
+    c = toys(
+        "scene=files", "scene.path='a: b, #c'", "train.rates.w2=1e-5", "train.max_seconds=3", "scene.downsample=2", "model.init={l:[1]}"
+    )
+    Path("run").mkdir()
+    Path("run/config.yaml").write_text(c.to_yaml())
+    assert RunConfig.from_yaml("run") == c
+    assert RunConfig.from_yaml(Path("run/config.yaml")) == c
+
+
+def test_reading_does_not_need_the_plugin(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("config.yaml").write_text(toys().to_yaml())
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda **_: ())
+    assert RunConfig.from_yaml("config.yaml").task == "toy"
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        ("task: [", "line 1: damaged configuration"),
+        ("", "expected a mapping, found NoneType"),
+        ("\x00", "damaged configuration"),
+        ("!!python/object/apply:os.system ['touch hacked']", "damaged configuration"),
+        ("[" * 500, "cannot be read"),
+        ("# " + "x" * 1_000_001, "larger than"),
+    ],
+)
+def test_damaged_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str, text: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("config.yaml").write_text(content)
+    with pytest.raises(CheckpointError) as caught:
+        RunConfig.from_yaml("config.yaml")
+    assert "config.yaml" in str(caught.value)
+    assert text in str(caught.value)
+    assert not Path("hacked").exists()
+
+
+def test_missing_files(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="no such run directory"):
+        RunConfig.from_yaml(tmp_path / "nowhere")
+    with pytest.raises(CheckpointError, match="missing; expected a directory written by"):
+        RunConfig.from_yaml(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ("iterations: 7", "iteratons: 7", "train.iteratons: no such setting; did you mean 'train.iterations'"),
+        ("iterations: 7", "iterations: many", "train.iterations=many: expected a whole number"),
+        ("preset: quick", "preset: 3", "preset: missing; expected a name"),
+        ("preset: quick", "persett: quick", "persett: no such setting; did you mean 'preset'"),
+        ("non_default: {}", "non_default: {a: 3}", "non_default: expected"),
+        ("output_dir: outputs/toy-ball", "output_dir: null", "output_dir: missing"),
+        ("overrides:", "overrides: 3\n#", "overrides: expected"),
+        ("backend: auto", "backend: abacus", "renderer.backend=abacus"),
+    ],
+)
+def test_impossible_settings_in_a_file(toy: Path, old: str, new: str, text: str) -> None:
+    content = toys().to_yaml()
+    assert old in content
+    content = (
+        content.replace("\n- task=toy", "").replace("overrides:", "overrides: []")
+        if old != "overrides:"
+        else content.replace("\n- task=toy", "")
+    )
+    Path("config.yaml").write_text(content.replace(old, new))
+    with pytest.raises(ConfigError) as caught:
+        RunConfig.from_yaml("config.yaml")
+    assert str(caught.value).startswith("config.yaml: ")
+    assert text in str(caught.value)
+
+
+# ---------------------------------------------------------------- the static task's files
+
+
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+@pytest.mark.parametrize("scene", ["solids", "blender", "nerfstudio", "colmap"])
+def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str, scene: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = [] if scene == "solids" else ["scene.path=data"]
+    c = compose([f"scene={scene}", f"preset={preset}", *path])
+    assert (c.task, c.scene_name, c.preset) == ("static", scene, preset)
+    assert set(c.train.rates) == {"means", "log_scales", "quats", "W1", "b1", "w2", "b2", "sh_dc", "sh_rest"}
+    assert c.train.population.strategy == {"quick": "relocate", "paper": "gradient"}[preset]
+
+
+@pytest.mark.parametrize("scene", ["blender", "nerfstudio", "colmap"])
+def test_static_loaders_know_every_key_of_their_yaml(tmp_path: Path, scene: str) -> None:
+    c = compose([f"scene={scene}", f"scene.path='{tmp_path / 'absent'}'", f"output_dir='{tmp_path / 'out'}'"])
+    with pytest.raises(DataError, match="absent"):  # the folder is looked for after the settings are accepted
+        load_task("static").scene(scene).load(c.scene, SceneContext(0, tmp_path))
+
+
+def test_solids_knows_every_key_of_its_yaml(tmp_path: Path) -> None:
+    from neuprim.tasks.static.solids.generate import SolidsSettings
+
+    assert checked(SolidsSettings, compose([f"output_dir='{tmp_path}/out'"]).scene) == SolidsSettings()

@@ -1,0 +1,265 @@
+"""What a data set promises: every broken promise is one line that names view, member, what was found and what was expected."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import FrozenInstanceError, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.cameras.rays import RayCamera
+from neuprim.core.data import Dataset, Pixels, PointCloud
+from neuprim.core.data.check import DatasetFault, check_dataset, check_mask, check_pixels, check_points, extra_of
+from neuprim.core.errors import ConfigError
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.fields import ConditionSpec
+from neuprim.core.train.settings import ModelSettings
+from neuprim.core.train.trainer import initial_model
+from neuprim.tasks.static.fields import SphericalHarmonics
+from tests.core import tiny
+
+N = tiny.SIZE
+TIME = ConditionSpec("time", (), "fraction", (0.0, 1.0), lambda text: [])
+
+
+def spoil(split: str = "train", index: int = 0, **changes: Any) -> Callable[[Any], None]:
+    """Replaces members of one view's pixels; a function is applied to the member."""
+
+    def change(data: Any) -> None:
+        images = getattr(data, split).images
+        members = {k: v(getattr(images[index], k)) if callable(v) else v for k, v in changes.items()}
+        images[index] = replace(images[index], **members)
+
+    return change
+
+
+def member(**changes: Any) -> Callable[[Any], None]:
+    return lambda data: data.__dict__.update(changes)
+
+
+def viewed(split: str, **changes: Any) -> Callable[[Any], None]:
+    """Replaces members of every view of a split."""
+
+    def change(data: Any) -> None:
+        views = getattr(data, split)
+        plain = views.view
+        views.view = lambda index: replace(plain(index), **changes)
+
+    return change
+
+
+def nan(image: Tensor) -> Tensor:
+    image = image.clone()
+    image[3, 4, 1] = float("nan")
+    return image
+
+
+def empty(data: Any) -> None:
+    data.test.cameras = []
+
+
+def wrong_view(data: Any) -> None:
+    data.test.view = lambda index: "a view"
+
+
+FAULTS: dict[str, tuple[Callable[[Any], None], str]] = {
+    "another size": (spoil(rgb=torch.zeros(8, 9, 3)), f"train view v0: rgb is float32 (8, 9, 3); expected float32 ({N}, {N}, 3), rows x columns"),
+    "channels first": (
+        spoil(rgb=lambda x: x.permute(2, 0, 1)),
+        f"train view v0: rgb is float32 (3, {N}, {N}); expected float32 ({N}, {N}, 3), rows x columns x channels",
+    ),
+    "bytes": (spoil(rgb=lambda x: (255 * x).to(torch.uint8)), f"rgb is uint8 ({N}, {N}, 3); expected float32"),
+    "double": (spoil("test", rgb=lambda x: x.double()), f"test view v0: rgb is float64 ({N}, {N}, 3); expected float32"),
+    "numpy": (spoil(rgb=lambda x: x.numpy()), "train view v0: rgb is a numpy.ndarray; expected float32"),
+    "nothing": (spoil(rgb=None), "train view v0: rgb is None; expected float32"),
+    "alpha with an axis too many": (
+        spoil(alpha=lambda x: x[..., None]),
+        f"train view v0: alpha is float32 ({N}, {N}, 1); expected float32 ({N}, {N}), rows x columns, or None",
+    ),
+    "mask of numbers": (spoil(mask=torch.ones(N, N)), f"train view v0: mask is float32 ({N}, {N}); expected bool ({N}, {N})"),
+    "mask of another size": (spoil(mask=torch.ones(3, N, dtype=torch.bool)), f"mask is bool (3, {N}); expected bool"),
+    "nan": (spoil(rgb=nan), "train view v0: rgb: found 1 values that are NaN or infinite, the first at [3, 4, 1]; expected finite numbers"),
+    "infinite alpha": (spoil("test", alpha=lambda x: x / 0), "test view v0: alpha: found"),
+    "no pixels": (lambda data: data.train.images.__setitem__(0, "png"), "train view v0: pixels are a str; expected a neuprim.core.data.Pixels"),
+    "background of another length": (
+        member(background=torch.ones(1)),
+        "two: background is float32 (1,); expected float32 (3,), one number for each of the 3 channels",
+    ),
+    "background as a list": (member(background=[1.0, 1.0, 1.0]), "two: background is a list; expected float32 (3,)"),
+    "other channels": (member(channels=1, background=torch.ones(1)), f"rgb is float32 ({N}, {N}, 3); expected float32 ({N}, {N}, 1)"),
+    "channels as text": (member(channels="3"), "two: channels is '3'; expected a whole number"),
+    "no test views": (empty, "two: the test split is empty"),
+    "no camera": (viewed("test", camera=None), "test view 0 (v0): camera is None; expected a neuprim.core.cameras.Camera"),
+    "a broken camera": (
+        viewed("train", camera=Camera(torch.eye(4) * 2, 1.0, 1.0, 0.0, 0.0, N, N)),
+        "train view 0 (v0): camera: camera rotation is singular or scaled",
+    ),
+    "a camera of texts": (viewed("train", camera=Camera(torch.eye(4), "1", 1.0, 0.0, 0.0, N, N)), "train view 0 (v0): camera is Camera("),
+    "a matrix of numpy": (
+        viewed("train", camera=Camera(np.eye(4), 1.0, 1.0, 0.0, 0.0, N, N)),  # type: ignore[arg-type]
+        "train view 0 (v0): camera: viewmat is a numpy.ndarray",
+    ),
+    "no name": (viewed("train", name=""), "train view 0: name is ''; expected text"),
+    "no view": (wrong_view, "test view 0: found a str; expected a neuprim.core.data.View"),
+    "no starting points": (member(start=None), "two: start is None; expected a function of (views, count, generator)"),
+    "exposure": (member(exposure=0), "two: exposure is 0; expected a positive number"),
+    "placement": (member(placement={}), "two: placement is a dict; expected a neuprim.core.volumes.source.Placement, or None"),
+    "a split that is none": (member(test=[]), "two: test is a list; expected a neuprim.core.data.ViewSet"),
+    "colour space": (member(color_space="sRGB"), "two: color_space is 'sRGB'; expected srgb or linear"),
+    "data source": (member(data_source="photos"), "two: data_source is 'photos'; expected real or generated or simulated"),
+    "extent": (member(extent=float("nan")), "two: extent is nan; expected a positive number"),
+    "up": (member(up=torch.full((3,), float("nan"))), "two: up: found 3 values that are NaN or infinite, the first at [0]"),
+    "bounds": (member(bounds=torch.zeros(3, 2)), "two: bounds is float32 (3, 2); expected float32 (2, 3)"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "text"), FAULTS.values(), ids=FAULTS)
+def test_a_broken_promise_is_one_line(change: Callable[[Any], None], text: str) -> None:
+    data = tiny.two_primitives()
+    check_dataset(data, ())
+    change(data)
+    with pytest.raises(DatasetFault) as caught:
+        check_dataset(data, ())
+    assert text in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "train view 0 (v0): condition 'time' is missing; found none, the task needs it"),
+        (torch.zeros(1), "train view 0 (v0): condition 'time' is float32 (1,); expected float32 ()"),
+        (0.5, "train view 0 (v0): condition 'time' is a float; expected float32 ()"),
+        (torch.tensor(float("nan")), "train view 0 (v0): condition 'time': found 1 values that are NaN or infinite; expected finite"),
+    ],
+)
+def test_conditions_that_the_task_declares(value: Any, text: str) -> None:
+    data = tiny.two_primitives()
+    if value is not None:
+        viewed("train", conditions={"time": value})(data)
+    with pytest.raises(DatasetFault) as caught:
+        check_dataset(data, [TIME])
+    assert text in str(caught.value)
+
+
+def test_a_condition_missing_in_one_later_view_is_found() -> None:
+    data = tiny.two_primitives()
+    for split in (data.train, data.test):
+        plain = split.view
+        split.view = lambda index, plain=plain: replace(plain(index), conditions={} if index == 3 else {"time": torch.tensor(0.5)})  # type: ignore[method-assign, misc]
+    with pytest.raises(DatasetFault, match=r"train view 3 \(v3\): condition 'time' is missing"):
+        check_dataset(data, [TIME])
+
+
+def test_conditions_that_no_task_needs_and_ray_cameras_are_fine() -> None:
+    data = tiny.two_primitives()
+    viewed("train", conditions={"time": torch.tensor(0.5), "more": "text"})(data)
+    viewed("test", camera=RayCamera.fisheye(N, N, torch.eye(4)))(data)
+    check_dataset(data, [])
+
+
+POINTS: dict[str, tuple[dict[str, Any], str]] = {
+    "more points than colours": ({"colors": torch.zeros(4, 3)}, "two: starting points: colors is float32 (4, 3); expected float32 (5, 3)"),
+    "other channels": ({"colors": torch.zeros(5, 1)}, "colors is float32 (5, 1); expected float32 (5, 3)"),
+    "planar": ({"means": torch.zeros(5, 2)}, "means is float32 (5, 2); expected float32 (5, 3)"),
+    "whole numbers": ({"means": torch.zeros(5, 3, dtype=torch.int64)}, "means is int64 (5, 3); expected float32 (5, 3)"),
+    "numpy": ({"means": np.zeros((5, 3))}, "means is a numpy.ndarray; expected float32"),
+    "nan": ({"means": torch.full((5, 3), float("nan"))}, "means: found 15 values that are NaN or infinite, the first at [0, 0]"),
+    "too many": ({"means": torch.zeros(7, 3)}, "found 7 points; expected at most 6"),
+    "quats": ({"quats": torch.zeros(5, 3)}, "quats is float32 (5, 3); expected float32 (5, 4)"),
+    "conditions": ({"conditions": {"time": torch.zeros(2)}}, "condition 'time' is float32 (2,); expected float32 (5,)"),
+}
+
+
+@pytest.mark.parametrize(("changes", "text"), POINTS.values(), ids=POINTS)
+def test_starting_points(changes: dict[str, Any], text: str) -> None:
+    data, cloud = tiny.two_primitives(), PointCloud(torch.zeros(5, 3), torch.zeros(5, 3))
+    check_points(cloud, 6, data)
+    cloud = replace(cloud, **changes)
+    with pytest.raises(DatasetFault) as caught:
+        check_points(cloud, 6, data)
+    assert text in str(caught.value)
+    data = replace(data, start=lambda views, count, generator: cloud)
+    with pytest.raises(DatasetFault, match="starting points"):  # where a run asks for them
+        initial_model(CosineDensity(1), SphericalHarmonics(0, 3), data, ModelSettings(primitives=6), 0)
+
+
+def test_no_points_at_all_and_a_list_of_them() -> None:
+    data = tiny.two_primitives()
+    check_points(PointCloud(torch.zeros(0, 3), torch.zeros(0, 3)), 6, data)
+    with pytest.raises(DatasetFault, match="found a list; expected a neuprim"):
+        check_points([[0, 0, 0]], 6, data)  # type: ignore[arg-type]
+
+
+def test_a_later_view_is_noticed_when_it_is_drawn() -> None:
+    data = tiny.two_primitives()
+    spoil(index=4, rgb=lambda x: x.permute(2, 0, 1))(data)
+    check_dataset(data, ())
+    trainer = tiny.trainer(data)
+    with pytest.raises(DatasetFault, match=r"train view v4: rgb is float32 \(3, "):
+        list(trainer.run())
+    assert trainer.step < 6
+
+
+def test_checking_pixels_and_masks_alone() -> None:
+    data = tiny.two_primitives()
+    view = data.test.view(1)
+    check_pixels("test", view, data.test.pixels(1), 3)
+    check_mask("test", view, torch.ones(N, N, dtype=torch.bool))
+    with pytest.raises(DatasetFault, match="test view v1: mask is uint8"):
+        check_mask("test", view, torch.ones(N, N, dtype=torch.uint8))
+
+
+def test_the_message_of_a_loss_that_is_nan_says_whether_the_image_was() -> None:
+    from neuprim.core.errors import NonFiniteError
+
+    data = tiny.two_primitives()
+    spoil(index=4, rgb=nan)(data)
+    with pytest.raises(NonFiniteError, match=r"on view v4, whose pixels are NaN or infinite somewhere"):
+        list(tiny.trainer(data).run())
+
+
+def test_a_light_network_refuses_a_wrong_start_value_in_one_line() -> None:
+    from neuprim.tasks.relight.colour import LightNetwork
+
+    for value in ("abc", None, float("nan"), True):
+        with pytest.raises(ConfigError, match=r"model\.init\.output=.*: expected a finite number"):
+            initial_model(CosineDensity(1), LightNetwork(2), tiny.two_primitives(), ModelSettings(primitives=4, init={"output": value}), 0)
+
+
+def test_a_data_set_is_a_description_that_stays_as_it_is() -> None:
+    data = tiny.two_primitives()
+    with pytest.raises(FrozenInstanceError):
+        data.name = "other"  # type: ignore[misc]
+    with pytest.raises(TypeError, match=r"^class Mine\(Dataset\): a data set is made by calling neuprim\.core\.data\.Dataset\(name="):
+        type("Mine", (Dataset,), {"judge": lambda self, index, rendered, truth: {}})
+    with pytest.raises(TypeError, match="missing 1 required keyword-only argument: 'extent'"):
+        Dataset(name="x", train=data.train, test=data.test, start=data.start, background=torch.ones(3))  # type: ignore[call-arg]
+
+
+def test_starting_points_follow_the_training_views() -> None:
+    data = tiny.two_primitives(
+        start=lambda views, count, generator: PointCloud(torch.full((len(views), 3), 0.5), torch.zeros(len(views), 3))
+    )
+    other = replace(data, train=data.test)
+    assert [len(d.initial_points(9, torch.Generator()).means) for d in (data, other)] == [6, 2]
+
+
+def test_what_a_task_knows_of_a_data_set_is_of_its_own_class() -> None:
+    data = tiny.two_primitives()
+    assert extra_of(data, Pixels) is None and extra_of(replace(data, extra=data.test.pixels(0)), Pixels) is data.test.pixels(0)
+    with pytest.raises(DatasetFault, match=r"^two: extra is a dict; expected a neuprim\.core\.data\.dataset\.Pixels, or None$"):
+        extra_of(replace(data, extra={"rgb": 1}), Pixels)
+
+
+def test_an_orbit_has_every_condition_of_the_training_views() -> None:
+    data = tiny.two_primitives()
+    plain = data.train.view
+    data.train.view = lambda i: replace(plain(i), conditions={"time": torch.tensor(0.1 * i), "light": torch.tensor([i, 2.0, 3.0])})  # type: ignore[method-assign]
+    views = data.orbit(3)
+    torch.testing.assert_close(torch.stack([v.conditions["time"] for v in views]), torch.tensor([0.0, 0.25, 0.5]))
+    assert [v.conditions["light"].tolist() for v in views] == [[0.0, 2.0, 3.0]] * 3

@@ -1,0 +1,109 @@
+"""Folders of frames, and the command that shows them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from neuprim.cli import main
+from neuprim.core.io.vdb import Grid, scale_transform, sequence, write_vdb
+from tests.core.io.vdb.vdb_bytes import one_grid, one_leaf, refused
+
+
+def frame(path: Path, size: int, voxel: float = 1.0, name: str = "density", value: float = 1.0) -> Path:
+    write_vdb(path, [Grid.from_dense(name, np.full((size,) * 3, value), transform=scale_transform(voxel))])
+    return path
+
+
+def test_sorted_by_number_with_gaps(tmp_path: Path) -> None:
+    for number in (10, 9, 0, 1, 14):
+        frame(tmp_path / f"fire_a2_{number}.vdb", 1)
+    (tmp_path / "notes_3.txt").write_text("no frame")
+    found = sequence(tmp_path)
+    assert [f.number for f in found.frames] == [0, 1, 9, 10, 14] and len(found) == 5
+    assert found.gaps == ((2, 8), (11, 13))
+    assert [len(h.grids) for h in found.headers()] == [1] * 5
+
+
+def test_what_changes_from_frame_to_frame(tmp_path: Path) -> None:
+    frame(tmp_path / "f_0.vdb", 0)  # no active voxel, and the inverted box OpenVDB writes then
+    frame(tmp_path / "f_1.vdb", 4, 0.5)
+    frame(tmp_path / "f_2.vdb", 3, 1.0, value=float("nan"))
+    frame(tmp_path / "f_3.vdb", 8, 1.0, name="flames")
+    frame(tmp_path / "f_4.vdb", 6, 1.0, value=2.0)
+    found = sequence(tmp_path)
+    assert found.gaps == () and found.read(3, "density") is None
+    empty = found.read(0, "density")
+    assert empty is not None and empty.bounds is None and empty.to_dense(((0, 0, 0), (2, 2, 2))).sum() == 0
+    survey = found.survey("density")
+    assert survey.empty == (0,) and survey.absent == (3,)
+    assert survey.voxel_sizes == ((1.0,) * 3, (0.5,) * 3)
+    assert survey.range == (1.0, 2.0)
+    assert [f.non_finite for f in survey.frames] == [0, 0, 27, 0, 0]
+    assert [f.active_voxels for f in survey.frames] == [0, 64, 27, 0, 216]
+    np.testing.assert_array_equal(survey.world_bounds, [[-0.5] * 3, [5.5] * 3])
+    np.testing.assert_array_equal(survey.frames[1].world_bounds, [[-0.25] * 3, [1.75] * 3])
+    refused(lambda: found.survey("denisty"), tmp_path.name, "none of 5 frames", "did you mean 'density'")
+
+
+def test_folders_that_are_no_sequence(tmp_path: Path) -> None:
+    refused(lambda: sequence(tmp_path / "gone"), "gone", "no such folder")
+    refused(lambda: sequence(tmp_path / ("x" * 300)), "cannot be read", "expected a folder")
+    refused(lambda: sequence(tmp_path), "no .vdb file")
+    frame(tmp_path / "a_1.vdb", 1)
+    frame(tmp_path / "b_1.vdb", 1)
+    refused(lambda: sequence(tmp_path), "'a_', 'b_'", "prefix")
+    refused(lambda: sequence(tmp_path / "a_1.vdb"), "a_1.vdb", "is a file")
+    assert sequence(tmp_path, "b_").frames[0].path.name == "b_1.vdb"
+    refused(lambda: sequence(tmp_path, "c_"), "c_NUMBER.vdb")
+    frame(tmp_path / "b_01.vdb", 1)
+    refused(lambda: sequence(tmp_path, "b_"), "frame 1", "b_01.vdb")
+    frame(tmp_path / "smoke.vdb", 1)
+    refused(lambda: sequence(tmp_path), "smoke.vdb", "no frame number")
+
+
+# ---------------------------------------------------------------- neuprim vdb info
+
+
+def test_info_of_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = frame(tmp_path / "a.vdb", 4, 0.5)
+    assert main(["vdb", "info", str(path)]) == 0
+    out = capsys.readouterr().out
+    for word in ("a.vdb", "density", "float", "fog", "blosc", "0.5", "0:4", "64", "256 B"):
+        assert word in out, out
+
+
+def test_info_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    frame(tmp_path / "a_2.vdb", 4, 0.5)
+    frame(tmp_path / "a_10.vdb", 0)
+    frame(tmp_path / "a_3.vdb", 2, value=float("inf"))
+    assert main(["vdb", "info", str(tmp_path), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert [Path(f["path"]).name for f in report["files"]] == ["a_2.vdb", "a_3.vdb", "a_10.vdb"]
+    assert report["notes"] == ["3 frames, 2 to 10; missing: 4–9"]
+    first, second, last = (f["grids"][0] for f in report["files"])
+    assert first["voxel_size"] == [0.5] * 3 and first["bounds"] == [[0, 0, 0], [4, 4, 4]] and first["active_voxels"] == 64
+    assert first["range"] == [1.0, 1.0] and first["dense_bytes"] == 256 and first["compression"] == "blosc + active values"
+    assert second["non_finite"] == 8 and second["range"] is None
+    assert last["bounds"] is None and last["active_voxels"] == 0
+
+
+def test_info_shows_what_is_not_read_and_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one_grid(tmp_path / "b.vdb", b"noise", b"", name="points\x1b[31m", kind="Tree_ptdataidx32_5_4_3_Mask")
+    leaf = one_leaf(np.ones(512, bool), b"\0" + bytes(2048), bytes(4))
+    one_grid(tmp_path / "a.vdb", *leaf, name="sdf", kept={"class": ("string", b"level set")})
+    assert main(["vdb", "info", str(tmp_path)]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "\x1b" not in out and "holds points" in out and "not read" in out
+    assert "sdf: is a level set" in out and "no frame number" in out
+
+
+def test_info_refuses_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.vdb").write_bytes(b"no volume at all")
+    for words in (["vdb", "info", str(tmp_path / "a.vdb")], ["vdb", "info", str(tmp_path / "b.vdb")], ["vdb", "show", "x"], ["vdb"]):
+        assert main(words) == 2
+        streams = capsys.readouterr()
+        assert streams.out == "" and streams.err.count("\n") == 1 and streams.err.startswith("neuprim: error:")

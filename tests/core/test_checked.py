@@ -1,0 +1,166 @@
+"""Settings from plain values: what is converted, what is refused, and in which words."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pytest
+
+from neuprim.core.checked import Accepts, Range, checked, choose, converted, kind_of, option_type, shown, text, verify
+from neuprim.core.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Inner:
+    size: Annotated[int, Range(8, 64)] = 16
+    name: Annotated[str, text("the name of a file")] = "a"
+
+
+@dataclass
+class Outer:
+    """What a plugin may declare: some fields without defaults, and nothing that checks when Python code makes one."""
+
+    path: Annotated[Path, text("a folder")]
+    inner: Inner = field(default_factory=Inner)
+    every: Annotated[int, Range(at_least=2, also=(0,))] = 0
+    form: Literal["sharp", "soft"] = "soft"
+    exposure: Annotated[float, Range(above=0)] | Literal["auto"] = 1.0
+    rates: dict[str, Annotated[float, Range(at_least=0)]] = field(default_factory=dict)
+    grids: Mapping[Literal["density", "flames"], str] = field(default_factory=dict)
+    range: tuple[float, float] | None = None
+    free: Any = None
+
+
+def test_what_loses_nothing_is_converted() -> None:
+    values = {"path": 123, "inner": {"size": 32.0}, "exposure": "1e-3", "rates": {"a": 1}, "range": [0, 1], "free": object}
+    made = checked(Outer, values, "scene")
+    assert made.path == Path("123") and made.inner == Inner(size=32) and isinstance(made.inner.size, int)
+    assert made.exposure == 1e-3 and isinstance(made.rates["a"], float) and made.range == (0.0, 1.0) and made.free is object
+    assert checked(Outer, {"path": "x", "exposure": "auto", "inner": Inner(9)}).inner.size == 9
+    assert checked(Outer, made) is made
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"pth": "x"}, "scene.pth: no such setting; did you mean 'scene.path'?"),
+        ({}, "scene.path: required and not given; expected a folder"),
+        ({"path": ""}, "scene.path='': expected a folder"),
+        ({"path": "a\0b"}, "scene.path='a\\x00b': expected a folder"),
+        ({"path": "x", "inner": {"size": 7}}, "scene.inner.size=7: expected a whole number from 8 to 64"),
+        ({"path": "x", "inner": {"size": True}}, "scene.inner.size=true: expected a whole number from 8 to 64"),
+        ({"path": "x", "inner": {"size": "32"}}, "scene.inner.size='32': expected a whole number from 8 to 64"),
+        ({"path": "x", "inner": {"sise": 32}}, "scene.inner.sise: no such setting; did you mean 'scene.inner.size'?"),
+        ({"path": "x", "inner": 3}, "scene.inner=3: expected settings, each as scene.inner.KEY=VALUE"),
+        ({"path": "x", "every": 1}, "scene.every=1: expected 0, or a whole number of at least 2"),
+        ({"path": "x", "form": "soft\n"}, "scene.form='soft\\n': expected sharp or soft"),
+        ({"path": "x", "exposure": 0}, "scene.exposure=0: expected a number above 0, or auto"),
+        ({"path": "x", "exposure": math.nan}, "scene.exposure=nan: expected a finite number above 0, or auto"),
+        ({"path": "x", "exposure": 10**400}, f"scene.exposure={10**400}: expected a finite number above 0, or auto"),
+        ({"path": "x", "rates": {"a": -1}}, "scene.rates.a=-1: expected a number of at least 0"),
+        ({"path": "x", "rates": 1}, "scene.rates=1: expected entries, each as scene.rates.KEY=VALUE"),
+        ({"path": "x", "grids": {"smoke": "s"}}, "scene.grids.smoke: no such setting; valid: scene.grids.density, scene.grids.flames"),
+        ({"path": "x", "range": [0]}, "scene.range=[0]: expected a list of a finite number, a finite number, or null"),
+    ],
+)
+def test_one_line_with_key_value_and_what_is_expected(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        checked(Outer, values, "scene")
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("bounds", "words"),
+    [
+        (Range(1, 16), "a number from 1 to 16"),
+        (Range(0, 2**63 - 1), "a number from 0 to 9223372036854775807"),
+        (Range(above=0, at_most=0.9999), "a number above 0 and at most 0.9999"),
+        (Range(at_least=0, below=1), "a number of at least 0 and below 1"),
+        (Range(above=0, below=1), "a number above 0 and below 1"),
+        (Range(above=1e-9), "a number above 1e-09"),
+        (Range(at_most=5), "a number of at most 5"),
+        (Range(below=5), "a number below 5"),
+        (Range(-math.inf, math.inf), "a number"),
+        (Range(at_least=2, also=(0,)), "0, or a number of at least 2"),
+    ],
+)
+def test_bounds_in_words(bounds: Range, words: str) -> None:
+    assert bounds.words("a number") == words
+
+
+def test_bounds_include_what_they_say() -> None:
+    assert [v for v in (-1, 0, 0.5, 1, 2) if Range(0, 1).accepts(v)] == [0, 0.5, 1]
+    assert [v for v in (-1, 0, 0.5, 1, 2) if Range(above=0, below=1).accepts(v)] == [0.5]
+    assert [v for v in (-1, 0, 0.5, 1, 2) if Range(at_least=2, also=(0,)).accepts(v)] == [0, 2]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "null"), (True, "true"), ("8", "'8'"), ("null", "'null'"), ("a b", "a b"), ([1, "x"], "[1, 'x']"), ("", "''")],
+)
+def test_values_are_shown_as_they_are_typed(value: object, text: str) -> None:
+    assert shown(value) == text
+
+
+@dataclass(frozen=True)
+class Verified:
+    low: Annotated[float, Range(at_least=0)] = 0.0
+    high: Annotated[float, Range(at_least=0)] = 1.0
+
+    def __post_init__(self) -> None:
+        verify(self, "scene")
+        if self.low > self.high:
+            raise ConfigError(f"scene.low={self.low:g}: expected at most scene.high, {self.high:g}")
+
+
+def test_python_code_is_checked_too_and_rules_between_fields_see_converted_values() -> None:
+    assert isinstance(Verified(low="0.5").low, float)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"^scene\.low=-1: expected a number of at least 0$"):
+        replace(Verified(), low=-1)
+    with pytest.raises(ConfigError, match=r"^scene\.low=2: expected at most scene\.high, 1$"):
+        checked(Verified, {"low": "2"}, "scene")
+
+
+def test_free_settings_take_hints_types_and_tuples() -> None:
+    offered = {"count": Annotated[int, Range(1, 4)], "form": ("a", "b"), "scale": float, "name": str}
+    choose({"count": 4, "form": "b", "scale": 3, "name": "x"}, "model.density", offered)
+    for found, message in (
+        ({"count": 5}, "model.density.count=5: expected a whole number from 1 to 4"),
+        ({"count": 4.0}, "model.density.count=4.0: expected a whole number from 1 to 4"),
+        ({"scale": "1e-3"}, "model.density.scale='1e-3': expected a finite number"),
+        ({"form": "c"}, "model.density.form=c: expected a or b"),
+        ({"name": 3}, "model.density.name=3: expected text (quote it: model.density.name='...')"),
+        ({"cuont": 3}, "model.density.cuont: no such setting; did you mean 'model.density.count'?"),
+    ):
+        with pytest.raises(ConfigError) as caught:
+            choose(found, "model.density", offered)
+        assert str(caught.value) == message
+    with pytest.raises(ConfigError, match=r"^model\.colour\.x: no such setting; there is none$"):
+        choose({"x": 1}, "model.colour", {})
+
+
+def test_options_have_the_type_of_their_default_or_their_own() -> None:
+    assert option_type((1.0, "help")) is float and option_type((None, "help")) is Any
+    assert option_type(("a", "help", ("a", "b"))) == Literal["a", "b"]
+    assert converted([3], kind_of([1, 2]), "x") == [3]
+    with pytest.raises(ConfigError, match=r"^x=3: expected a list such as \[1, 2\]$"):
+        converted(3, kind_of([1, 2]), "x")
+
+
+def test_a_test_of_ones_own_says_what_it_expects() -> None:
+    even = Annotated[int, Accepts(lambda v: v % 2 == 0, "an even number")]
+    assert converted(4, even, "x") == 4
+    for value in (3, "x", None):
+        with pytest.raises(ConfigError, match=r"expected an even number$"):
+            converted(value, even, "x")
+
+
+def test_the_module_of_before_still_imports() -> None:
+    with pytest.warns(DeprecationWarning, match=r"neuprim\.core\.choices is now neuprim\.core\.checked"):
+        old = importlib.import_module("neuprim.core.choices")
+    assert old.choose is choose

@@ -1,0 +1,309 @@
+"""The training loop: it learns, and it goes on exactly where it was stopped."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from neuprim.core import checkpoint
+from neuprim.core.data import Dataset
+from neuprim.core.errors import CheckpointError, ConfigError, DataError, NonFiniteError
+from neuprim.core.metrics import psnr
+from neuprim.core.task import Supervision
+from neuprim.core.train.settings import ModelSettings, TrainSettings
+from neuprim.core.train.trainer import StepReport, Trainer, initial_model
+from neuprim.runs.measure import draw
+from tests.core import tiny
+
+
+@pytest.fixture(scope="module")
+def plain() -> Dataset:
+    return tiny.two_primitives()
+
+
+@pytest.fixture(scope="module")
+def random_background() -> Dataset:
+    return tiny.two_primitives(random_background=True)
+
+
+STRATEGIES: dict[str, dict[str, Any]] = {
+    "fixed": {},
+    "relocate": {"strategy": "relocate", "fraction": 0.2},
+    "gradient": {"strategy": "gradient", "grow_threshold": 1e-4, "prune_threshold": 1e-9, "clone_scale": 0.05, "max_primitives": 20},
+}
+
+
+def same(a: Trainer, b: Trainer) -> None:
+    first, second = a.state(), b.state()
+    assert {**first[1], "elapsed": 0} == {**second[1], "elapsed": 0}
+    assert first[0].keys() == second[0].keys()
+    for name, value in first[0].items():
+        assert value.dtype == second[0][name].dtype and torch.equal(value, second[0][name]), name
+
+
+def curve(reports: list[StepReport]) -> list[tuple[Any, ...]]:
+    return [(r.step, r.loss, r.psnr, r.primitives, r.view, r.change) for r in reports]
+
+
+def test_training_learns(plain: Dataset) -> None:
+    trainer = tiny.trainer(plain, 300)
+    reports = list(trainer.run())
+    assert len(reports) == 300 and trainer.finished
+    first, last = reports[:6], reports[-6:]
+    assert sum(r.loss for r in last) < 0.2 * sum(r.loss for r in first)
+    assert sum(r.psnr for r in last) / 6 > 24
+    assert all(math.isfinite(r.loss) for r in reports)
+    assert [r.step for r in reports] == list(range(1, 301))
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_half_saved_loaded_and_half_is_the_whole(strategy: str, random_background: Dataset, tmp_path: Path) -> None:
+    """N chosen so that the stop falls in the middle of an epoch and between two interventions."""
+
+    def make() -> Trainer:
+        smooth = {"warmup_steps": 5, "anisotropy_weight": 1e-3, "anisotropy_from": 15}
+        return tiny.trainer(random_background, 40, population=STRATEGIES[strategy], **smooth)
+
+    whole = make()
+    expected = list(whole.run())
+    first = make()
+    reports = [first.train_step() for _ in range(20)]
+    tensors, header = first.state()
+    checkpoint.write(tmp_path / "c.safetensors", "checkpoint", tensors, header)
+
+    torch.manual_seed(99)  # the global generator plays no part
+    second = make()
+    header, tensors = checkpoint.read(tmp_path / "c.safetensors", "checkpoint")
+    second.load_state(tensors, header, "c.safetensors")
+    assert second.step == 20 and second.elapsed == first.elapsed
+    same(first, second)
+    reports += second.run()
+    assert curve(reports) == curve(expected)
+    same(whole, second)
+    changed = [r.change for r in expected if r.change]
+    assert bool(changed) == (strategy != "fixed")
+    if strategy == "gradient":
+        assert whole.model.count > 12
+    assert whole.optimizer.age.max() == 40
+    assert (whole.optimizer.age.min() < 40) == (strategy != "fixed")
+
+
+def test_two_runs_of_one_seed_are_equal_and_of_two_are_not(random_background: Dataset) -> None:
+    a, b, c = (tiny.trainer(random_background, 6, seed=s) for s in (3, 3, 4))
+    for trainer in (a, b, c):
+        list(trainer.run())
+    same(a, b)
+    assert not torch.equal(a.model.params["means"], c.model.params["means"])
+
+
+def test_every_view_once_per_epoch(plain: Dataset) -> None:
+    trainer = tiny.trainer(plain, 18)
+    names = [trainer.train_step().view for _ in range(18)]
+    epochs = [names[i : i + 6] for i in (0, 6, 12)]
+    assert all(sorted(e) == [f"v{i}" for i in range(6)] for e in epochs)
+    assert epochs[0] != epochs[1] or epochs[1] != epochs[2]
+
+
+def test_rates(plain: Dataset) -> None:
+    trainer = tiny.trainer(plain, 100, final_rate=0.01, warmup_steps=4, rates={"b2": 0.5})
+    first = trainer.rates()
+    assert first["b2"] == pytest.approx(0.5 / 4)
+    specs = {s.name: s for s in trainer.model.specs}
+    assert first["means"] == pytest.approx(specs["means"].lr * plain.extent / 4)
+    trainer.step = 50
+    assert trainer.rates()["W1"] == pytest.approx(specs["W1"].lr * 0.1)
+    trainer.step = 100
+    assert trainer.rates()["b2"] == pytest.approx(0.5 * 0.01)
+
+
+def test_budget_of_seconds(plain: Dataset) -> None:
+    trainer = tiny.trainer(plain, 10**9, max_seconds=0.05)
+    reports = list(trainer.run())
+    assert 0 < len(reports) < 10_000 and trainer.elapsed >= 0.05 and trainer.progress == 1.0
+    assert list(tiny.trainer(plain, 0).run()) == []
+
+
+def test_masked_pixels_do_not_count(plain: Dataset) -> None:
+    mask = torch.ones(tiny.SIZE, tiny.SIZE, dtype=torch.bool)
+    mask[:, 12:] = False
+    clean = [replace(p, mask=mask) for p in plain.train.images]  # type: ignore[attr-defined]
+    spoiled = [replace(p, rgb=torch.where(mask[..., None], p.rgb, torch.full_like(p.rgb, 1e3))) for p in clean]
+    results = []
+    for images in (spoiled, clean):
+        dataset = tiny.two_primitives()
+        dataset.train.images = images  # type: ignore[attr-defined]
+        trainer = tiny.trainer(dataset, 5, ssim_weight=0.0)
+        list(trainer.run())
+        results.append(trainer)
+    same(*results)
+
+
+def test_the_psnr_of_a_step_is_that_of_the_pixels_that_count() -> None:
+    dataset = tiny.two_primitives()
+    mask = torch.zeros(tiny.SIZE, tiny.SIZE, dtype=torch.bool)
+    mask[8:14, 5:20] = True
+    dataset.train.images = [replace(p, mask=mask) for p in dataset.train.images]  # type: ignore[attr-defined]
+    trainer = tiny.trainer(dataset, 3)
+    drawn = [draw(trainer.model, dataset.train.view(i), trainer.renderer, dataset.background) for i in range(len(dataset.train))]
+    report = trainer.train_step()
+    index = [dataset.train.view(i).name for i in range(len(dataset.train))].index(report.view)
+    expected = psnr(drawn[index], dataset.train.pixels(index).over(dataset.background), mask)
+    assert report.psnr == pytest.approx(expected, abs=1e-4)
+
+
+# ---------------------------------------------------------------- what goes wrong
+
+
+def poisoned(name: str, row: int, at: int):  # type: ignore[no-untyped-def]
+    """A trainer, of whose parameter ``name`` the gradient of primitive ``row`` is NaN at step ``at``."""
+    trainer = tiny.trainer(tiny.two_primitives(), 40)
+    plain_loss = trainer.loss
+
+    def poison(grad: Tensor) -> Tensor:
+        if trainer.step != at:
+            return grad
+        grad = grad.clone()
+        grad[row].view(-1)[0] = float("nan")
+        return grad
+
+    def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
+        if trainer.step == at:
+            trainer.model.params[name].register_hook(poison)
+        return plain_loss(rendered, truth, frame)
+
+    trainer.loss = loss
+    return trainer
+
+
+@pytest.mark.parametrize("name", ["means", "W1", "sh_dc"])
+def test_a_non_finite_gradient_stops_by_name(name: str) -> None:
+    trainer = poisoned(name, 5, 3)
+    for _ in range(3):
+        trainer.train_step()
+    before = {k: v.detach().clone() for k, v in trainer.model.params.items()}
+    with pytest.raises(NonFiniteError, match=rf"gradient of {name} of primitive 5\b"):
+        trainer.train_step()
+    assert all(torch.equal(v, before[k]) for k, v in trainer.model.params.items())
+    assert trainer.optimizer.age.tolist() == [3] * 12
+
+
+def test_a_non_finite_parameter_stops_by_name(plain: Dataset) -> None:
+    trainer = tiny.trainer(plain)
+    trainer.train_step()
+    with torch.no_grad():
+        trainer.model.params["w2"][4, 1] = float("inf")
+    with pytest.raises(NonFiniteError, match=r"w2 of primitive 4\b"):
+        trainer.train_step()
+
+
+def test_a_non_finite_image_stops_by_view() -> None:
+    dataset = tiny.two_primitives()
+    dataset.train.images[2].rgb[3, 4, 1] = float("nan")  # type: ignore[attr-defined]
+    trainer = tiny.trainer(dataset)
+    with pytest.raises(NonFiniteError, match=r"loss is nan at step \d on view v2"):
+        for _ in range(6):
+            trainer.train_step()
+
+
+def test_empty_splits_and_no_points(plain: Dataset) -> None:
+    model = tiny.trainer(plain).model
+    dataset = tiny.two_primitives()
+    dataset.train.cameras = []  # type: ignore[attr-defined]
+    with pytest.raises(DataError, match="training split is empty"):
+        Trainer(model, dataset, lambda a, b: (a, {}), TrainSettings(), tiny.RenderSettings(), 0)
+    nowhere = replace(dataset, start=lambda views, count, generator: tiny.PointCloud(torch.zeros(0, 3), torch.zeros(0, 3)))
+    with pytest.raises(DataError, match="two: no starting points"):
+        initial_model(model.density, model.colour, nowhere, ModelSettings(), 0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_few_points_still_make_a_model(plain: Dataset, count: int) -> None:
+    model = initial_model(tiny.CosineDensity(2), tiny.SphericalHarmonics(0), plain, ModelSettings(primitives=count), 0)
+    assert model.count == count
+    assert bool(torch.isfinite(model.geometry.scales).all()) and model.geometry.scales.min() > 0
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("alpha", 1.0, "above 0 and below 1"),
+        ("alpha", "much", "a finite number above 0 and below 1"),
+        ("scale", 0, "above 0"),
+        ("mode", "papr", "opaque or paper"),
+    ],
+)
+def test_impossible_starting_values_name_their_key(plain: Dataset, key: str, value: object, expected: str) -> None:
+    with pytest.raises(ConfigError, match=rf"model\.init\.{key}={value}: expected .*{expected}"):
+        initial_model(tiny.CosineDensity(2), tiny.SphericalHarmonics(0), plain, ModelSettings(primitives=5, init={key: value}), 0)
+
+
+def damaged(kind: str, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
+    """Spoil a trainer's state in place."""
+    if kind == "no step":
+        del header["step"]
+    elif kind == "step of text":
+        header["step"] = "20"
+    elif kind == "step negative":
+        header["step"] = -1
+    elif kind == "elapsed nan":
+        header["elapsed"] = float("nan")
+    elif kind == "other data":
+        header["views"] = 7
+    elif kind == "other names":
+        header["names"] = "0" * 16
+    elif kind == "missing parameter":
+        del tensors["params.w2"]
+    elif kind == "parameter shape":
+        tensors["params.w2"] = tensors["params.w2"][:, :2].contiguous()
+    elif kind == "parameter type":
+        tensors["params.w2"] = tensors["params.w2"].double()
+    elif kind == "parameter nan":
+        tensors["params.w2"] = torch.full_like(tensors["params.w2"], float("nan"))
+    elif kind == "rows differ":
+        tensors["params.w2"] = tensors["params.w2"][:5].contiguous()
+    elif kind == "scalar means":
+        tensors["params.means"] = torch.tensor(1.0)
+    elif kind == "missing moment":
+        del tensors["adam.m.w2"]
+    elif kind == "moment shape":
+        tensors["adam.v.w2"] = torch.zeros(12, 3)
+    elif kind == "moment type":
+        tensors["adam.v.w2"] = tensors["adam.v.w2"].double()
+    elif kind == "age shape":
+        tensors["adam.age"] = torch.zeros(3, dtype=torch.int64)
+    elif kind == "order range":
+        tensors["order"] = torch.tensor([0, 6])
+    elif kind == "no generator":
+        del tensors["generator"]
+    elif kind == "short generator":
+        tensors["generator"] = tensors["generator"][:100].contiguous()
+    elif kind == "population shape":
+        tensors["population.weight"] = torch.zeros(3)
+
+
+DAMAGES = [
+    "no step", "step of text", "step negative", "elapsed nan", "other data", "other names", "missing parameter", "parameter shape",
+    "parameter type", "parameter nan", "rows differ", "scalar means", "missing moment", "moment shape", "moment type", "age shape", "order range",
+    "no generator", "short generator", "population shape",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", DAMAGES)
+def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(plain: Dataset, kind: str) -> None:
+    make = lambda: tiny.trainer(plain, 40, population=STRATEGIES["relocate"])  # noqa: E731
+    old = make()
+    for _ in range(3):
+        old.train_step()
+    tensors, header = old.state()
+    tensors = {k: v.clone() for k, v in tensors.items()}
+    damaged(kind, tensors, header)
+    new, untouched = make(), make()
+    with pytest.raises(CheckpointError, match=r"some file\.safetensors"):
+        new.load_state(tensors, header, "some file.safetensors")
+    same(new, untouched)

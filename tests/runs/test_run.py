@@ -1,0 +1,371 @@
+"""Whole runs of a tiny scene: what they leave on disk, and that neither Ctrl-C nor a kill costs more than a step."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+import neuprim.runs.fit as fitting
+from neuprim.config import RunConfig
+from neuprim.core import checkpoint
+from neuprim.core.channels import Channels
+from neuprim.core.data import Clip, Dataset
+from neuprim.core.errors import CheckpointError, DataError, NonFiniteError
+from neuprim.core.train.trainer import StepReport, Trainer
+from neuprim.runs.curve import curve_psnr
+from neuprim.runs.draw import render_run
+from neuprim.runs.measure import evaluate_run, measure
+from neuprim.runs.open import read_metrics
+from neuprim.tasks.static import TASK
+from tests.core import tiny
+from tests.short_runs import STEPS, fit, words
+from tests.systems import posix
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_orbits() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 4)
+        yield
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny.write_blender(tmp_path_factory.mktemp("data") / "two")
+
+
+@pytest.fixture(scope="module")
+def whole(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An uninterrupted run."""
+    return fit(words(scene, tmp_path_factory.mktemp("runs") / "whole"))
+
+
+def tensors(run_dir: Path, kind: str = "model") -> dict[str, Tensor]:
+    return checkpoint.read(run_dir / f"{kind}.safetensors", kind)[1]
+
+
+def curve(run_dir: Path) -> list[dict[str, Any]]:
+    lines = [json.loads(text) for text in (run_dir / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
+
+
+def assert_same_run(a: Path, b: Path) -> None:
+    for kind in ("model", "checkpoint"):
+        first, second = tensors(a, kind), tensors(b, kind)
+        assert first.keys() == second.keys()
+        for name, value in first.items():
+            assert value.dtype == second[name].dtype and value.numpy().tobytes() == second[name].numpy().tobytes(), name
+    assert curve(a) == curve(b)
+    timings = ("train_seconds", "render_fps", "per_view", "model_bytes", "non_default")
+    first, second = ({k: v for k, v in read_metrics(d).items() if k not in timings} for d in (a, b))
+    assert first == second
+
+
+# ---------------------------------------------------------------- what a run leaves
+
+
+def test_contents(whole: Path) -> None:
+    assert {"config.yaml", "model.safetensors", "checkpoint.safetensors", "metrics.jsonl", "metrics.json", "renders", "report.html"} <= {
+        p.name for p in whole.iterdir()
+    }
+    assert not list(whole.rglob("*.tmp"))
+    pictures = sorted(p.name for p in (whole / "renders").iterdir())
+    assert "orbit.webp" in pictures
+    shown = [p for p in pictures if p.startswith("test_")]
+    assert len(shown) == 6, "two views, each rendered, true and the error"
+    assert all(Image.open(whole / "renders" / p).size[1] == tiny.SIZE for p in shown)
+    assert "<html" in (whole / "report.html").read_text(encoding="utf-8")
+
+
+def test_metrics(whole: Path, scene: Path) -> None:
+    metrics = read_metrics(whole)
+    asked = (
+        "task scene split psnr ssim per_view primitives parameters parameters_per_primitive model_bytes iterations train_seconds render_fps "
+        "backend device checkpoint downsampling background data_source seed versions"
+    )
+    assert set(asked.split()) <= metrics.keys()
+    assert (metrics["task"], metrics["scene"], metrics["split"], metrics["checkpoint"]) == ("static", "blender", "test", "last")
+    assert metrics["primitives"] == 40 and metrics["parameters_per_primitive"] == 10 + 21 + 48
+    assert metrics["parameters"] == 40 * 79
+    assert metrics["model_bytes"] == (whole / "model.safetensors").stat().st_size > 40 * 79 * 4
+    assert metrics["iterations"] == STEPS and metrics["seed"] == 3 and metrics["background"] == [1.0, 1.0, 1.0]
+    assert metrics["backend"] == "cpu" and metrics["data_source"] == "real" and metrics["downsampling"] == "none"
+    assert metrics["train_seconds"] > 0 and metrics["render_fps"] > 1
+    assert {"neuprim", "python", "torch", "numpy"} <= metrics["versions"].keys()
+    views = metrics["per_view"]
+    assert len(views) == 2
+    assert metrics["psnr"] == pytest.approx(sum(v["psnr"] for v in views) / 2) and metrics["psnr"] > 12
+    assert metrics["ssim"] == pytest.approx(sum(v["ssim"] for v in views) / 2)
+
+
+def test_curve(whole: Path) -> None:
+    lines = curve(whole)
+    assert [line["step"] for line in lines if line["step"] % 10 == 0] == list(range(10, STEPS + 1, 10))
+    assert [line["step"] for line in lines if "eval_psnr" in line] == [STEPS * i // 4 for i in (1, 2, 3, 4)]
+    assert {"loss", "l1", "ssim", "psnr", "primitives"} <= lines[-1].keys()
+    assert any("moved" in line.get("change", "") for line in lines)
+    assert lines[-1]["eval_psnr"] > lines[0]["psnr"] + 3
+    assert lines[-1]["eval_psnr"] == pytest.approx(read_metrics(whole)["psnr"], abs=1e-3)
+
+
+def test_masked_pixels_do_not_count_on_the_curve() -> None:
+    dataset = tiny.two_primitives()
+    mask = torch.zeros(tiny.SIZE, tiny.SIZE, dtype=torch.bool)
+    mask[8:14, 5:20] = True
+    dataset.test.images = [  # type: ignore[attr-defined]
+        replace(p, rgb=torch.where(mask[..., None], p.rgb, torch.tensor(7.0)), mask=mask)
+        for p in dataset.test.images  # type: ignore[attr-defined]
+    ]
+    trainer = tiny.trainer(dataset, 3)
+    views = measure(trainer.model, TASK, dataset, trainer.renderer, Channels())
+    assert curve_psnr(trainer) == pytest.approx(sum(v.psnr for v in views) / len(views), abs=1e-9)
+
+
+def test_a_perfect_view_leaves_the_curve_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = tiny.two_primitives()
+    monkeypatch.setattr("neuprim.runs.curve.draw", lambda model, view, settings, background: dataset.test.pixels(0).over(background))
+    dataset.test.images = [dataset.test.images[0]] * 2  # type: ignore[attr-defined]
+    assert curve_psnr(tiny.trainer(dataset, 3)) == 200.0
+
+
+def test_a_task_may_judge_views_and_make_films_and_tell_facts(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def judge(dataset: Dataset, index: int, rendered: Tensor, truth: Tensor) -> dict[str, float]:
+        return {"index": float(index), "mse_part": 0.1 if index else 0.2, "pixels_part": 3.0 if index == 0 else 1.0}
+
+    mine = replace(
+        TASK,
+        judge=judge,
+        mask=lambda dataset, index: dataset.test.pixels(index).alpha > 0.5,
+        diagnose=lambda dataset, model: {"counted": [model.count, dataset.channels]},
+        clips=lambda dataset: [Clip("round", [2, 0, 1], 10.0, dataset.train)],
+        facts=lambda dataset: {"seen": len(dataset.train)},
+        orbit=lambda dataset, frames: dataset.orbit(frames)[:3],
+    )
+    monkeypatch.setattr("neuprim.tasks.static.TASK", mine)
+    out = fit(words(scene, tmp_path / "film", 20))
+    metrics = read_metrics(out)
+    count = len(metrics["per_view"])
+    assert metrics["index"] == (count - 1) / 2 and [v["index"] for v in metrics["per_view"]] == list(range(count))
+    pooled = (3 * 0.2 + (count - 1) * 0.1) / (3 + count - 1)
+    assert metrics["psnr_pooled_part"] == pytest.approx(-10 * math.log10(pooled)) and metrics["pixels_part"] == 3 + count - 1
+    assert "per_frame" not in metrics
+    assert metrics["counted"] == [metrics["primitives"], 3]
+    assert all(math.isfinite(view["psnr_mask"] + view["mse_mask"]) for view in metrics["per_view"])
+    header = checkpoint.read(out / "model.safetensors", "model")[0]
+    assert header["data"] == {"up": [0.0, 0.0, 1.0], "center": header["data"]["center"], "seen": 6}
+    with Image.open(out / "renders" / "orbit.webp") as film:
+        assert getattr(film, "n_frames", 1) == 3
+    with Image.open(out / "renders" / "clip_round.webp") as film:
+        assert getattr(film, "n_frames", 1) == 3 and film.width == 2 * film.height
+    assert evaluate_run(out)["index"] == metrics["index"]
+
+
+def test_the_configuration_reads_back(whole: Path, scene: Path) -> None:
+    config = RunConfig.from_yaml(whole)
+    assert config.train.iterations == STEPS and config.scene["path"] == str(scene) and config.seed == 3
+
+
+def test_evaluating_again_gives_the_same_numbers(whole: Path) -> None:
+    first, second = read_metrics(whole), evaluate_run(whole)
+    assert first["psnr"] == second["psnr"] and first["ssim"] == second["ssim"]
+    drop = lambda m: [{k: v for k, v in view.items() if k != "seconds"} for view in m["per_view"]]  # noqa: E731
+    assert drop(first) == drop(second)
+    for key in ("iterations", "train_seconds", "primitives", "model_bytes", "background"):
+        assert first[key] == second[key]
+
+
+def test_the_same_run_twice(whole: Path, scene: Path, tmp_path: Path) -> None:
+    torch.manual_seed(5)
+    assert_same_run(whole, fit(words(scene, tmp_path / "again")))
+
+
+# ---------------------------------------------------------------- pictures
+
+
+def test_render_orbit_test_and_file(whole: Path, tmp_path: Path) -> None:
+    paths = render_run(whole, "orbit", (30, 20), "png", tmp_path / "orbit", 3, {})
+    assert [Image.open(p).size for p in paths] == [(30, 20)] * 3
+    assert len({p.read_bytes() for p in paths}) == 3
+    paths = render_run(whole, "test", None, "png", tmp_path / "test", 60, {})
+    assert [Image.open(p).size for p in paths] == [(tiny.SIZE, tiny.SIZE)] * 2
+    own = sorted(p for p in (whole / "renders").glob("test_*.png") if "truth" not in p.name and "error" not in p.name)
+    assert [p.read_bytes() for p in paths] == [p.read_bytes() for p in own], "the pictures that the run made itself"
+
+    cameras = tmp_path / "cameras.json"
+    cameras.write_text(
+        json.dumps({**json.loads((Path(RunConfig.from_yaml(whole).scene["path"]) / "transforms_test.json").read_text()), "w": 18, "h": 14})
+    )
+    paths = render_run(whole, str(cameras), None, "png", None, 60, {})
+    assert [Image.open(p).size for p in paths] == [(18, 14)] * 2
+    (path,) = render_run(whole, str(cameras), None, "webp", tmp_path / "a.webp", 60, {})
+    assert path == tmp_path / "a.webp" and Image.open(path).size == (18, 14) and Image.open(path).n_frames == 2  # type: ignore[attr-defined]
+    paths = render_run(whole, "test", (8, 6), "exr", tmp_path / "exr", 60, {})
+    assert [p.suffix for p in paths] == [".exr", ".exr"]
+
+
+# ---------------------------------------------------------------- stops
+
+
+def start(overrides: list[str]) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-m", "neuprim", "run", *overrides], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def wait_for_step(process: subprocess.Popen[bytes], run_dir: Path, step: int) -> None:
+    """Until the checkpoint on disk has reached ``step``. Every state of the file that can be seen meanwhile is whole."""
+    seen, snapshot = run_dir / "checkpoint.safetensors", run_dir.with_name("snapshot.safetensors")
+    end = time.monotonic() + 120
+    while time.monotonic() < end:
+        assert process.poll() is None, process.communicate()
+        if seen.exists():
+            snapshot.write_bytes(seen.read_bytes())  # the file is replaced all the time; a copy stays
+            if checkpoint.read(snapshot, "checkpoint")[0]["step"] >= step:
+                return
+        time.sleep(0.005)
+    pytest.fail("no checkpoint appeared")
+
+
+@posix
+@pytest.mark.parametrize("strategy", ["relocate", pytest.param("gradient", marks=pytest.mark.slow)])
+def test_killed_and_resumed_is_the_uninterrupted_run(scene: Path, whole: Path, tmp_path: Path, strategy: str) -> None:
+    more = (
+        []
+        if strategy == "relocate"
+        else ["train.population.strategy=gradient", "train.population.prune_threshold=0", "train.population.max_primitives=60"]
+    )
+    expected = whole if not more else fit(words(scene, tmp_path / "expected", STEPS, *more))
+    out = tmp_path / "killed"
+    overrides = words(scene, out, STEPS, "train.checkpoint_every_seconds=0", *more)
+    process = start(overrides)
+    try:
+        wait_for_step(process, out, 75)
+    finally:
+        process.kill()  # SIGKILL
+    assert process.wait() == -signal.SIGKILL
+    stopped = checkpoint.read_header(out / "checkpoint.safetensors", "checkpoint")["step"]
+    assert 75 <= stopped < STEPS and not (out / "metrics.json").exists()
+
+    done = subprocess.run([sys.executable, "-m", "neuprim", "run", *overrides, "resume=true"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert f"resumed at step {stopped}" in done.stderr
+    assert_same_run(expected, out)
+
+
+@posix
+def test_ctrl_c_leaves_a_checkpoint_that_goes_on(scene: Path, whole: Path, tmp_path: Path) -> None:
+    out = tmp_path / "stopped"
+    overrides = words(scene, out, STEPS, "train.checkpoint_every_seconds=0")
+    process = start(overrides)
+    try:
+        wait_for_step(process, out, 30)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+    finally:
+        process.kill()
+    step = checkpoint.read_header(out / "checkpoint.safetensors", "checkpoint")["step"]
+    assert 30 <= step < STEPS
+    assert read_metrics(out)["iterations"] == step, "what was fitted until then is measured"
+    assert checkpoint.read_header(out / "model.safetensors", "model")["iterations"] == step
+    assert evaluate_run(out)["psnr"] == read_metrics(out)["psnr"]
+    fit([*overrides, "resume=true"])
+    assert_same_run(whole, out)
+
+
+def test_a_last_line_cut_short_by_a_kill(scene: Path, whole: Path, tmp_path: Path) -> None:
+    """metrics.jsonl may be ahead of the checkpoint, or end in half a line."""
+    out = tmp_path / "run"
+    overrides = words(scene, out)
+    state: dict[str, Any] = {}
+
+    class Stop(Exception):
+        pass
+
+    class Halting(Trainer):
+        def train_step(self) -> StepReport:
+            if self.step == 101 and len(self.model.params["means"]) == 40:
+                raise Stop
+            if self.step == 95 and not state:
+                state["saved"] = {k: v.clone() for k, v in self.state()[0].items()}, self.state()[1]
+            return super().train_step()
+
+    original = fitting.Trainer
+    fitting.Trainer = Halting  # type: ignore[misc]
+    try:
+        with pytest.raises(Stop):
+            fit(overrides)
+    finally:
+        fitting.Trainer = original  # type: ignore[misc]
+    held, header = state["saved"]
+    checkpoint.write(out / "checkpoint.safetensors", "checkpoint", held, {"task": "static", **header})
+    with open(out / "metrics.jsonl", "a") as file:
+        file.write('{"step": 110, "lo')
+    fit([*overrides, "resume=true"])
+    assert_same_run(whole, out)
+
+
+def test_a_finished_run_resumed_stays_as_it_is(scene: Path, whole: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    fit(words(scene, out, 20))
+    before = tensors(out)
+    fit([*words(scene, out, 20), "resume=true"])
+    assert all(torch.equal(v, before[k]) for k, v in tensors(out).items())
+    assert len({line["step"] for line in curve(out)}) == len(curve(out))
+
+
+def test_resuming_with_other_settings_is_refused(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    fit(words(scene, out, 10))
+    before = (out / "checkpoint.safetensors").read_bytes()
+    with pytest.raises(CheckpointError, match=r"checkpoint\.safetensors.*W1"):
+        fit([*words(scene, out, 20), "resume=true", "model.neurons=5"])
+    assert (out / "checkpoint.safetensors").read_bytes() == before
+
+
+def test_a_non_finite_gradient_stops_the_run(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Poisoned(Trainer):
+        def train_step(self) -> StepReport:
+            if self.step == 5:
+                self.model.params["b1"].register_hook(lambda g: g.index_fill(0, torch.tensor([7]), float("nan")))
+            return super().train_step()
+
+    monkeypatch.setattr("neuprim.runs.fit.Trainer", Poisoned)
+    out = tmp_path / "run"
+    with pytest.raises(NonFiniteError, match=r"gradient of b1 of primitive 7\b"):
+        fit(words(scene, out, 10, "train.checkpoint_every_seconds=0"))
+    header, saved = checkpoint.read(out / "checkpoint.safetensors", "checkpoint")
+    assert header["step"] == 5
+    assert all(bool(torch.isfinite(v).all()) for v in saved.values() if v.is_floating_point())
+    monkeypatch.undo()
+    fit([*words(scene, out, 10), "resume=true"])
+    assert read_metrics(out)["iterations"] == 10
+
+
+def test_bad_data_leaves_an_earlier_run_alone(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    fit(words(scene, out, 5))
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    with pytest.raises(DataError, match="nowhere"):
+        fit([*words(tmp_path / "nowhere", out, 10), "resume=true"])
+    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
+
+
+def test_a_checkpoint_of_another_task_is_refused(scene: Path, tmp_path: Path) -> None:
+    out = fit(words(scene, tmp_path / "run", 20))
+    header, tensors = checkpoint.read(out / "checkpoint.safetensors", "checkpoint")
+    checkpoint.write(out / "checkpoint.safetensors", "checkpoint", tensors, {**header, "task": "dynamic"})
+    before = (out / "checkpoint.safetensors").read_bytes()
+    with pytest.raises(CheckpointError, match=r"checkpoint\.safetensors.*'dynamic'.*'static'"):
+        fit(words(scene, out, 40, "resume=true"))
+    assert (out / "checkpoint.safetensors").read_bytes() == before

@@ -1,0 +1,170 @@
+"""What every generated scene gets: files in the cache that are there whole or not at all, drawn in threads, described in transforms."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from neuprim.core.errors import DataError
+from neuprim.scenes.cached import cached_folder
+from neuprim.scenes.image_set import ImageSet
+from neuprim.scenes.poses import camera_to_world, direction
+from neuprim.scenes.side_by_side import THREADS, side_by_side
+from neuprim.tasks.relight.lit.generate import LitSettings
+from neuprim.tasks.static.solids.generate import SolidsSettings
+
+
+def quiet(text: str, fraction: float) -> None:
+    pass
+
+
+def numbers(engine: str = "embree", **changes: Any) -> ImageSet[int]:
+    """A "scene" whose images are the squares of their numbers."""
+
+    def draw(scene: Any, view: int, paths: Sequence[Path]) -> None:
+        for path in paths:
+            path.write_text(f"{path.name} {scene.power**view}")
+
+    given = {
+        "name": "numbers",
+        "key": "abc",
+        "size": 7,
+        "splits": {"train": [1, 2, 3], "test": [4]},
+        "lens": {"camera_angle_x": 0.5, "camera_near": 1.0},
+        "build": lambda: SimpleNamespace(engine=engine, power=2),
+        "frame": lambda split, view: {"file_path": f"./{split}/{view}", "other": view},
+        "files": lambda view: [f"{view}.txt", f"{view}_again.txt"],
+        "draw": draw,
+    }
+    return ImageSet(**{**given, **changes})  # type: ignore[arg-type]
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {p.relative_to(folder).as_posix(): p.read_text() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+# ---------------------------------------------------------------- image sets
+
+
+def test_files_and_transforms(tmp_path: Path) -> None:
+    folder = numbers().generate(tmp_path / "new" / "cache", quiet)
+    assert folder == tmp_path / "new" / "cache" / "numbers-abc"
+    files = contents(folder)
+    assert files.pop("transforms_test.json") == json.dumps(
+        {"camera_angle_x": 0.5, "camera_near": 1.0, "frames": [{"file_path": "./test/4", "other": 4}]}, indent=1
+    )
+    assert [frame["other"] for frame in json.loads(files.pop("transforms_train.json"))["frames"]] == [1, 2, 3]
+    expected = {f"{split}/{v}{end}": f"{v}{end} {2**v}" for split, v in (("train", 1), ("train", 2), ("train", 3), ("test", 4)) for end in (".txt", "_again.txt")}  # fmt: skip
+    assert files == expected
+    if os.name != "nt":
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o755
+
+
+def test_what_is_complete_is_not_drawn_again_and_what_is_not_is(tmp_path: Path) -> None:
+    folder = numbers().generate(tmp_path, quiet)
+    whole = contents(folder)
+
+    def never(*_: object) -> Any:
+        raise AssertionError("drawn again")
+
+    assert numbers(build=never, frame=never, draw=never).generate(tmp_path, never) == folder
+    for gone in ("transforms_test.json", "train/2_again.txt"):
+        (folder / gone).unlink()
+        with pytest.raises(AssertionError, match="drawn again"):
+            numbers(build=never).generate(tmp_path, quiet)
+        assert numbers().generate(tmp_path, quiet) == folder and contents(folder) == whole
+    assert os.listdir(tmp_path) == ["numbers-abc"]
+
+
+@pytest.mark.parametrize(("engine", "more"), [("embree", ""), ("bvh", " (without embreex, which would be faster)")])
+def test_what_is_said_meanwhile(engine: str, more: str, tmp_path: Path) -> None:
+    said: list[tuple[str, float]] = []
+    numbers(engine).generate(tmp_path, lambda text, fraction: said.append((text, fraction)))
+    assert said[0] == ("numbers: building the scene", 0.0)
+    assert said[1:] == [(f"numbers: drawing 7x7 images{more}", (i + 1) / 4) for i in range(4)]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError])
+def test_what_ends_early_leaves_nothing(error: type[BaseException], tmp_path: Path) -> None:
+    def draw(scene: Any, view: int, paths: Sequence[Path]) -> None:
+        paths[0].touch()
+        if view == 2:
+            raise error
+
+    with pytest.raises(error):
+        numbers(draw=draw).generate(tmp_path, quiet)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match=r"^scene numbers: cannot write the generated images to .*numbers-abc: "):
+        numbers().generate(tmp_path / "file", quiet)
+    with pytest.raises(DataError, match=r"^sand to .*heap: "):
+        cached_folder(tmp_path / "file" / "heap", ["a"], lambda folder: None, "sand")
+
+
+def test_names_in_caches_that_exist_stay() -> None:
+    """Whoever has drawn the scenes already does not draw them again."""
+    assert (SolidsSettings().key(), LitSettings().key()) == ("40df9acdfa7cb07b", "53c33d7cccb60600")
+    assert SolidsSettings(size=32, train_views=3).key() == "7cf4e6f3c6a332eb"
+
+
+# ---------------------------------------------------------------- threads
+
+
+def test_pieces_run_side_by_side_and_are_counted_in_order() -> None:
+    together = threading.Barrier(2)
+    fractions: list[float] = []
+
+    def work(job: int) -> None:
+        if (os.cpu_count() or 1) > 1:
+            together.wait(20)  # breaks unless another one runs meanwhile
+
+    side_by_side(work, range(4), fractions.append)
+    assert fractions == [0.25, 0.5, 0.75, 1.0] and THREADS > 1
+
+
+def test_a_failure_cancels_what_has_not_begun() -> None:
+    done = []
+
+    def work(job: int) -> None:
+        if job == 0:
+            raise ValueError("first")
+        threading.Event().wait(0.05)
+        done.append(job)
+
+    with pytest.raises(ValueError, match="first"):
+        side_by_side(work, range(200), lambda fraction: None)
+    assert len(done) < 100
+
+
+# ---------------------------------------------------------------- poses
+
+
+@pytest.mark.parametrize("eye", [(3.0, 0.0, 0.0), (1.0, -2.0, 0.5), (0.0, 0.0, 4.0), (0.0, 0.0, -4.0)])
+def test_a_camera_looks_at_the_origin_with_z_up(eye: tuple[float, float, float]) -> None:
+    pose = camera_to_world(np.array(eye))
+    right, up, back = pose[:3, :3].T
+    np.testing.assert_allclose(pose[:3, 3], eye, atol=1e-12)
+    np.testing.assert_allclose(back, np.array(eye) / np.linalg.norm(eye), atol=1e-12)
+    np.testing.assert_allclose(np.cross(right, up), back, atol=1e-12)
+    assert abs(right[2]) < 1e-12 and up[2] > -1e-12 and pose[3].tolist() == [0, 0, 0, 1]
+
+
+@pytest.mark.parametrize("cosine", [-1.0, -0.2, 0.0, 0.7, 1.0, 1.0 + 1e-15])
+def test_directions_are_unit_vectors(cosine: float) -> None:
+    for azimuth in (-1.1, 0.0, 2.0):
+        d = direction(cosine, azimuth)
+        assert d.shape == (3,) and np.linalg.norm(d) == pytest.approx(1.0) and d[2] == cosine
+        if abs(cosine) < 1:
+            assert np.arctan2(d[1], d[0]) == pytest.approx(azimuth)

@@ -14,7 +14,7 @@ from tests import scenes
 from tests.backends import FAST
 from tests.numerics.cases import CASES, case
 from tests.numerics.compare import assert_same_frame
-from tests.numerics.test_fuzz import render_block
+from tests.numerics.wild import render_block
 
 EDGES = (1, 2)
 

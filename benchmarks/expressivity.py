@@ -27,8 +27,8 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 
 import torch
-from static_quality import cpu_name, spread
-from tables import between_markers
+from shared.machine import cpu_name
+from shared.tables import between_markers, spread
 
 from neuprim.config import compose
 from neuprim.core.checkpoint import save_model

@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import time
 
-from tables import ROOT, Table, between_markers
+from shared.tables import ROOT, Table, between_markers
 
 from neuprim.core.data.views import ImageViews
 from neuprim.core.io.files import cache_directory

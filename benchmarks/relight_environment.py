@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tables import ROOT, Table, between_markers
+from shared.tables import ROOT, Table, between_markers
 from torch import Tensor
 
 from neuprim.core.cameras import Camera

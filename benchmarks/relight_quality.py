@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from static_quality import cpu_name, spread
-from tables import README, ROOT, between_markers
+from shared.machine import cpu_name
+from shared.tables import README, ROOT, between_markers, spread
 
 from neuprim.config import compose
 from neuprim.core.compute.threads import core_count

@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from render import lower, random_scene, view
-from static_quality import cpu_name
-from tables import PERFORMANCE, Table, between_markers
+from shared.machine import cpu_name
+from shared.scenes import lower, random_scene, view
+from shared.tables import PERFORMANCE, Table, between_markers
 
 from neuprim.core.compute.threads import core_count
 from neuprim.core.model.primitives import Lowered

@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from render import fastest, lower, random_scene, view
-from tables import PERFORMANCE, Table, between_markers
+from shared.scenes import lower, random_scene, view
+from shared.tables import PERFORMANCE, Table, between_markers
+from shared.timing import fastest
 from torch import Tensor
 
 from neuprim.core.cameras import Camera

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import statistics
 import subprocess
 import sys
@@ -21,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from PIL import Image
-from tables import README, ROOT, between_markers
+from shared.machine import cpu_name
+from shared.tables import README, ROOT, between_markers, spread
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "static_quality.json"
@@ -39,25 +39,11 @@ def one_run(scene: Path, primitives: int, seconds: int, neurons: int, seed: int)
         return json.loads((out / "metrics.json").read_text())  # type: ignore[no-any-return]
 
 
-def cpu_name() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
-
-
 def image_size(scene: Path) -> int:
     """Width of the test images in pixels."""
     frame = json.loads((scene / "transforms_test.json").read_text())["frames"][0]
     with Image.open(scene / f"{frame['file_path']}.png") as image:
         return image.width
-
-
-def spread(values: list[float], digits: int) -> str:
-    half = (max(values) - min(values)) / 2
-    return f"{statistics.mean(values):.{digits}f}" + (f" ± {half:.{digits}f}" if len(values) > 1 else "")
 
 
 def table(results: dict[str, Any]) -> str:

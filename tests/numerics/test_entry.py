@@ -190,5 +190,5 @@ def test_coincident_primitives_keep_their_index_order(sort: str) -> None:
 
 
 def test_settings_that_do_not_exist_are_named() -> None:
-    with pytest.raises(ConfigError, match=r"renderer\.sort='depth': expected center or entry"):
+    with pytest.raises(ConfigError, match=r"renderer\.sort=depth: expected center or entry"):
         RenderSettings(sort="depth")  # type: ignore[arg-type]

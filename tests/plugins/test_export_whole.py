@@ -110,7 +110,7 @@ def test_the_default_place_is_in_the_run(tmp_path: Path) -> None:
         ("mesh", ("grid=many",), "expected a whole number"),
         ("vdb", ("grid=8.5",), "whole number"),
         ("vdb", ("half=1",), "true or false"),
-        ("vdb", ("units=metres",), "source or world"),
+        ("vdb", ("units=metres",), "units=metres: expected auto, source, world or scene"),
     ],
 )
 def test_wrong_words_are_refused(run_dir: Path, tmp_path: Path, form: str, words: tuple[str, ...], reason: str) -> None:

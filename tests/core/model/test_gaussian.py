@@ -275,5 +275,5 @@ def test_rates_are_still_checked(tmp_path: Path) -> None:
     ]
     with pytest.raises(ConfigError, match=r"train\.rates\.log_amplitud: no such parameter; did you mean 'log_amplitude'"):
         running.run(compose(words))
-    with pytest.raises(ConfigError, match=r"model\.density\.form='gausian': expected cosine or gaussian"):
+    with pytest.raises(ConfigError, match=r"model\.density\.form=gausian: expected cosine or gaussian"):
         compose(["model.density.form=gausian"])

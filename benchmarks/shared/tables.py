@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import statistics
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 PERFORMANCE = ROOT / "docs" / "performance.md"
 
@@ -31,3 +32,9 @@ class Table:
 
     def __str__(self) -> str:
         return "\n".join(self.lines)
+
+
+def spread(values: list[float], digits: int) -> str:
+    """Mean ± half the spread."""
+    half = (max(values) - min(values)) / 2
+    return f"{statistics.mean(values):.{digits}f}" + (f" ± {half:.{digits}f}" if len(values) > 1 else "")

@@ -1,0 +1,1 @@
+"""What several benchmarks need: this machine's name, timing in turns, tables, random scenes."""

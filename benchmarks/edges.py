@@ -15,9 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from render import fastest, lower, ours, random_scene, view
-from static_quality import cpu_name
-from tables import PERFORMANCE, Table, between_markers
+from render import ours
+from shared.machine import cpu_name
+from shared.scenes import lower, random_scene, view
+from shared.tables import PERFORMANCE, Table, between_markers
+from shared.timing import fastest
 
 from neuprim.core.model.edge import EDGES, NORMS
 from neuprim.core.model.fields import Cosine

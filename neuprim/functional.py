@@ -200,6 +200,8 @@ def _check_primitives(t: dict[str, Tensor], omega0: float, edge: int) -> tuple[i
     n, colors = sizes["N"][0], tuple(t["colors"].shape)
     if "log_gain" in t and tuple(t["log_gain"].shape) not in ((n, 1), (n,)):
         raise _wrong("log_gain", f"shape {tuple(t['log_gain'].shape)}", f"({n}, 1) or ({n},), as means has N={n}")
+    if "log_gain" in t and not bool((finite := torch.isfinite(t["log_gain"].detach()).reshape(-1)).all()):
+        raise NonFiniteError(f"rasterize: log_gain of primitive {int((~finite).nonzero()[0])} is not finite")
     if len(colors) not in (2, 3) or colors[-2] != n or colors[-1] < 1:
         raise _wrong("colors", f"shape {colors}", f"(N, channels) or (C, N, channels) with N={n} as in means and channels >= 1")
     for name, row, numbers in _non_finite(t):

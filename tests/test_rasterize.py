@@ -66,6 +66,21 @@ def test_b2_may_be_flat_and_omega0_scales_the_phase(backend: str) -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_edges_and_gains_are_those_of_a_model(backend: str) -> None:
+    a = arguments()
+    log_gain = torch.linspace(-1, 1, 30)[:, None].requires_grad_()
+    hard = neuprim.rasterize(**a, backend=backend).rgb
+    for edge in (1, 2):
+        soft = neuprim.rasterize(**a, edge=edge, log_gain=log_gain, backend=backend)
+        by_hand = {**a, "w2": a["w2"] * log_gain.exp(), "b2": a["b2"] * log_gain.exp()}
+        assert torch.equal(neuprim.rasterize(**by_hand, edge=edge, backend=backend).rgb, soft.rgb)
+        assert torch.equal(neuprim.rasterize(**a, edge=edge, log_gain=log_gain[:, 0], backend=backend).rgb, soft.rgb)
+        assert not torch.allclose(soft.rgb, hard, atol=1e-2)
+        (grad,) = torch.autograd.grad(soft.rgb.sum(), log_gain)
+        assert float(grad.abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_colours_of_each_camera(backend: str) -> None:
     a = arguments()
     per_camera = torch.stack([a["colors"], 1 - a["colors"], 0.5 * a["colors"]]).requires_grad_()
@@ -211,6 +226,9 @@ BAD: dict[str, tuple[Any, type[NeuprimError], str]] = {
     "width": (put("width", 0), DataError, r"width has value 0; expected a positive int"),
     "height": (put("height", 30.0), DataError, r"height has value 30\.0; expected a positive int"),
     "omega0": (put("omega0", float("inf")), DataError, r"omega0 has value inf; expected a finite number"),
+    "edge": (put("edge", 3), DataError, r"edge has value 3; expected 0, 1 or 2"),
+    "log_gain": (put("log_gain", torch.zeros(29)), DataError, r"log_gain has shape \(29,\); expected \(30, 1\) or \(30,\)"),
+    "log_gain nan": (put("log_gain", torch.full((30,), NAN)), NonFiniteError, r"log_gain of primitive 0 is not finite"),
     "backgrounds": (put("backgrounds", torch.ones(2, 3)), DataError, r"backgrounds has shape \(2, 3\); expected \(3,\) or \(3, 3\)"),
     "backgrounds nan": (put("backgrounds", torch.full((3,), NAN)), NonFiniteError, r"backgrounds is not finite"),
     "setting": (put("alpha_mim", 0.1), ConfigError, r"unknown setting 'alpha_mim'; did you mean 'alpha_min'"),

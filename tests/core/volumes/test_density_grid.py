@@ -21,10 +21,10 @@ from tests import scenes
 SHAPE = (13, 9, 11)
 
 
-def model(neurons: int = 5) -> Primitives:
+def model(neurons: int = 5, edge: int = 0) -> Primitives:
     t = scenes.tensors(40, neurons, seed=2)
     return Primitives(
-        CosineDensity(neurons), SphericalHarmonics(0), {**{k: v for k, v in t.items() if k != "colors"}, "sh_dc": t["colors"]}
+        CosineDensity(neurons, edge=edge), SphericalHarmonics(0), {**{k: v for k, v in t.items() if k != "colors"}, "sh_dc": t["colors"]}
     )
 
 
@@ -48,16 +48,17 @@ def test_the_oracle_is_the_sum_over_primitives_one_by_one() -> None:
     assert torch.allclose(density_at(m, {}, points), total, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("edge", [0, 1, 2])
 @pytest.mark.parametrize("sheared", [False, True])
-def test_it_equals_the_sum_of_clamped_densities(sheared: bool) -> None:
-    m = model()
+def test_it_equals_the_sum_of_clamped_densities(sheared: bool, edge: int) -> None:
+    m = model(edge=edge)
     matrix = torch.eye(4, dtype=torch.float64) * 0.15
     matrix[:3, 3] = torch.tensor([-0.9, -0.6, -0.8])
     matrix[3, 3] = 1
     if sheared:
         matrix[0, 1], matrix[2, 0] = 0.07, -0.05
     expected = oracle(m, matrix)
-    assert float(expected.max()) > 0.5
+    assert float(expected.max()) > 0.5 and (edge == 0) == torch.equal(expected, oracle(model(), matrix))
     found = density_grid(m, {}, matrix, SHAPE)
     assert torch.allclose(found.double(), expected, rtol=1e-5, atol=1e-5)
 

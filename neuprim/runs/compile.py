@@ -16,13 +16,18 @@ import torch
 
 from neuprim.core.compute.kernels import cache_directory
 
-__all__ = ["Compiling", "compiled", "compiling", "main", "mark_compiled"]
+__all__ = ["Compiling", "compiled", "compiling", "main", "mark_compiled", "variant"]
 
 _LIMIT = 600.0  # seconds after which the run goes on alone
 
 
-def compiled(backend: str, form: str = "Constant") -> bool:
-    """Whether the kernels with which a backend draws this form of colour (the name of its class) are on disk."""
+def variant(colour: str, edge: int) -> str:
+    """Name of the kernels that draw a form of colour (the name of its class) with an edge of density."""
+    return f"{colour}-{edge}"
+
+
+def compiled(backend: str, form: str) -> bool:
+    """Whether the kernels with which a backend draws a :func:`variant` are on disk."""
     return _marker(backend, form).exists()
 
 
@@ -65,12 +70,12 @@ class Compiling:
 
 
 @contextmanager
-def compiling(backend: str | None) -> Iterator[Compiling]:
-    """Start compiling this backend, None for none, unless that has been done; the process never outlives the block."""
+def compiling(backend: str | None, edge: int = 0) -> Iterator[Compiling]:
+    """Start compiling this backend for densities of an edge, None for none, unless that has been done; the process never outlives the block."""
     process = None
-    if backend is not None and not compiled(backend) and sys.executable:
-        quiet = subprocess.DEVNULL
-        process = subprocess.Popen([sys.executable, "-m", "neuprim.runs.compile", backend], stdin=quiet, stdout=quiet, stderr=quiet)
+    if backend is not None and not compiled(backend, variant("Constant", edge)) and sys.executable:
+        quiet, words = subprocess.DEVNULL, [sys.executable, "-m", "neuprim.runs.compile", backend, str(edge)]
+        process = subprocess.Popen(words, stdin=quiet, stdout=quiet, stderr=quiet)
     started = Compiling(process)
     try:
         yield started
@@ -78,7 +83,7 @@ def compiling(backend: str | None) -> Iterator[Compiling]:
         started.stop()
 
 
-def main(backend: str) -> None:
+def main(backend: str, edge: int = 0) -> None:
     """A training step on a few primitives drawn by this backend: forward, backward, colours, loss, optimiser."""
     from neuprim.core.cameras import Camera, look_at
     from neuprim.core.data import View
@@ -97,7 +102,7 @@ def main(backend: str) -> None:
     generator = torch.Generator().manual_seed(0)
     means = torch.rand((8, 3), generator=generator) - 0.5
     context = InitContext(means, torch.full((8,), 0.3), torch.full((8, 3), 0.5), generator)
-    density = CosineDensity()
+    density = CosineDensity(edge=edge)
     dc = ParameterSpec("dc", (3,), 1e-3, lambda c: torch.zeros(c.count, 3))
     specs = [*GEOMETRY_SPECS, *density.parameters(), dc, ParameterSpec("rest", (15, 3), 1e-3, lambda c: torch.zeros(c.count, 15, 3))]
     params = {spec.name: spec.init(context).float().contiguous().requires_grad_() for spec in specs}
@@ -110,8 +115,8 @@ def main(backend: str) -> None:
     loss, _ = photometric({"ssim_weight": 0.2})(output.rgb, torch.zeros_like(output.rgb), Supervision(View("warm", camera)))
     loss.backward()
     RowAdam(specs, params).step(params, {spec.name: 1e-3 for spec in specs})
-    mark_compiled(backend, "Constant")
+    mark_compiled(backend, variant("Constant", edge))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(sys.argv[1], int(sys.argv[2]))

@@ -16,10 +16,11 @@ from neuprim.config import RunConfig, suspects_of
 from neuprim.core import checkpoint
 from neuprim.core.errors import CheckpointError
 from neuprim.core.io.files import write_text
+from neuprim.core.model.edge import EDGES
 from neuprim.core.render.backends import choose, compiled_ahead
 from neuprim.plugins.judging import facts_of
 from neuprim.plugins.provenance import check_resumed
-from neuprim.runs.compile import compiled, compiling, mark_compiled
+from neuprim.runs.compile import compiled, compiling, mark_compiled, variant
 from neuprim.runs.curve import open_curve
 from neuprim.runs.events import Events, Finishing, Note, Preparing, silent
 from neuprim.runs.finish import finish
@@ -45,7 +46,8 @@ def run(config: RunConfig, events: Events = silent) -> Path:
     directory = config.output_dir
     suspects = suspects_of(config)
     ahead = compiled_ahead(config.renderer)
-    with compiling(None if ahead is None else ahead.name) as kernels, suspects.watch(directory / LOGS):
+    edge = config.model.density.get("edge", 0)  # of a density of ours; of another's, whatever the word means there
+    with compiling(None if ahead is None else ahead.name, edge if edge in EDGES else 0) as kernels, suspects.watch(directory / LOGS):
         fitted = start(config, events, suspects=suspects)
         _resume(fitted, events)
         directory.mkdir(parents=True, exist_ok=True)
@@ -78,7 +80,7 @@ def _train(fitted: Fitted, events: Events) -> bool:
     trainer, config = fitted.trainer, fitted.config
     view = fitted.dataset.train.view(0)
     lowered = trainer.model.lower(view.camera, view.conditions, trainer.renderer)
-    form = type(lowered.colour).__name__
+    form = variant(type(lowered.colour).__name__, lowered.density.edge)
     backend = choose(lowered, trainer.renderer, view.camera)
     if backend.compiles and not compiled(backend.name, form):
         events(Preparing(_COMPILING))

@@ -23,9 +23,17 @@ def test_what_is_compiled_is_what_training_needs() -> None:
     assert missing == []
 
 
+@pytest.mark.parametrize(("edge", "key"), [(0, "Tuple(())"), (2, "UniTuple(int64, 2)")])
+def test_only_the_edge_that_a_run_draws_is_compiled(edge: int, key: str) -> None:
+    found = kernels.compiled_by(f"from neuprim.runs import compile; compile.main('cpu', {edge})")
+    tiles = [types for name, types in found.items() if name.endswith(("forward.composite_tiles", "backward.backward_tiles"))]
+    assert len(tiles) == 2 and all(len(types) == 1 and types[0].endswith(f"{key})") for types in tiles)
+
+
 def test_it_says_so_once_it_is_done(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(ahead, "cache_directory", lambda: tmp_path / "kernels")
-    assert not ahead.compiled("cpu")
+    constant = ahead.variant("Constant", 0)
+    assert not ahead.compiled("cpu", constant)
 
     def interrupted(*args: object) -> None:
         raise KeyboardInterrupt
@@ -34,27 +42,28 @@ def test_it_says_so_once_it_is_done(monkeypatch: pytest.MonkeyPatch, tmp_path: P
         patch.setattr(optimizer.RowAdam, "step", interrupted)  # the last that it compiles
         with pytest.raises(KeyboardInterrupt):
             ahead.main("cpu")
-    assert not ahead.compiled("cpu"), "a run must not wait for less than all"
+    assert not ahead.compiled("cpu", constant), "a run must not wait for less than all"
     ahead.main("cpu")
-    assert ahead.compiled("cpu") and not ahead.compiled("cpu", "RayNet") and not ahead.compiled("reference")
+    others = [("cpu", ahead.variant("RayNet", 0)), ("cpu", ahead.variant("Constant", 2)), ("reference", constant)]
+    assert ahead.compiled("cpu", constant) and not any(ahead.compiled(*other) for other in others)
     monkeypatch.setattr(ahead, "cache_directory", lambda: tmp_path / "other sources")
-    assert not ahead.compiled("cpu")
+    assert not ahead.compiled("cpu", constant)
 
 
 def test_nothing_is_started_where_there_is_nothing_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ahead.subprocess, "Popen", lambda *a, **k: pytest.fail("a process was started"))
-    monkeypatch.setattr(ahead, "compiled", lambda backend: True)
+    monkeypatch.setattr(ahead, "compiled", lambda *a: True)
     with ahead.compiling("cpu") as started:
         assert not started.running
         started.wait()
-    monkeypatch.setattr(ahead, "compiled", lambda backend: False)
+    monkeypatch.setattr(ahead, "compiled", lambda *a: False)
     with ahead.compiling(None) as started:
         assert not started.running
 
 
 def test_the_process_ends_with_the_block(monkeypatch: pytest.MonkeyPatch) -> None:
     genuine = ahead.subprocess.Popen
-    monkeypatch.setattr(ahead, "compiled", lambda backend: False)
+    monkeypatch.setattr(ahead, "compiled", lambda *a: False)
     monkeypatch.setattr(ahead.subprocess, "Popen", lambda *a, **k: genuine([sys.executable, "-c", "import time; time.sleep(60)"]))
     before = time.monotonic()
     with ahead.compiling("cpu") as started:

@@ -23,7 +23,7 @@ EDGES = (0, 1, 2)
 """Exponents p that there are."""
 
 NORMS = (2.0, 4 / 3, 16 / 15)
-"""N_p: the integral of (1 - u^2)^p over [-1, 1]."""
+"""N_p: the integral of (1 - u^2)^p over [-1, 1]. numba freezes them into kernels."""
 
 _SERIES_BELOW, _TERMS = 2.0, 14  # upward recursion loses digits as z^-n; the series' last term is below 1e-17 of the first
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from neuprim.core.checked import choose
 from neuprim.core.data import Dataset
+from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import ColourField, DensityField
@@ -26,6 +27,9 @@ def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, Co
 
 def _check(model: Mapping[str, Any]) -> None:
     choose(model["density"], "model.density", {"form": ("cosine", "gaussian"), **DENSITY_OPTIONS})
+    others = [key for key in model["density"] if key != "form"]
+    if model["density"].get("form") == "gaussian" and others:
+        raise ConfigError(f"model.density.{others[0]}: of densities of the form cosine; expected none with model.density.form=gaussian")
     choose(model["colour"], "model.colour", {})
 
 

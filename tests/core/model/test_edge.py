@@ -10,7 +10,8 @@ import torch
 from scipy import integrate, special
 from torch import Tensor
 
-from neuprim.core.errors import FormError
+from neuprim.config import compose
+from neuprim.core.errors import ConfigError, FormError
 from neuprim.core.model.densities.cosine import CosineDensity, amplified, cosine_density, mass
 from neuprim.core.model.edge import EDGES, NORMS, ball_integral, chord_integral, fade, profile, spherical_bessel
 from neuprim.core.model.fields import Cosine
@@ -148,6 +149,24 @@ def test_the_edge_is_0_1_or_2(wrong: object) -> None:
         CosineDensity(8, edge=wrong)  # type: ignore[arg-type]
     t = scenes.tensors(2, 1)
     assert "; expected 0, 1 or 2" in str(Cosine(t["W1"], t["b1"], t["w2"], t["b2"], 30.0, wrong).fault({}))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["task=static", "model.density.edge=3"], "model.density.edge=3: expected 0, 1 or 2"),
+        (["task=relight", "model.density.edg=1"], "model.density.edg: no such setting; did you mean 'model.density.edge'?"),
+        (["task=dynamic", "model.density.omega0=-1"], "model.density.omega0=-1: expected a number above 0"),
+        (["task=static", "model.density.gain=2"], "model.density.gain=2: expected true or false"),
+        (
+            ["task=static", "model.density.form=gaussian", "model.density.edge=1"],
+            "model.density.edge: of densities of the form cosine; .*gaussian",
+        ),
+    ],
+)
+def test_wrong_words_are_refused_before_data_load(words: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{message}"):
+        compose(words, check_output=False)
 
 
 def test_sums_keep_their_edge() -> None:

@@ -17,7 +17,7 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["EDGES", "NORMS", "ball_integral", "chord_integral", "fade", "legendre", "profile", "sinc", "spherical_bessel"]
+__all__ = ["EDGES", "NORMS", "chord_integral", "fade", "legendre", "profile", "sinc", "spherical_bessel"]
 
 EDGES = (0, 1, 2)
 """Exponents p that there are."""
@@ -102,11 +102,3 @@ def profile(z: Tensor, order: int) -> Tensor:
     safe = torch.where(small, torch.ones_like(z), z)
     series = 1 - z.square() / (2 * (2 * order + 3))
     return torch.where(small, series, math.prod(range(1, 2 * order + 2, 2)) * spherical_bessel(safe, order)[order] / safe**order)
-
-
-def ball_integral(omega: Tensor, edge: int) -> Tensor:
-    """Integral of (1 - |y|^2)^p cos(omega . y) over the unit ball, |omega| given: V_p B_(p+1)(|omega|), differentiable.
-
-    In three dimensions the profile is one order smoother than along a chord; V_p = pi^(3/2) p!/Gamma(p + 5/2).
-    """
-    return math.pi**1.5 * math.gamma(edge + 1) / math.gamma(edge + 2.5) * profile(omega, edge + 1)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import torch
-from scipy import integrate, special
+from scipy import special
 from torch import Tensor
 
 from neuprim.config import compose
 from neuprim.core.errors import ConfigError, FormError
-from neuprim.core.model.densities.cosine import CosineDensity, amplified, cosine_density, mass
-from neuprim.core.model.edge import EDGES, NORMS, ball_integral, chord_integral, fade, profile, spherical_bessel
+from neuprim.core.model.densities.cosine import CosineDensity, amplified, cosine_density
+from neuprim.core.model.edge import EDGES, NORMS, chord_integral, fade, profile, spherical_bessel
 from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pairs import Pairs
@@ -74,33 +72,6 @@ def test_gradients_of_a_part_of_a_chord() -> None:
         assert torch.autograd.gradcheck(
             lambda a, b, c, *more, p=edge: chord_integral((a, b, c), p, *more), (*parts, *rest), atol=1e-7, rtol=1e-5
         )
-
-
-@pytest.mark.parametrize("edge", EDGES)
-def test_integrals_over_the_ball(edge: int) -> None:
-    for omega in (0.0, 1e-5, 0.5, 2.0, 9.0, 60.0):
-        # around the axis of omega: 2 pi r sin(theta) with cos(theta) integrated in closed form
-        exact = integrate.quad(lambda r: 4 * math.pi * r * r * (1 - r * r) ** edge * np.sinc(omega * r / math.pi), 0, 1, limit=200)[0]  # noqa: B023
-        assert float(ball_integral(torch.tensor(omega, dtype=F64), edge)) == pytest.approx(exact, abs=1e-10)
-
-
-@pytest.mark.parametrize("edge", EDGES)
-def test_mass_is_the_integral_of_sigma(edge: int) -> None:
-    t = scenes.tensors(6, 3, seed=4, dtype=F64)
-    geometry, form = Geometry(t["means"], t["log_scales"], t["quats"]), Cosine(t["W1"], t["b1"], t["w2"], t["b2"], 9.0, edge)
-    x, w = np.polynomial.legendre.leggauss(60)
-    grid, weight = (
-        torch.from_numpy(np.stack(np.meshgrid(x, x, x), -1).reshape(-1, 3)),
-        torch.from_numpy(np.einsum("i,j,k", w, w, w).ravel()),
-    )
-    inside = grid.square().sum(-1) < 1
-    grid, weight = grid[inside], weight[inside]
-    for n in range(6):
-        points = geometry.means[n] + (grid * geometry.scales[n]) @ geometry.rotations[n].T
-        sigma = cosine_density(form, geometry, torch.full((len(grid),), n), points)
-        exact = (sigma * weight).sum() * geometry.scales[n].prod()
-        largest = (sigma.abs() * weight).sum() * geometry.scales[n].prod()
-        assert abs(float(mass(form, geometry)[n] - exact)) <= (2e-2, 2e-3, 5e-4)[edge] * float(largest)  # a cut lattice: worst at p = 0
 
 
 @pytest.mark.parametrize("edge", EDGES)

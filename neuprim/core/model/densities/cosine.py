@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from neuprim.core.checked import Range
-from neuprim.core.model.edge import EDGES, NORMS, ball_integral, fade
+from neuprim.core.model.edge import EDGES, NORMS, fade
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.tensors import number_fault
 
-__all__ = ["DENSITY_OPTIONS", "OMEGA0", "CosineDensity", "amplified", "cosine_density", "mass", "split_cosine", "split_scale"]
+__all__ = ["DENSITY_OPTIONS", "OMEGA0", "CosineDensity", "amplified", "cosine_density", "split_cosine", "split_scale"]
 
 OMEGA0 = 30.0
 """SIREN boost: multiplies the whole phase."""
@@ -132,16 +132,6 @@ def cosine_density(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) ->
         return sigma
     whitened = (geometry.rotations[prim].transpose(1, 2) @ local[:, :, None])[..., 0] * (m[:, None] / geometry.scales[prim])
     return sigma * fade(whitened.square().sum(-1), form.edge)
-
-
-def mass(form: Cosine, geometry: Geometry) -> Tensor:
-    """(N,) float64 integrals of sigma over space, unclamped; scene units squared."""
-    log_m = geometry.log_length_scale.double()
-    axes = geometry.rotations.double() * (geometry.log_scales.double() - log_m[:, None]).exp()[:, None, :]  # whitened -> local
-    omega = form.omega0 * (form.W1.double() @ axes).norm(dim=-1)
-    waves = (form.w2.double() * (form.omega0 * form.b1.double()).cos() * ball_integral(omega, form.edge)).sum(-1)
-    one = ball_integral(torch.zeros(1, dtype=torch.float64), form.edge)
-    return (geometry.log_scales.double().sum(-1) - log_m).exp() * (form.b2.double().reshape(-1) * one + waves)
 
 
 def split_scale(old: Geometry, new: Geometry, edge: int = 0) -> Tensor:

@@ -1,7 +1,8 @@
 """How well Gaussians become primitives, and primitives Gaussians, for each edge.
 
-    python benchmarks/gaussians.py [RUN_DIR ...] [--parts import export] [--edges 0 1 2] [--iterations 600] [--docs]
+    python benchmarks/gaussians.py [RUN_DIR ...] [--parts rule import export] [--edges 0 1 2] [--iterations 600] [--docs]
 
+    rule     the support and the depth that a Gaussian gets, and how far its footprint and a primitive's are apart, both ways
     import   a cloud of random Gaussians, drawn as the 3DGS rasteriser draws them and exactly, as densities in space, against the primitives
              (K = 0) that a PLY file of it starts a model from; by the former rule, semi-axes of sqrt 5 deviations, too
     export   trained models against their gaussian-ply, by its option `size`; given run directories, or the static task's `solids` trained for
@@ -18,6 +19,8 @@ import math
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,17 +31,19 @@ from neuprim.config import compose
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.metrics import psnr
 from neuprim.core.model.colours import sh
+from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.edge import EDGES, NORMS
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.footprint import gaussian_support
 from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.plugins.export.appearance import Harmonics
-from neuprim.plugins.export.gaussians import SIZES, Gaussians, draw_gaussians
+from neuprim.plugins.export.gaussians import SIZES, Gaussians, draw_gaussians, fit_gaussians
 from neuprim.runs.export import export_run
 from neuprim.runs.run import run
+from neuprim.tasks.static.fields import SphericalHarmonics
 
 PAGE = ROOT / "docs" / "export.md"
 REFERENCE = RenderSettings(backend="reference")
@@ -98,6 +103,50 @@ def imported(c: dict[str, Tensor], camera: Camera, edge: int, rule: str) -> Tens
     return render_lowered(Lowered(Geometry(c["means"], axes.log(), c["quats"]), form, Constant(c["colors"])), camera, REFERENCE).rgb.float()
 
 
+RADII = (torch.arange(4000, dtype=torch.float64) + 0.5) / 4000 * 6
+
+
+def remains(found: Tensor, wanted: Tensor) -> float:
+    """RMS over the screen of the difference of two round footprints, over the RMS of the second."""
+    return float((((found - wanted).square() * RADII).sum() / (wanted.square() * RADII).sum()).sqrt())
+
+
+def footprint(depth: float, support: float, edge: int) -> Tensor:
+    return -torch.expm1(-depth * (1 - (RADII / support).square()).clamp_min(0) ** (edge + 0.5))
+
+
+def rule_table(edges: Sequence[int]) -> str:
+    opacities = torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)
+    names = ", ".join(f"{o:g}" for o in opacities)
+    table = Table(
+        "edge",
+        f"c for o = {names}",
+        "τ/−log(1 − o)",
+        "RMS of the difference to the bell, of its own",
+        "a ball of depth 0.1 and 3: its bell's, by `profile`",
+    )
+    for edge in edges:
+        support, depth = gaussian_support(edge, opacities)
+        bells = [o * (-RADII.square() / 2).exp() for o in opacities]
+        apart = [remains(footprint(float(t), float(c), edge), bell) for t, c, bell in zip(depth, support, bells, strict=True)]
+        shares = depth / -torch.log1p(-opacities)
+        cells = [", ".join(f"{x:.2f}" for x in values) for values in (support, shares)]
+        percent = [", ".join(f"{100 * x:.0f} %" for x in values) for values in (apart, [ball(edge, 0.1), ball(edge, 3.0)])]
+        table.row(edge, *cells, *percent)
+    return str(table)
+
+
+def ball(edge: int, depth: float) -> float:
+    """How far the footprint of a ball of this depth and its Gaussian's are apart."""
+    density = CosineDensity(0, edge=edge)
+    params = {"means": torch.zeros(1, 3), "log_scales": torch.zeros(1, 3), "quats": torch.eye(4)[:1], "sh_dc": torch.zeros(1, 3)}
+    params |= {"W1": torch.zeros(1, 0, 3), "b1": torch.zeros(1, 0), "w2": torch.zeros(1, 0), "b2": torch.full((1, 1), depth / NORMS[edge])}
+    run: Any = SimpleNamespace(model=Primitives(density, SphericalHarmonics(0), params))
+    found = fit_gaussians(run, {}, "profile")
+    bell = float(found.opacities[0]) * (-RADII.square() / 2 / float(found.covariances[0, 0, 0])).exp()
+    return remains(bell, footprint(depth, 1.0, edge))
+
+
 def import_table(edges: Sequence[int]) -> str:
     table = Table("150 Gaussians", "drawn", "rule", *(f"edge {edge}" for edge in edges))
     for name, bounds in CLOUDS.items():
@@ -141,7 +190,7 @@ def export_table(runs: Sequence[tuple[str, Path]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, nargs="*")
-    parser.add_argument("--parts", nargs="*", default=["import", "export"])
+    parser.add_argument("--parts", nargs="*", default=["rule", "import", "export"])
     parser.add_argument("--edges", nargs="*", type=int, choices=EDGES, default=EDGES)
     parser.add_argument("--neurons", nargs="*", type=int, default=[8, 0])
     parser.add_argument("--iterations", type=int, default=600)
@@ -149,6 +198,8 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     tables = {}
+    if "rule" in args.parts:
+        tables["gaussians-rule"] = rule_table(args.edges)
     if "import" in args.parts:
         tables["gaussians-import"] = import_table(args.edges)
     if "export" in args.parts:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,7 +113,7 @@ def _fit(density, own, still: Geometry, moved: Geometry, conditions: Conditions,
     return moved.means.double() + (world @ mean[:, :, None])[..., 0], world @ spread @ world.transpose(1, 2), opacity, kept
 
 
-def _closest(screens: list[tuple[Tensor, ...]], areas: Tensor, bells: Tensor, ticks: Tensor) -> tuple[Tensor, Tensor]:
+def _closest(screens: Sequence[tuple[Tensor, ...]], areas: Tensor, bells: Tensor, ticks: Tensor) -> tuple[Tensor, Tensor]:
     """(n,) factors on the covariance and (n,) opacities of the bells closest to what three screens show, (alpha, covariance, mean, area) each.
 
     For each of some factors, the opacity is that with the same integral of alpha over the screens, at most 0.99; taken is the factor with the

@@ -15,6 +15,7 @@ from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.ply import read_ply, write_ply
 from neuprim.core.model.colours import sh
 from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.edge import EDGES, NORMS
 from neuprim.core.model.footprint import gaussian_support
 from neuprim.core.model.geometry import Geometry
@@ -86,6 +87,15 @@ def test_the_footprint_is_the_closest_of_those_that_hide_as_much(edge: int, volu
         assert float(depth[i]) == pytest.approx(float(exact), rel=5e-3)
         assert all(float(error) <= float(left(c[i] * f)[0]) * 1.001 for f in (0.9, 0.97, 1.03, 1.1))
     assert bool((c[0] > 1.9) & (c[0] < 2.9)), "well inside what is searched"
+
+
+def test_a_gaussian_density_starts_as_the_gaussians_are(tmp_path: Path) -> None:
+    settings = ModelSettings(primitives=50, init={"points": str(splats(tmp_path / "g.ply"))})
+    model = initial_model(GaussianDensity(3.0), SphericalHarmonics(1), tiny.two_primitives(), settings, 0)
+    assert torch.allclose(model.geometry.scales, 3 * torch.tensor([[0.1, 0.2, 0.3]]).expand(3, 3))
+    central = math.sqrt(2 * math.pi) / 3 * math.erf(3 / math.sqrt(2)) * 3 / (1 + 3 / 2 + 3)
+    alpha = 1 - torch.exp(-model.params["log_amplitude"].exp()[:, 0] * central)
+    assert torch.allclose(alpha, torch.tensor([0.5, 0.98, 0.02]), atol=1e-5)
 
 
 def test_gaussians_without_opacities_start_as_opaque_as_ever(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.neurons import field_values
 from neuprim.core.render.cpu.ray_colours import add_ray_colours, composite_rgb_ray_colours, ray_colours
-from neuprim.core.render.cpu.tiles import compact, row_spans
+from neuprim.core.render.cpu.tiles import aligned, compact, row_spans
 from neuprim.core.render.cpu.trigonometry import one_minus_exp
 
 __all__ = ["composite_tiles"]
@@ -81,9 +81,9 @@ def composite_tiles(  # type: ignore[no-untyped-def]
     scratch = L.FORWARD_SCRATCH
     if net is not None:
         scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
-        waves = np.zeros((net.hidden, L.NET_SCRATCH), np.float32)
-    S, D = np.zeros(scratch + 1024, np.float32), np.zeros(FLOAT64_SCRATCH, np.float64)
-    state = np.zeros((4 + C) * L.PIXELS + 2 * L.TILE, np.float32)
+        waves = aligned(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
+    S, D = aligned(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64)
+    state = aligned((4 + C) * L.PIXELS + 2 * L.TILE)
     w = np.zeros(L.TILE, np.float32)
     bounds, offset = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32)
     rows_live = np.zeros(L.TILE, np.float32)

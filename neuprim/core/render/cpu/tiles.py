@@ -12,13 +12,21 @@ from neuprim.core.compute.kernels import inline
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cpu import layout as L
 
-__all__ = ["chords", "compact", "row_spans"]
+__all__ = ["aligned", "chords", "compact", "row_spans"]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(L.TILE).astype(np.float32)
 _MEANS = tuple(f(n / 2) for n in NORMS)  # of (1 - u^2)^p over [-1, 1]
 _MARGIN, _ROUNDING = f(2e-3), f(4e-7)  # pixels, and per pixel of the ellipse; a lane too many is rejected by its own D
+
+
+@inline
+def aligned(floats):  # type: ignore[no-untyped-def]
+    """Zeros that begin a cache line: numba aligns to 32 bytes, and a vector of 64 that lies across two lines costs twice."""
+    room = np.zeros(floats + 16, np.float32)
+    shift = -(np.int64(room.ctypes.data) // 4) % 16
+    return room[shift : shift + floats]
 
 
 @inline

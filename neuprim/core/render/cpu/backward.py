@@ -175,16 +175,16 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             y0, y1 = max(boxes[i, 1] - ty, 0), min(boxes[i, 3] - ty, L.TILE)
             x0, x1 = max(boxes[i, 0] - tx, 0), min(boxes[i, 2] - tx, L.TILE)
             fx0, fy0 = f(tx) + f(0.5) - p[L.UX], f(ty) + f(0.5) - p[L.UY]
-            row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, bounds)
-            for y in range(y0, y1):
+            for y in range(L.TILE):
                 rows_live[y] = f(1) if reach[y] >= rank else f(0)
-            n = compact(S, state, offset, bounds, y0, y1, rows_live, fx0, fy0)
+            row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, rows_live, bounds)
+            n = compact(S, state, offset, bounds, y0, y1)
             out[:] = f(0)
             if n == 0:
                 continue
             n16 = ((n + 15) // 16) * 16
             evaluated += n16
-            field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, edge)
+            field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, edge)
             opacity(S, n16, amin, amax, edge)
             for k in range(n, n16):
                 S[L.GRAD + k] = f(0)

@@ -104,12 +104,12 @@ def composite_tiles(  # type: ignore[no-untyped-def]
             y0, y1 = max(boxes[i, 1] - ty, 0), min(boxes[i, 3] - ty, L.TILE)
             x0, x1 = max(boxes[i, 0] - tx, 0), min(boxes[i, 2] - tx, L.TILE)
             fx0, fy0 = f(tx) + f(0.5) - p[L.UX], f(ty) + f(0.5) - p[L.UY]
-            row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, bounds)
-            n = compact(S, state, offset, bounds, y0, y1, rows_live, fx0, fy0)
+            row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, rows_live, bounds)
+            n = compact(S, state, offset, bounds, y0, y1)
             if n > 0:
                 n16 = ((n + 15) // 16) * 16
                 evaluated += n16
-                field_values(S, D, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, with_depth, False, edge)
+                field_values(S, D, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, with_depth, False, edge)
                 _opacity(S, n16, amin, amax, edge)
                 if net is not None:
                     ray_colours(S, D, waves, n16, i, net, slots, colors[i], False)

@@ -20,7 +20,7 @@ from neuprim.core.render.cpu.ray_colours import (
     uncomposite_rgb_ray_colours,
     weigh_ray_colours,
 )
-from neuprim.core.render.cpu.tiles import aligned, compact, row_spans
+from neuprim.core.render.cpu.tiles import aligned, compact, fetch_ahead, row_spans
 from neuprim.core.render.cpu.trigonometry import one_minus_exp
 
 __all__ = ["backward_tiles", "opacity", "sum_rows"]
@@ -169,6 +169,8 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             pair_rows[q, :] = f(0)
         for back in range(deepest):
             q = first + deepest - 1 - back
+            if back + 1 < deepest:
+                fetch_ahead(np.int64(ids[q - 1]), rows, spans, boxes)
             i = ids[q]
             p, out = rows[i], pair_rows[q]
             rank = f(q - first + 1)

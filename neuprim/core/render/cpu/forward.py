@@ -9,7 +9,7 @@ from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.neurons import field_values
 from neuprim.core.render.cpu.ray_colours import add_ray_colours, composite_rgb_ray_colours, ray_colours
-from neuprim.core.render.cpu.tiles import aligned, compact, row_spans
+from neuprim.core.render.cpu.tiles import aligned, compact, fetch_ahead, row_spans
 from neuprim.core.render.cpu.trigonometry import one_minus_exp
 
 __all__ = ["composite_tiles"]
@@ -99,6 +99,8 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                 if tx + x < width and ty + y < height:
                     state[j + L.T_], state[j + L.NORM] = f(1), norms[ty + y, tx + x]
         for q in range(starts[t], starts[t + 1]):
+            if q + 1 < starts[t + 1]:
+                fetch_ahead(np.int64(ids[q + 1]), rows, spans, boxes)
             i = ids[q]
             p = rows[i]
             y0, y1 = max(boxes[i, 1] - ty, 0), min(boxes[i, 3] - ty, L.TILE)
@@ -109,7 +111,9 @@ def composite_tiles(  # type: ignore[no-untyped-def]
             if n > 0:
                 n16 = ((n + 15) // 16) * 16
                 evaluated += n16
-                field_values(S, D, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, with_depth, False, edge)
+                field_values(
+                    S, D, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, with_depth, False, edge
+                )
                 _opacity(S, n16, amin, amax, edge)
                 if net is not None:
                     ray_colours(S, D, waves, n16, i, net, slots, colors[i], False)

@@ -151,7 +151,7 @@ def _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turn
         biggest = max(biggest, speed, abs(np.float64(w2[i, k])))
         total += speed + turns * np.float64(b1[i, k]) + w2[i, k]
     for k in range(K):
-        at, speed = 0, waves[k, 3]  # counting the slower ones sorts without a branch; neurons as fast keep their order
+        at, speed = np.int64(0), waves[k, 3]  # counting the slower ones sorts without a branch; neurons as fast keep their order
         for j in range(K):
             at += np.int64((waves[j, 3] < speed) | ((waves[j, 3] == speed) & (j < k)))
         o, phase = L.NEURONS + L.PER_NEURON * at, turns * np.float64(b1[i, k])

@@ -6,13 +6,18 @@ chord and neurons over that list, scatter back row by row. Evaluated lanes then 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 from neuprim.core.compute.kernels import inline
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cpu import layout as L
 
-__all__ = ["aligned", "chords", "compact", "row_spans"]
+__all__ = ["aligned", "chords", "compact", "fetch_ahead", "row_spans"]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
@@ -27,6 +32,31 @@ def aligned(floats):  # type: ignore[no-untyped-def]
     room = np.zeros(floats + 16, np.float32)
     shift = -(np.int64(room.ctypes.data) // 4) % 16
     return room[shift : shift + floats]
+
+
+def _prefetch(context, address):  # type: ignore[no-untyped-def]
+    """Ask memory for the cache line at an address. Nothing is read, so that no address is wrong."""
+
+    def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        byte, i32 = ir.IntType(8).as_pointer(), ir.IntType(32)
+        function = builder.module.declare_intrinsic("llvm.prefetch", (byte,), ir.FunctionType(ir.VoidType(), [byte, i32, i32, i32]))
+        builder.call(function, [builder.inttoptr(arguments[0], byte), i32(0), i32(3), i32(1)])  # to read, to stay, data
+        return context.get_dummy_value()
+
+    return types.void(types.intp), code
+
+
+_ask: Any = intrinsic(_prefetch)
+
+
+@inline
+def fetch_ahead(i, rows, spans, boxes):  # type: ignore[no-untyped-def]
+    """Ask memory for what the pair after this one, of primitive ``i``, reads first: tiles meet primitives in no order that it could guess."""
+    row = rows.ctypes.data + i * rows.strides[0]
+    for at in range(0, rows.strides[0], 64):
+        _ask(row + at)
+    _ask(spans.ctypes.data + i * spans.strides[0])
+    _ask(boxes.ctypes.data + i * boxes.strides[0])
 
 
 @inline

@@ -18,6 +18,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io import images
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.source import placement_of
+from neuprim.tasks.dynamic.volume.voxels import FrameVoxels
 
 __all__ = ["MEMORY", "MEMORY_TEST", "FrameViews", "Recording", "volume_dataset"]
 
@@ -173,6 +174,7 @@ def volume_dataset(
         bounds=torch.from_numpy(capture.bounds),
         exposure=exposure,
         placement=placement_of(capture),
+        points=FrameVoxels(capture, folder, train.frames, train.times, exposure),
         extra=recording,
     )
 

@@ -40,7 +40,9 @@ class PointStep:
         return Tally(self.shares.weight, self.shares.error_weight, self.rows)
 
 
-def point_step(model: Primitives, supervision: PointSupervision, settings: TrainSettings, generator: torch.Generator) -> PointStep:
+def point_step(
+    model: Primitives, supervision: PointSupervision, settings: TrainSettings, generator: torch.Generator, threads: int = 0
+) -> PointStep:
     """Draw points, look what the model holds there, and compare.
 
     The loss is the mean square of errors over their scale: the extinction's, which is the square of its relative L2 error but for how
@@ -48,7 +50,7 @@ def point_step(model: Primitives, supervision: PointSupervision, settings: Train
     """
     samples = supervision.draw(settings.voxels_per_step, generator)
     colour = samples.source is not None and settings.voxel_colour > 0
-    found = values_at(model, samples.conditions, samples.points, colour)
+    found = values_at(model, samples.conditions, samples.points, colour, threads)
     wrong = (found.sigma - samples.sigma) / samples.sigma_scale
     loss = wrong.square().mean()
     parts = {"voxel_sigma": loss.item()}

@@ -179,7 +179,7 @@ class Trainer:
             value.grad = None
 
         seen = None if self.settings.supervision == "voxels" else self._look(progress)
-        known = None if self.points is None else point_step(model, self.points, self.settings, self.generator)
+        known = None if self.points is None else point_step(model, self.points, self.settings, self.generator, self.renderer.threads)
         if seen is None:
             assert known is not None
             loss, parts = known.loss, known.parts

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,14 @@ class Voxels:
         index = np.flatnonzero(flat.any(1))
         x, y, z = medium.values.shape[:3]
         return Voxels(index.astype(np.int64), np.ascontiguousarray(flat[index]), (x, y, z), medium.scene_from_index)
+
+    @cached_property
+    def sizes(self) -> tuple[float, float]:
+        """Root mean squares of sigma, and of sigma times radiance, over the voxels; 0 without any."""
+        if not len(self.index):
+            return 0.0, 0.0
+        squares = np.square(self.values, dtype=np.float64).mean(0)
+        return float(np.sqrt(squares[0])), float(np.sqrt(squares[1:].mean()))
 
     @property
     def bytes(self) -> int:
@@ -109,17 +118,16 @@ class FrameVoxels(PointSupervision):
             cells = np.concatenate([cells, chosen])
         values = voxels.at(cells)
         points = cells @ voxels.scene_from_index[:3, :3].T + voxels.scene_from_index[:3, 3]
-        matter = voxels.values if len(voxels.index) else np.full((1, 4), self.capture.look.extinction or 1.0)
-        sizes = np.sqrt(np.square(matter, dtype=np.float64).mean(0))
-        light = max(float(np.sqrt(np.square(sizes[1:]).mean())) / self.exposure, 1e-12)
+        sigma, light = voxels.sizes
+        usual = self.capture.look.extinction or 1.0  # of a frame that holds nothing
         return PointSamples(
             f"frame_{self.frames[t].number:04d}",
             {"time": self.times[t]},
             torch.from_numpy(points).float(),
             torch.from_numpy(values[:, 0].copy()),
             torch.from_numpy(values[:, 1:] / np.float32(self.exposure)),
-            max(float(sizes[0]), 1e-12),
-            light,
+            sigma or usual,
+            (light or usual) / self.exposure,
         )
 
     def voxels(self, t: int) -> Voxels:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neuprim.core.data.points import PointSupervision
+from neuprim.core.data import Dataset, PointSupervision
+from neuprim.core.data.check import check_samples
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Tally
 from neuprim.core.train.settings import TrainSettings
@@ -41,7 +42,12 @@ class PointStep:
 
 
 def point_step(
-    model: Primitives, supervision: PointSupervision, settings: TrainSettings, generator: torch.Generator, threads: int = 0
+    model: Primitives,
+    dataset: Dataset,
+    supervision: PointSupervision,
+    settings: TrainSettings,
+    generator: torch.Generator,
+    threads: int = 0,
 ) -> PointStep:
     """Draw points, look what the model holds there, and compare.
 
@@ -49,6 +55,7 @@ def point_step(
     the points are spread, and ``train.voxel_colour`` times the source's.
     """
     samples = supervision.draw(settings.voxels_per_step, generator)
+    check_samples(samples, dataset)
     colour = samples.source is not None and settings.voxel_colour > 0
     found = values_at(model, samples.conditions, samples.points, colour, threads)
     wrong = (found.sigma - samples.sigma) / samples.sigma_scale

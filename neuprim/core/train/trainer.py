@@ -124,7 +124,6 @@ class Trainer:
                 raise ConfigError(f"train.rates.{key}: no such parameter{nearest(key, names)}")
         if settings.supervision != "images" and dataset.points is None:
             raise ConfigError(f"train.supervision={settings.supervision}: {dataset.name} has no voxels to learn from; expected images")
-        self.points = None if settings.supervision == "images" else dataset.points
         self.model, self.dataset, self.loss = model, dataset, loss
         self.settings, self.renderer = settings, replace(renderer, depth=False)
         self.optimizer = RowAdam(model.specs, model.params, settings.adam_beta2)
@@ -179,7 +178,7 @@ class Trainer:
             value.grad = None
 
         seen = None if self.settings.supervision == "voxels" else self._look(progress)
-        known = None if self.points is None else point_step(model, self.points, self.settings, self.generator, self.renderer.threads)
+        known = self._look_inside() if self.settings.supervision != "images" else None
         if seen is None:
             assert known is not None
             loss, parts = known.loss, known.parts
@@ -226,6 +225,12 @@ class Trainer:
             mse = torch.dot(flat, flat).item() / counted
         psnr = -10 * math.log10(max(mse, 1e-20)) if math.isfinite(mse) else math.nan
         return _ImageStep(loss, parts, psnr, view.name, truth, tally)
+
+    def _look_inside(self) -> PointStep:
+        """Draw points of known extinction and compare."""
+        points = self.dataset.points
+        assert points is not None, "refused at the start"
+        return point_step(self.model, self.dataset, points, self.settings, self.generator, self.renderer.threads)
 
     def _refuse(self, value: float, seen: _ImageStep | None, known: PointStep | None) -> None:
         """Say why a loss is not finite.

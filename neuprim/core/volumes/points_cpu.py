@@ -66,7 +66,34 @@ def add_values(start, stop, points, starts, low, step, counts, reach, means, A, 
 
 
 @kernel
-def pull_values(start, stop, points, starts, low, step, counts, reach, means, A, rate, phase, amplitude, offset, colors, edge, pulled, error, g_means, g_A, g_rate, g_phase, g_amplitude, g_offset, g_colors, shares):  # type: ignore[no-untyped-def]
+def pull_values(
+    start,
+    stop,
+    points,
+    starts,
+    low,
+    step,
+    counts,
+    reach,
+    means,
+    A,
+    rate,
+    phase,
+    amplitude,
+    offset,
+    colors,
+    edge,
+    pulled,
+    error,
+    g_means,
+    g_A,
+    g_rate,
+    g_phase,
+    g_amplitude,
+    g_offset,
+    g_colors,
+    shares,
+):  # type: ignore[no-untyped-def]
     """Gradients of primitives start:stop from those of the sums, ``pulled`` (M, 1 + C), and the sums of sigma and sigma x error."""
     K, C = phase.shape[1], colors.shape[1]
     for n in range(start, stop):

@@ -42,7 +42,9 @@ def moving(seed: int = 0) -> Primitives:
 
 def gaussians() -> Primitives:
     generator = torch.Generator().manual_seed(0)
-    context = InitContext(0.3 * torch.rand(5, 3, generator=generator), torch.full((5,), 0.4), torch.rand(5, 3, generator=generator), generator)
+    context = InitContext(
+        0.3 * torch.rand(5, 3, generator=generator), torch.full((5,), 0.4), torch.rand(5, 3, generator=generator), generator
+    )
     return wide(Primitives.initialise(GaussianDensity(), SphericalHarmonics(0), context))
 
 
@@ -184,7 +186,10 @@ def test_cells_hold_every_point() -> None:
     x = cloud().numpy()
     cells = cells_of(x)
     assert sorted(cells.order) == list(range(300)) and cells.starts[-1] == 300 and len(cells.starts) == cells.counts.prod() + 1
-    corner = cells.low + np.stack(np.unravel_index(np.repeat(np.arange(cells.counts.prod()), np.diff(cells.starts)), cells.counts), 1) * cells.step
+    corner = (
+        cells.low
+        + np.stack(np.unravel_index(np.repeat(np.arange(cells.counts.prod()), np.diff(cells.starts)), cells.counts), 1) * cells.step
+    )
     away = x[cells.order] - corner
     assert (away >= -1e-12).all() and (away <= cells.step * (1 + 1e-12)).all()
 

@@ -9,13 +9,21 @@ import pytest
 import torch
 from torch import Tensor
 
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes import errors
 from neuprim.core.volumes.errors import NUMBERS, Comparison, blocks, frame_errors
 from neuprim.core.volumes.grid import agreement, density_grid, voxels_within
 from neuprim.core.volumes.truth import DensityTruth, TruthFrame
-from tests.core.volumes.test_density_grid import model
+from neuprim.tasks.static.fields import SphericalHarmonics
+from tests import scenes
 
 SHAPE = (20, 14, 17)
+
+
+def model() -> Primitives:
+    t = scenes.tensors(40, 5, seed=2)
+    return Primitives(CosineDensity(5), SphericalHarmonics(0), {**{k: v for k, v in t.items() if k != "colors"}, "sh_dc": t["colors"]})
 
 
 class Known(DensityTruth):

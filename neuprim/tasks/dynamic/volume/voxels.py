@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -26,6 +27,9 @@ MEMORY = 2**29
 
 _NEAR, _FAR = 0.2, 0.1
 """Shares of the points that are drawn around voxels with matter, and anywhere in the box."""
+
+_ANY = 0.1
+"""Share of the steps whose frame is any, so that frames with little or nothing are learned, too."""
 
 _AROUND = 6
 """How far around, in voxels along each axis."""
@@ -84,24 +88,33 @@ class Voxels:
 class FrameVoxels(PointSupervision):
     """Points on the voxels' centres of one frame after another.
 
-    Every frame to learn from is as likely as any other, so a late frame with more voxels sees fewer of them a step. 70 % of the points are
-    voxels with matter, 20 % lie up to six voxels beside one, and 10 % anywhere in a box a little larger than the sequence's.
+    A frame is drawn as often as it has a share of the sequence's extinction, and one draw in ten takes any. 70 % of the points are voxels
+    with matter, 20 % lie up to six voxels beside one, and 10 % anywhere in a box a little larger than the sequence's.
 
     Args:
         folder: of the capture's images; a frame's voxels are kept beside them once they were read, as the light in them may take long.
-        frames, times: those to learn from.
+        frames, times, weights: those to learn from, and each one's extinction.
         exposure: what radiance is divided by.
     """
 
     def __init__(
-        self, capture: Capture, folder: Path, frames: Sequence[VdbFrame], times: Sequence[Tensor], exposure: float, memory: int = MEMORY
+        self,
+        capture: Capture,
+        folder: Path,
+        frames: Sequence[VdbFrame],
+        times: Sequence[Tensor],
+        weights: Sequence[float],
+        exposure: float,
+        memory: int = MEMORY,
     ) -> None:
         self.capture, self.folder, self.frames, self.times = capture, folder, list(frames), list(times)
         self.exposure, self.memory = exposure, memory
+        shares = torch.tensor(weights, dtype=torch.float64)
+        self.chances = (1 - _ANY) * shares / shares.sum().clamp_min(1e-300) + _ANY / len(frames)
         self._kept: OrderedDict[int, Voxels] = OrderedDict()
 
     def draw(self, count: int, generator: torch.Generator) -> PointSamples:
-        t = int(torch.randint(len(self.frames), (), generator=generator))
+        t = int(torch.multinomial(self.chances, 1, generator=generator))
         voxels = self.voxels(t)
         near, far = round(_NEAR * count), round(_FAR * count)
         if not len(voxels.index):
@@ -154,5 +167,5 @@ class FrameVoxels(PointSupervision):
             with np.load(path, allow_pickle=False) as file:
                 x, y, z = (int(n) for n in file["shape"])
                 return Voxels(file["index"], file["values"], (x, y, z), file["scene_from_index"])
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
             raise DataError(f"{path}: damaged ({error}); delete it to read the frame again") from error

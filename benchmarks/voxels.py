@@ -142,6 +142,7 @@ def main() -> None:
                             "asked": kilobytes,
                             "budget": budget[0] + budget[1],
                         }
+                        recorded |= json.loads(RESULTS.read_text()) if RESULTS.exists() else {}  # another process may add to it
                         recorded["runs"] = [r for r in recorded["runs"] if _key(r) != _key(entry)] + [entry]
                         RESULTS.write_text(json.dumps(recorded, indent=1) + "\n")  # after every run: a long benchmark may be cut short
                         print(json.dumps(entry), flush=True)

@@ -66,7 +66,7 @@ def add_values(start, stop, points, starts, low, step, counts, reach, means, A, 
 
 
 @kernel
-def pull_values(
+def pull_values(  # type: ignore[no-untyped-def]
     start,
     stop,
     points,
@@ -93,7 +93,7 @@ def pull_values(
     g_offset,
     g_colors,
     shares,
-):  # type: ignore[no-untyped-def]
+):
     """Gradients of primitives start:stop from those of the sums, ``pulled`` (M, 1 + C), and the sums of sigma and sigma x error."""
     K, C = phase.shape[1], colors.shape[1]
     for n in range(start, stop):

@@ -161,7 +161,7 @@ class _Values(torch.autograd.Function):
         cells = cells_of(places)
         chunk = max(1, -(-count // _SUMS))
         sums = np.zeros((max(1, -(-count // chunk)), len(places), width))
-        ctx.given = [np.ascontiguousarray(places[cells.order]), *cells[1:], reach, *rows, edge]
+        ctx.given = [np.ascontiguousarray(places[cells.order]), tuple(cells[1:]), reach, tuple(rows), edge]
         parallel_for(add_values, count, chunk, threads, *ctx.given, chunk, sums)
         found = np.empty((len(places), width), np.float32)
         found[cells.order] = sums.sum(0)
@@ -176,7 +176,7 @@ class _Values(torch.autograd.Function):
         error = np.zeros(len(pulled)) if shares.error is None else shares.error.double().numpy()[ctx.order]
         made = [np.zeros(shape) for shape in ctx.shapes]
         sums = np.zeros((ctx.shapes[0][0], 2))
-        parallel_for(pull_values, len(sums), _ROWS, ctx.threads, *ctx.given, pulled, error, *made, sums)
+        parallel_for(pull_values, len(sums), _ROWS, ctx.threads, *ctx.given, pulled, error, tuple(made), sums)
         shares.weight, shares.error_weight = (torch.from_numpy(sums[:, i]).float() for i in range(2))
         return (None,) * 5 + tuple(torch.from_numpy(x) for x in made)
 
@@ -189,7 +189,7 @@ def pairs_of(geometry: Geometry, points: np.ndarray) -> tuple[Tensor, Tensor]:
     cells, reach = cells_of(points), _reach(geometry)
     with torch.no_grad():
         whiten = geometry.rotations.double().transpose(1, 2) / geometry.log_scales.double().exp()[:, :, None]
-    given = (np.ascontiguousarray(points[cells.order]), *cells[1:], reach, geometry.means.detach().double().numpy(), whiten.numpy())
+    given = (np.ascontiguousarray(points[cells.order]), tuple(cells[1:]), reach, geometry.means.detach().double().numpy(), whiten.numpy())
     counts = np.zeros(geometry.count, np.int64)
     parallel_for(count_pairs, geometry.count, _ROWS, 0, *given, counts)
     starts = np.cumsum(counts) - counts

@@ -22,6 +22,16 @@ def _last(center, reach, low, step, count):  # type: ignore[no-untyped-def]
 
 
 @inline
+def _met(cells, reach, means, n):  # type: ignore[no-untyped-def]
+    """First and last cell along each axis that the box of primitive n meets; along z none where the last comes before the first."""
+    _, low, step, counts = cells
+    x0, x1 = _first(means[n, 0], reach[n, 0], low[0], step, counts[0]), _last(means[n, 0], reach[n, 0], low[0], step, counts[0])
+    y0, y1 = _first(means[n, 1], reach[n, 1], low[1], step, counts[1]), _last(means[n, 1], reach[n, 1], low[1], step, counts[1])
+    z0, z1 = _first(means[n, 2], reach[n, 2], low[2], step, counts[2]), _last(means[n, 2], reach[n, 2], low[2], step, counts[2])
+    return x0, x1, y0, y1, z0, z1
+
+
+@inline
 def _inside(A, n, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Whitened coordinates of an offset from the mean."""
     y0 = A[n, 0, 0] * dx + A[n, 0, 1] * dy + A[n, 0, 2] * dz
@@ -31,18 +41,19 @@ def _inside(A, n, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def add_values(start, stop, points, starts, low, step, counts, reach, means, A, rate, phase, amplitude, offset, colors, edge, chunk, sums):  # type: ignore[no-untyped-def]
+def add_values(start, stop, points, cells, reach, prims, edge, chunk, sums):  # type: ignore[no-untyped-def]
     """Adds sigma and source of primitives start:stop to part ``start // chunk`` of ``sums`` (parts, M, 1 + C).
 
     Args:
-        points: (M, 3) float64, cell by cell; starts, low, step, counts: of the cells. The rest: per primitive.
+        points: (M, 3) float64, cell by cell. cells: starts, low, step and counts of :class:`~neuprim.core.volumes.points.Cells`.
+        reach: (N, 3) half sides of the primitives' boxes. prims: what ``_prepared`` there makes, and colours (N, C).
     """
+    starts, counts = cells[0], cells[3]
+    means, A, rate, phase, amplitude, offset, colors = prims
     own = sums[start // chunk]
     K, C = phase.shape[1], colors.shape[1]
     for n in range(start, stop):
-        x0, x1 = _first(means[n, 0], reach[n, 0], low[0], step, counts[0]), _last(means[n, 0], reach[n, 0], low[0], step, counts[0])
-        y0, y1 = _first(means[n, 1], reach[n, 1], low[1], step, counts[1]), _last(means[n, 1], reach[n, 1], low[1], step, counts[1])
-        z0, z1 = _first(means[n, 2], reach[n, 2], low[2], step, counts[2]), _last(means[n, 2], reach[n, 2], low[2], step, counts[2])
+        x0, x1, y0, y1, z0, z1 = _met(cells, reach, means, n)
         if z0 > z1:
             continue
         for i in range(x0, x1 + 1):
@@ -66,40 +77,16 @@ def add_values(start, stop, points, starts, low, step, counts, reach, means, A, 
 
 
 @kernel
-def pull_values(  # type: ignore[no-untyped-def]
-    start,
-    stop,
-    points,
-    starts,
-    low,
-    step,
-    counts,
-    reach,
-    means,
-    A,
-    rate,
-    phase,
-    amplitude,
-    offset,
-    colors,
-    edge,
-    pulled,
-    error,
-    g_means,
-    g_A,
-    g_rate,
-    g_phase,
-    g_amplitude,
-    g_offset,
-    g_colors,
-    shares,
-):
-    """Gradients of primitives start:stop from those of the sums, ``pulled`` (M, 1 + C), and the sums of sigma and sigma x error."""
+def pull_values(start, stop, points, cells, reach, prims, edge, pulled, error, gradients, shares):  # type: ignore[no-untyped-def]
+    """Gradients of primitives start:stop, a tuple like ``prims``, from those of the sums, ``pulled`` (M, 1 + C), and the sums of sigma and
+    sigma x error, ``shares`` (N, 2).
+    """
+    starts, counts = cells[0], cells[3]
+    means, A, rate, phase, amplitude, offset, colors = prims
+    g_means, g_A, g_rate, g_phase, g_amplitude, g_offset, g_colors = gradients
     K, C = phase.shape[1], colors.shape[1]
     for n in range(start, stop):
-        x0, x1 = _first(means[n, 0], reach[n, 0], low[0], step, counts[0]), _last(means[n, 0], reach[n, 0], low[0], step, counts[0])
-        y0, y1 = _first(means[n, 1], reach[n, 1], low[1], step, counts[1]), _last(means[n, 1], reach[n, 1], low[1], step, counts[1])
-        z0, z1 = _first(means[n, 2], reach[n, 2], low[2], step, counts[2]), _last(means[n, 2], reach[n, 2], low[2], step, counts[2])
+        x0, x1, y0, y1, z0, z1 = _met(cells, reach, means, n)
         if z0 > z1:
             continue
         m0, m1, m2, whole, weight, wrong = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -163,25 +150,23 @@ def pull_values(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def count_pairs(start, stop, points, starts, low, step, counts, reach, means, A, found):  # type: ignore[no-untyped-def]
+def count_pairs(start, stop, points, cells, reach, means, A, found):  # type: ignore[no-untyped-def]
     """How many points primitives start:stop contain."""
     for n in range(start, stop):
-        found[n] = _each(n, points, starts, low, step, counts, reach, means, A, 0, found[:0])
+        found[n] = _each(n, points, cells, reach, means, A, 0, found[:0])
 
 
 @kernel
-def fill_pairs(start, stop, points, starts, low, step, counts, reach, means, A, begins, point):  # type: ignore[no-untyped-def]
+def fill_pairs(start, stop, points, cells, reach, means, A, begins, point):  # type: ignore[no-untyped-def]
     """Which they are, from ``begins[n]`` on."""
     for n in range(start, stop):
-        _each(n, points, starts, low, step, counts, reach, means, A, begins[n], point)
+        _each(n, points, cells, reach, means, A, begins[n], point)
 
 
 @inline
-def _each(n, points, starts, low, step, counts, reach, means, A, begin, point):  # type: ignore[no-untyped-def]
-    found = 0
-    x0, x1 = _first(means[n, 0], reach[n, 0], low[0], step, counts[0]), _last(means[n, 0], reach[n, 0], low[0], step, counts[0])
-    y0, y1 = _first(means[n, 1], reach[n, 1], low[1], step, counts[1]), _last(means[n, 1], reach[n, 1], low[1], step, counts[1])
-    z0, z1 = _first(means[n, 2], reach[n, 2], low[2], step, counts[2]), _last(means[n, 2], reach[n, 2], low[2], step, counts[2])
+def _each(n, points, cells, reach, means, A, begin, point):  # type: ignore[no-untyped-def]
+    starts, counts, found = cells[0], cells[3], 0
+    x0, x1, y0, y1, z0, z1 = _met(cells, reach, means, n)
     if z0 > z1:
         return 0
     for i in range(x0, x1 + 1):

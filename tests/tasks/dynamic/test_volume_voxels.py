@@ -62,7 +62,7 @@ def trainer(folder: Path, *more: str) -> Trainer:
 def test_points_are_voxel_centres_with_the_files_own_values(files: Path, tmp_path: Path) -> None:
     data = dataset(files, tmp_path)
     assert isinstance(data.points, FrameVoxels)
-    drawn = frames_of(data.points, 40)
+    drawn = frames_of(data.points, 300)
     capture = recorded(data).capture
     assert sorted(drawn) == [f"frame_{n:04d}" for n in range(1, 6)]
     for frame in capture.frames[:4]:
@@ -81,18 +81,18 @@ def test_points_are_voxel_centres_with_the_files_own_values(files: Path, tmp_pat
             full = medium.values[..., 0][medium.values[..., 0] > 0].astype(float)
             assert samples.sigma_scale == pytest.approx(np.sqrt((full**2).mean()), rel=1e-5)
             share = float((samples.sigma > 0).float().mean())
-            assert 0.7 <= share < 0.95 and not inside.all()  # some lie beside the matter, some beyond the box
+            assert 0.7 <= share < 0.98 and not inside.all()  # some lie beside the matter, some beyond the box
 
 
 def test_an_empty_frame_is_learned_as_empty(files: Path, tmp_path: Path) -> None:
-    for samples in frames_of(supervision(files, tmp_path), 40)["frame_0005"]:
+    for samples in frames_of(supervision(files, tmp_path), 300)["frame_0005"]:
         assert len(samples.points) == 400 and not bool(samples.sigma.any()) and samples.sigma_scale > 1
         assert samples.source is not None and not bool(samples.source.any()) and samples.source_scale > 0
 
 
 def test_a_chunk_of_a_sequence_and_frames_left_out(files: Path, tmp_path: Path) -> None:
     assert set(frames_of(supervision(files, tmp_path, frames="2:3"), 20)) == {"frame_0002", "frame_0003"}
-    assert set(frames_of(supervision(files, tmp_path, train_every=2), 30)) == {"frame_0001", "frame_0003", "frame_0005"}
+    assert set(frames_of(supervision(files, tmp_path, train_every=2), 300)) == {"frame_0001", "frame_0003", "frame_0005"}
 
 
 def test_the_generator_alone_decides(files: Path, tmp_path: Path) -> None:

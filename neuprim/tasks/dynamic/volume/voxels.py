@@ -124,12 +124,13 @@ class FrameVoxels(PointSupervision):
         places = low - margin + torch.rand((far, 3), generator=generator, dtype=torch.float64).numpy() * (high - low + 2 * margin)
         back = np.linalg.inv(voxels.scene_from_index)
         cells = np.rint(places @ back[:3, :3].T + back[:3, 3]).astype(np.int64)
+        known = np.zeros((0, 4), np.float32)
         if far < count:
             rows = torch.randint(len(voxels.index), (count - far,), generator=generator).numpy()
             chosen = np.stack(np.unravel_index(voxels.index[rows], voxels.shape), -1)
             chosen[:near] += torch.randint(-_AROUND, _AROUND + 1, (near, 3), generator=generator).numpy()
-            cells = np.concatenate([cells, chosen])
-        values = voxels.at(cells)
+            cells, known = np.concatenate([cells, chosen]), voxels.values[rows[near:]]
+        values = np.concatenate([voxels.at(cells[: count - len(known)]), known])
         points = cells @ voxels.scene_from_index[:3, :3].T + voxels.scene_from_index[:3, 3]
         sigma, light = voxels.sizes
         usual = self.capture.look.extinction or 1.0  # of a frame that holds nothing

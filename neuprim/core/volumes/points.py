@@ -87,12 +87,13 @@ def values_at(model: Primitives, conditions: Conditions, points: Tensor, colour:
     tensors = _asked(living, places, colors, shares) if not isinstance(form, Cosine) else None
     if tensors is None:
         assert isinstance(form, Cosine)
-        prepared = _prepared(living.geometry, form)
+        axes = _Axes.of(living.geometry)
+        prepared = _prepared(axes, form)
         shown = torch.zeros(living.geometry.count, 0, dtype=torch.float64) if colors is None else colors.double()
         if not all(bool(torch.isfinite(x.detach().sum())) for x in (*prepared, shown)):
             model.check_finite()
             raise NonFiniteError("extinction at points: a product of finite parameters is not finite")
-        whole = _Values.apply(places, _reach(living.geometry), form.edge, shares, threads, *prepared, shown)
+        whole = _Values.apply(places, axes.reach, form.edge, shares, threads, *prepared, shown)
         tensors = whole[:, 0], (None if colors is None else whole[:, 1:])
     sigma, source = tensors
     return PointValues(sigma, source, living.rows, shares)
@@ -105,21 +106,35 @@ def _flat_colours(field: ColourField, living: Living, conditions: Conditions) ->
     return None if found is None else (found[0] * C0 + 0.5).clamp_min(0.0)
 
 
-def _prepared(geometry: Geometry, form: Cosine) -> tuple[Tensor, ...]:
+class _Axes(NamedTuple):
+    """Ellipsoids in float64, differentiable but for ``reach``.
+
+    Attributes:
+        means: (N, 3); m: (N,) longest semi-axes; whiten: (N, 3, 3), the A of y = A (x - mu).
+        reach: (N, 3) half sides of the ellipsoids' boxes.
+    """
+
+    means: Tensor
+    m: Tensor
+    whiten: Tensor
+    reach: np.ndarray
+
+    @classmethod
+    def of(cls, geometry: Geometry) -> _Axes:
+        rotations, scales = geometry.rotations.double(), geometry.log_scales.double().exp()
+        with torch.no_grad():
+            reach = (rotations * scales[:, None, :]).norm(dim=-1).numpy()
+        m = geometry.log_length_scale.double().exp()
+        return cls(geometry.means.double(), m, rotations.transpose(1, 2) / scales[:, :, None], np.ascontiguousarray(reach))
+
+
+def _prepared(axes: _Axes, form: Cosine) -> tuple[Tensor, ...]:
     """float64 tensors that the kernels read: means (N, 3), A (N, 3, 3) with y = A (x - mu), and of each neuron rate (N, K, 3), phase and
     amplitude (N, K), and offset (N,), so that f/m = offset + sum of amplitude cos(phase + rate . (x - mu)).
     """
-    m = geometry.log_length_scale.double().exp()
-    A = geometry.rotations.double().transpose(1, 2) / geometry.log_scales.double().exp()[:, :, None]
+    m, b2 = axes.m, form.b2.double().reshape(-1)
     rate = form.omega0 * form.W1.double() / m[:, None, None]
-    return geometry.means.double(), A, rate, form.omega0 * form.b1.double(), form.w2.double() / m[:, None], form.b2.double().reshape(-1) / m
-
-
-def _reach(geometry: Geometry) -> np.ndarray:
-    """(N, 3) float64 half sides of the ellipsoids' boxes."""
-    with torch.no_grad():
-        axes = geometry.rotations.double() * geometry.log_scales.double().exp()[:, None, :]
-        return np.asarray(axes.norm(dim=-1).numpy())
+    return axes.means, axes.whiten, rate, form.omega0 * form.b1.double(), form.w2.double() / m[:, None], b2 / m
 
 
 class Cells(NamedTuple):
@@ -186,10 +201,11 @@ class _Values(torch.autograd.Function):
 
 def pairs_of(geometry: Geometry, points: np.ndarray) -> tuple[Tensor, Tensor]:
     """(P,) int64 rows of points and of primitives that contain them, primitive by primitive."""
-    cells, reach = cells_of(points), _reach(geometry)
+    cells = cells_of(points)
     with torch.no_grad():
-        whiten = geometry.rotations.double().transpose(1, 2) / geometry.log_scales.double().exp()[:, :, None]
-    given = (np.ascontiguousarray(points[cells.order]), tuple(cells[1:]), reach, geometry.means.detach().double().numpy(), whiten.numpy())
+        axes = _Axes.of(geometry)
+    own = (np.ascontiguousarray(x.detach().numpy()) for x in (axes.means, axes.whiten))
+    given = (np.ascontiguousarray(points[cells.order]), tuple(cells[1:]), axes.reach, *own)
     counts = np.zeros(geometry.count, np.int64)
     parallel_for(count_pairs, geometry.count, _ROWS, 0, *given, counts)
     starts = np.cumsum(counts) - counts

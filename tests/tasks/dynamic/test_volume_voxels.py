@@ -167,6 +167,15 @@ def test_images_alone_draw_no_points(files: Path, monkeypatch: pytest.MonkeyPatc
     assert len(list(plain.run())) == 3
 
 
+def test_the_preset_learns_from_both_with_soft_edges(files: Path) -> None:
+    small = [*SMALL[:3], "model.primitives=50", "train.iterations=4", "train.max_seconds=null"]
+    words = ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'", "scene.look=smoke_fire", "preset=voxels", *small]
+    found = start(compose(words, check_output=False)).trainer
+    assert {"voxel_sigma", "voxel_source"} <= found.train_step().parts.keys()
+    assert found.model.density.settings() == {"neurons": 0, "edge": 2, "gain": True, "time": "window+motion"}
+    assert found.model.parameters_per_primitive == 23
+
+
 def test_colour_may_be_left_to_the_images(files: Path) -> None:
     found = trainer(files, "train.supervision=voxels", "train.voxel_colour=0", "train.iterations=3")
     before = found.model.params["sh_dc"].clone()

@@ -1,4 +1,4 @@
-"""What a volume model is worth in voxels: images, voxels or both to learn from, three forms of density, at equal bytes and equal steps.
+"""What a volume model is worth in voxels: images, voxels or both to learn from, several densities, at equal bytes and equal steps.
 
     python benchmarks/voxels.py DIR [--frames 1:40] [--iterations 2500] [--seeds 3] [--kilobytes 1240] [--forms ...] [--from ...] [--docs]
 
@@ -39,7 +39,10 @@ FORMS = {
     "K = 8, p = 0": ("model.neurons=8",),
     "K = 0, p = 2, gain": ("model.neurons=0", *SOFT),
     "K = 2, p = 2, gain": ("model.neurons=2", *SOFT),
+    "preset voxels": ("preset=voxels",),
 }
+"""All but the last with the starting values and rates of the preset quick."""
+
 SOURCES = ("images", "both", "voxels")
 THIRDS = ("early", "middle", "late")
 KEYS = ("psnr_mask", "psnr_pooled_mask", *(f"sigma_{k}_{t}" for k in ("relative_l2", "psnr_active", "max_error") for t in THIRDS))

@@ -75,7 +75,7 @@ CORE: dict[str, set[str]] = {
     "checkpoint": {"errors", "io", "model", "task"},
     "extensions": {"channels", "checked", "conditions", "data", "errors", "model", "settings", "task", "volumes"},
     "render": {"cameras", "compute", "errors", "metrics", "model", "settings"},
-    "train": {"checked", "compute", "data", "errors", "model", "render", "task"},
+    "train": {"checked", "compute", "data", "errors", "model", "render", "task", "volumes"},
     "uses": {"checked", "errors", "extensions", "task", "train"},
 }
 """The same inside ``core``, folders and single files alike."""

@@ -17,7 +17,8 @@ from neuprim.core.io import images
 from neuprim.core.io.drafts import refuse_taken
 from neuprim.core.io.film import write_film
 from neuprim.core.model.fields import Conditions
-from neuprim.core.volumes.grid import POINTS_LIMIT, agreement, density_grid, lattice
+from neuprim.core.volumes.errors import frame_errors
+from neuprim.core.volumes.grid import POINTS_LIMIT, density_grid, lattice
 from neuprim.core.volumes.truth import DensityTruth
 from neuprim.plugins.blame import reported
 from neuprim.plugins.inspect.against import open_truth, pair, write_volume
@@ -201,13 +202,11 @@ class _Film:
         return box_of(self.model, [conditions for conditions, _ in self.pairs])
 
     def _compare(self, index: int, events: Events) -> dict[str, float] | None:
-        """The frame's agreement with the truth on the grid that the data set itself compares on, whatever is shown."""
+        """The frame's errors against the truth on the truth's own points, whatever is shown."""
         if self.truth is None:
             return None
         conditions, number = self.pairs[index]
-        matrix, shape = lattice(self.truth.bounds, self.truth.resolution)
-        found = density_grid(self.model, conditions, matrix, shape).numpy()
-        numbers = agreement(self.truth.grid(number, matrix, shape).numpy(), found)
+        numbers = frame_errors(self.model, conditions, self.truth, number)
         words = "nothing to compare with" if numbers is None else "  ".join(f"{k} {v:.4f}" for k, v in numbers.items())
         events(Note(f"{self.truth.frames[number].name}  {in_words(conditions)}  {words}"))
         return numbers

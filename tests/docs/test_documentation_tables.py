@@ -11,8 +11,13 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+import torch
 from PIL import Image
 
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.geometry import GEOMETRY_SPECS
+from neuprim.core.model.primitives import Primitives
+from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.docs.pages import ROOT, links, prose
 
 RESULTS = ROOT / "benchmarks" / "results"
@@ -108,3 +113,31 @@ def test_the_readme_is_a_page_with_one_large_picture() -> None:
     with Image.open(ROOT / picture) as image:
         assert image.width >= 3 * 256 and image.height >= 2 * 256
     assert "generated data" in prose(README).lower()
+
+
+def test_the_table_of_voxels_is_that_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
+    recorded = json.loads((RESULTS / "voxels.json").read_text(encoding="utf-8"))
+    assert between("docs/dynamic.md", "voxels") == benchmark("voxels").table(recorded)
+
+
+def test_eight_bits_are_half_a_step_off_and_a_quarter_of_the_bytes(benchmark: Callable[[str], ModuleType]) -> None:
+    script = benchmark("voxels")
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(5000, generator=generator, dtype=torch.float64).numpy()
+    codes, back = script.coded(x)
+    kept = abs(back - x) < abs(x).max() / 2
+    assert codes.dtype == "uint8" and abs(back - x)[kept].max() < (x.max() - x.min()) / 255 and kept.mean() > 0.95
+    assert not script.coded(x * 0)[1].any()
+    model = even_model(generator)
+    coarse, size = script.eight_bits(model)
+    order = torch.from_numpy(script.morton(model.params["means"].numpy()).argsort(kind="stable"))
+    assert size < sum(v.numel() for v in model.params.values()) + 8 * 60
+    for name, value in model.params.items():
+        assert (coarse.params[name] - value[order]).abs().max() <= 0.02 * (value.max() - value.min()), name
+
+
+def even_model(generator: torch.Generator) -> Primitives:
+    """Numbers spread evenly, which eight bits hold to half a step."""
+    density, colour = CosineDensity(2), SphericalHarmonics(0)
+    specs = (*GEOMETRY_SPECS, *density.parameters(), *colour.parameters())
+    return Primitives(density, colour, {s.name: torch.rand((2000, *s.shape), generator=generator) for s in specs})

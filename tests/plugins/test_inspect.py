@@ -15,6 +15,7 @@ from neuprim.cli import main
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
 from neuprim.core.extensions import Inspector
 from neuprim.core.io.vdb import read_grid
+from neuprim.core.volumes.errors import NUMBERS
 from neuprim.core.volumes.grid import density_at, density_grid, lattice
 from neuprim.plugins.inspect import ViewOptions, headless, views
 from neuprim.plugins.inspect.field import FieldFrame
@@ -153,7 +154,7 @@ def test_its_own_volume_agrees_with_the_model(run_dir: Path, tmp_path: Path) -> 
     look(run_dir, conditions={"time": "0:1:3"}, grid=128, out=tmp_path / "out" / "v.vdb")
     paths, said = look(run_dir, conditions={"time": "0.9"}, grid=16, against=str(tmp_path / "out"), out=tmp_path / "again.vdb")
     assert len(paths) == 1 and "scene units" in said[0]
-    found = re.fullmatch(r"v_0002\.vdb  time 1  correlation (\S+)  relative_l2 (\S+)", said[1])
+    found = re.fullmatch(r"v_0002\.vdb  time 1  correlation (\S+)  relative_l2 (\S+)  psnr_active (\S+)  max_error (\S+)", said[1])
     assert found and float(found[1]) > 0.99 and float(found[2]) < 0.12
 
 
@@ -164,7 +165,7 @@ def test_the_numbers_are_those_of_the_data_set(run_dir: Path, tmp_path: Path) ->
         _, said = look(run_dir, conditions={"time": "0:1:20"}, grid=8, against=against, out=tmp_path / "x.vdb", overwrite=True)
         assert len(expected) == 3 and len(said) == 5
         for number, line in zip(runs.NUMBERS, said[1:], strict=False):
-            wanted = f"correlation {expected[number]['correlation']:.4f}  relative_l2 {expected[number]['relative_l2']:.4f}"
+            wanted = "  ".join(f"{key} {expected[number][key]:.4f}" for key in NUMBERS)
             assert line.endswith(wanted) and line.startswith(f"ball_{number}.vdb  time {(number - 4) / 2:g} ")
 
 

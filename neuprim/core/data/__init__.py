@@ -1,5 +1,18 @@
 """What a data set hands to the trainer, and what loaders of posed images share."""
 
 from neuprim.core.data.dataset import Clip, Dataset, DataSource, Pixels, PointCloud, StartingPoints, View, ViewSet, camera_extent
+from neuprim.core.data.points import PointSamples, PointSupervision
 
-__all__ = ["Clip", "DataSource", "Dataset", "Pixels", "PointCloud", "StartingPoints", "View", "ViewSet", "camera_extent"]
+__all__ = [
+    "Clip",
+    "DataSource",
+    "Dataset",
+    "Pixels",
+    "PointCloud",
+    "PointSamples",
+    "PointSupervision",
+    "StartingPoints",
+    "View",
+    "ViewSet",
+    "camera_extent",
+]

@@ -14,12 +14,12 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.rays import AnyCamera, RayCamera
-from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, View, ViewSet
+from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, PointSamples, PointSupervision, View, ViewSet
 from neuprim.core.errors import DataError
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.volumes.source import Placement
 
-__all__ = ["DatasetFault", "check_dataset", "check_mask", "check_pixels", "check_points", "extra_of"]
+__all__ = ["DatasetFault", "check_dataset", "check_mask", "check_pixels", "check_points", "check_samples", "extra_of"]
 
 Extra = TypeVar("Extra")
 
@@ -100,6 +100,34 @@ def check_points(cloud: PointCloud, count: int, dataset: Dataset) -> None:
         _floats(f"{where}: condition {name!r}", value, (found,))
 
 
+def check_samples(samples: PointSamples, dataset: Dataset) -> None:
+    """Points to learn from, as a data set's ``points`` drew them; shapes and dtypes alone, as it is done in every step.
+
+    Raises:
+        DatasetFault: naming member, found and expected.
+    """
+    where = f"{dataset.name}: points"
+    if not isinstance(samples, PointSamples):
+        raise DatasetFault(f"{where}: drew {_described(samples)}; expected a neuprim.core.data.PointSamples")
+    count = len(samples.sigma) if isinstance(samples.sigma, Tensor) and samples.sigma.dim() else 0
+    if count == 0:
+        _refuse(f"{where} of {samples.name}: sigma", samples.sigma, torch.float32, ("M",), ", M at least 1")
+    wanted = [
+        ("points", samples.points, (count, 3)),
+        ("sigma", samples.sigma, (count,)),
+        ("source", samples.source, (count, dataset.channels)),
+    ]
+    for name, value, shape in wanted:
+        if not (_is(value, torch.float32) and value is not None and tuple(value.shape) == shape) and not (
+            name == "source" and value is None
+        ):
+            _refuse(f"{where} of {samples.name}: {name}", value, torch.float32, shape)
+    for name in ("sigma_scale", "source_scale"):
+        number = getattr(samples, name)
+        if not isinstance(number, (int, float)) or not 0 < number < float("inf"):
+            raise DatasetFault(f"{where} of {samples.name}: {name} is {number!r}; expected a positive number")
+
+
 def extra_of(dataset: Dataset, kind: type[Extra]) -> Extra | None:
     """``dataset.extra``, for the task that knows what it is.
 
@@ -135,6 +163,8 @@ def _members(dataset: Dataset) -> None:
     _floats(f"{who}: center", dataset.center, (3,))
     if bounds is not None:
         _floats(f"{who}: bounds", bounds, (2, 3), ", lower and upper corner, or None")
+    if not isinstance(dataset.points, PointSupervision | None):
+        raise DatasetFault(f"{who}: points is {_described(dataset.points)}; expected a neuprim.core.data.PointSupervision, or None")
     if not isinstance(dataset.exposure, (int, float)) or not 0 < dataset.exposure < float("inf"):
         raise DatasetFault(f"{who}: exposure is {dataset.exposure!r}; expected a positive number")
     if not isinstance(dataset.placement, Placement | None):
@@ -205,7 +235,7 @@ def _one_of(where: str, value: object, choices: tuple[str, ...]) -> None:
         raise DatasetFault(f"{where} is {value!r}; expected {' or '.join(choices)}")
 
 
-def _refuse(where: str, value: Any, dtype: torch.dtype, shape: tuple[int, ...], more: str = "") -> None:
+def _refuse(where: str, value: Any, dtype: torch.dtype, shape: tuple[int | str, ...], more: str = "") -> None:
     raise DatasetFault(f"{where} is {_described(value)}; expected {_name(dtype)} {shape}{more}")
 
 

@@ -19,6 +19,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Conditions
 
 if TYPE_CHECKING:
+    from neuprim.core.data.points import PointSupervision
     from neuprim.core.volumes.source import Placement
 
 __all__ = ["Clip", "DataSource", "Dataset", "Pixels", "PointCloud", "StartingPoints", "View", "ViewSet", "camera_extent"]
@@ -145,6 +146,8 @@ class Dataset:
         bounds: (2, 3) lower and upper corner of a box around everything, scene units; None if the data do not say.
         exposure: what the linear values of the files were divided by.
         placement: how scene units follow from the world of the voxel files that the scene was made from; None without such files.
+        points: points at which extinction and source radiance are known, for ``train.supervision=voxels`` and ``both``; None where they
+            are not.
         extra: what else the scene's own task likes to know, of the class that this task names, e.g. what pixels show or what the images
             were made from. None is always enough: a task judges by images, cameras and conditions then.
     """
@@ -165,6 +168,7 @@ class Dataset:
     bounds: Tensor | None = None
     exposure: float = 1.0
     placement: Placement | None = None
+    points: PointSupervision | None = None
     extra: object = None
 
     def __init_subclass__(cls) -> None:

@@ -1,6 +1,7 @@
 """The training loop, for every task, in one sitting.
 
-A step: draw a view, render it, compare, go back, move the parameters, let the population react. Everything that shapes
+A step: draw a view, render it, compare, go back, move the parameters, let the population react; ``train.supervision`` may put points of
+known extinction in a view's place or beside it. Everything that shapes
 the next step is in :meth:`Trainer.state`, so that 2N steps equal N steps, a kill, a resume and N more, bit for bit.
 """
 
@@ -27,9 +28,11 @@ from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
+from neuprim.core.render.output import Tally
 from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.losses import scale_anisotropy
 from neuprim.core.train.optimizer import RowAdam
+from neuprim.core.train.points import PointStep, point_step
 from neuprim.core.train.population import Change, make_population
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 
@@ -42,7 +45,8 @@ _USUAL_OPACITY = 0.5
 
 @dataclass(frozen=True)
 class StepReport:
-    """What one step did. ``psnr`` is of the training view just seen; ``change`` says what the population did, if anything."""
+    """What one step did. ``psnr`` is of the training view just seen, or of the extinction at points where no view was; ``change`` says what
+    the population did, if anything."""
 
     step: int
     seconds: float
@@ -100,6 +104,18 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
     return Primitives.initialise(density, colour, context)
 
 
+@dataclass(frozen=True)
+class _ImageStep:
+    """One view, drawn and compared; ``tally`` is filled by the backward pass."""
+
+    loss: Tensor
+    parts: dict[str, float]
+    psnr: float
+    name: str
+    truth: Tensor
+    tally: Tally
+
+
 class Trainer:
     """Fits a model to the training views of a data set.
 
@@ -116,6 +132,8 @@ class Trainer:
         for key in settings.rates:
             if key not in names:
                 raise ConfigError(f"train.rates.{key}: no such parameter{nearest(key, names)}")
+        if settings.supervision != "images" and dataset.points is None:
+            raise ConfigError(f"train.supervision={settings.supervision}: {dataset.name} has no voxels to learn from; expected images")
         self.model, self.dataset, self.loss = model, dataset, loss
         self.settings, self.renderer = settings, replace(renderer, depth=False)
         self.optimizer = RowAdam(model.specs, model.params, settings.adam_beta2)
@@ -157,7 +175,7 @@ class Trainer:
             yield self.train_step()
 
     def train_step(self) -> StepReport:
-        """One view, one update.
+        """One view, some points or both, one update.
 
         Raises:
             NonFiniteError: a loss, gradient or parameter is NaN or infinite; nothing was updated by this step.
@@ -169,29 +187,23 @@ class Trainer:
         for value in model.params.values():
             value.grad = None
 
-        index = self._next_view()
-        view, pixels = self.dataset.train.view(index), self.dataset.train.pixels(index)
-        check_pixels("train", view, pixels, self.dataset.channels)
-        background = self._background()
-        truth = pixels.over(background)
-        output = render(model, view.camera, view.conditions, self.renderer, background)
-        rgb = output.rgb if pixels.mask is None else torch.where(pixels.mask[..., None], output.rgb, truth)
-        loss, parts = self.loss(rgb, truth, Supervision(view, pixels.mask, pixels.alpha, progress))
+        seen = None if self.settings.supervision == "voxels" else self._look(progress)
+        known = self._look_inside() if self.settings.supervision != "images" else None
+        if seen is None:
+            assert known is not None
+            loss, parts = known.loss, known.parts
+        else:
+            loss, parts = seen.loss, seen.parts
+            if known is not None:
+                loss, parts = loss + self.settings.voxel_weight * known.loss, {**parts, **known.parts}
         if self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from:
             loss = loss + self.settings.anisotropy_weight * scale_anisotropy(model.params["log_scales"])
         if not math.isfinite(loss.item()):
-            model.check_finite()
-            spoiled = "" if bool(torch.isfinite(truth).all()) else ", whose pixels are NaN or infinite somewhere"
-            raise NonFiniteError(f"loss is {loss.item()} at step {self.step} on view {view.name}{spoiled}")
-        with torch.no_grad():
-            difference = rgb - truth
-            channels = difference.shape[-1]
-            tally = output.watch(difference.abs() @ torch.full((channels,), 1.0 / channels))
-            flat = difference.reshape(-1)
-            counted = flat.numel() if pixels.mask is None else int(pixels.mask.sum()) * channels
-            mse = torch.dot(flat, flat).item() / counted
+            self._refuse(loss.item(), seen, known)
         loss.backward()
 
+        tally = seen.tally if seen is not None else known.tally() if known is not None else None
+        assert tally is not None
         self.population.observe(model, tally)
         self.optimizer.step(model.params, self.rates())
         self.step += 1
@@ -201,8 +213,46 @@ class Trainer:
             if change is not None:
                 self._apply(change)
         self.elapsed += time.perf_counter() - start
-        psnr = -10 * math.log10(max(mse, 1e-20))
-        return StepReport(self.step, self.elapsed, loss.item(), parts, psnr, model.count, view.name, change.text if change else None)
+        psnr, name = (seen.psnr, seen.name) if seen is not None else (known.psnr, known.name) if known is not None else (0.0, "")
+        return StepReport(self.step, self.elapsed, loss.item(), parts, psnr, model.count, name, change.text if change else None)
+
+    def _look(self, progress: float) -> _ImageStep:
+        """Draw the next view and compare."""
+        index = self._next_view()
+        view, pixels = self.dataset.train.view(index), self.dataset.train.pixels(index)
+        check_pixels("train", view, pixels, self.dataset.channels)
+        background = self._background()
+        truth = pixels.over(background)
+        output = render(self.model, view.camera, view.conditions, self.renderer, background)
+        rgb = output.rgb if pixels.mask is None else torch.where(pixels.mask[..., None], output.rgb, truth)
+        loss, parts = self.loss(rgb, truth, Supervision(view, pixels.mask, pixels.alpha, progress))
+        with torch.no_grad():
+            difference = rgb - truth
+            channels = difference.shape[-1]
+            tally = output.watch(difference.abs() @ torch.full((channels,), 1.0 / channels))
+            flat = difference.reshape(-1)
+            counted = flat.numel() if pixels.mask is None else int(pixels.mask.sum()) * channels
+            mse = torch.dot(flat, flat).item() / counted
+        psnr = -10 * math.log10(max(mse, 1e-20)) if math.isfinite(mse) else math.nan
+        return _ImageStep(loss, parts, psnr, view.name, truth, tally)
+
+    def _look_inside(self) -> PointStep:
+        """Draw points of known extinction and compare."""
+        points = self.dataset.points
+        assert points is not None, "refused at the start"
+        return point_step(self.model, self.dataset, points, self.settings, self.generator, self.renderer.threads)
+
+    def _refuse(self, value: float, seen: _ImageStep | None, known: PointStep | None) -> None:
+        """Say why a loss is not finite.
+
+        Raises:
+            NonFiniteError: always.
+        """
+        self.model.check_finite()
+        where = f"view {seen.name}" if seen is not None else f"points of {known.name}" if known is not None else ""
+        spoiled = seen is not None and not bool(torch.isfinite(seen.truth).all())
+        more = ", whose pixels are NaN or infinite somewhere" if spoiled else ""
+        raise NonFiniteError(f"loss is {value} at step {self.step} on {where}{more}")
 
     def _next_view(self) -> int:
         """Random order without replacement."""

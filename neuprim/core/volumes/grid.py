@@ -20,7 +20,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Conditions, Cosine
 from neuprim.core.model.primitives import Primitives
 
-__all__ = ["POINTS_LIMIT", "agreement", "density_at", "density_grid", "lattice"]
+__all__ = ["POINTS_LIMIT", "agreement", "density_at", "density_grid", "lattice", "voxels_within"]
 
 _SLAB = 8  # planes per unit of work; fixed, and the result does not depend on it
 _PAIRS = 1 << 17  # of points and primitives that a density in torch code is asked for at once
@@ -38,6 +38,22 @@ def lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, tuple
     matrix[3, 3] = 1.0
     matrix[:3, 3] = torch.from_numpy(low + step / 2)
     return matrix, (x, y, z)
+
+
+def voxels_within(bounds: np.ndarray | Tensor, scene_from_index: np.ndarray) -> tuple[Tensor, tuple[int, int, int]]:
+    """(4, 4) scene_from_index and shape of the voxels whose centres lie in a (2, 3) box of the scene; of turned ones all in a box around it.
+
+    Args:
+        scene_from_index: (4, 4) float64, of the voxels' own indices.
+    """
+    corners = np.stack(np.meshgrid(*np.asarray(bounds, np.float64).T, indexing="ij"), -1).reshape(-1, 3)
+    back = np.linalg.inv(scene_from_index)
+    index = corners @ back[:3, :3].T + back[:3, 3]
+    low, high = np.ceil(index.min(0) - 1e-6).astype(np.int64), np.floor(index.max(0) + 1e-6).astype(np.int64) + 1
+    matrix = np.array(scene_from_index, np.float64)
+    matrix[:3, 3] += matrix[:3, :3] @ low
+    x, y, z = (int(n) for n in np.maximum(high - low, 1))
+    return torch.from_numpy(matrix), (x, y, z)
 
 
 def agreement(truth: np.ndarray, found: np.ndarray) -> dict[str, float] | None:

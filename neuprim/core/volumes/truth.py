@@ -32,12 +32,16 @@ class DensityTruth(ABC):
     Attributes:
         frames: in order, one or more.
         bounds: (2, 3) float64 box around all of it, scene units.
-        resolution: points along the box's longest side on which the data set itself compares models with it.
     """
 
     frames: Sequence[TruthFrame]
     bounds: Tensor
-    resolution: int
+
+    @abstractmethod
+    def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
+        """(4, 4) float64 scene_from_index and shape of the regular grid on which models are compared with a frame: of files, all their
+        own voxels in the box. None where the frame holds nothing.
+        """
 
     @abstractmethod
     def grid(self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int]) -> Tensor:

@@ -19,13 +19,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy import ndimage
 
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
 from neuprim.core.io.vdb import Grid, Tiles, read_grid, scale_transform, write_vdb
 from neuprim.core.model.fields import Conditions
 from neuprim.core.task import API_VERSION
-from neuprim.core.volumes.grid import agreement, density_grid, lattice
+from neuprim.core.volumes.errors import Comparison, blocks, frame_errors
+from neuprim.core.volumes.grid import density_grid
 from neuprim.core.volumes.source import Placement, VolumeSource
 from neuprim.plugins.export.common import model_box
 
@@ -95,7 +97,10 @@ def _write(job: ExportJob) -> ExportReport:
     where = "the source's own voxels and world" if own else "cubic voxels in " + ("the source's world" if placement else "scene units")
     notes.append(f"on {where}; values below {threshold:.3g} are left out")
     if errors:
-        notes.append("correlation and relative_l2: the model against the files as in metrics.json; file_*: what was written against them")
+        notes.append(
+            "errors: the model's sigma against the files on all their voxels, as in metrics.json; file_*: what was written against them; "
+            "psnr_active over voxels with matter, max_error as a share of the frame's largest sigma: a proxy with a measured error, no bound"
+        )
     return ExportReport(tuple(paths), False, errors, tuple(notes))
 
 
@@ -234,26 +239,26 @@ def _slabs(
 def _errors(
     job: ExportJob, source: VolumeSource, frame: _GridFrame, path: Path, scene_from_world: np.ndarray, factor: float
 ) -> dict[str, float]:
-    """The model and the written file, each against the source, on the lattice of ``metrics.json``."""
+    """The model and the written file, each against the source on the source's own voxels, as ``metrics.json`` has it."""
     assert frame.source is not None
-    matrix, shape = lattice(source.bounds, source.resolution)
-    truth = source.grid(frame.source, matrix, shape).numpy()
-    both = agreement(truth, density_grid(job.run.model, frame.conditions, matrix, shape, job.run.settings.threads).numpy())
-    if both is None:
+    model = frame_errors(job.run.model, frame.conditions, source, frame.source, job.run.settings.threads)
+    place = source.points(frame.source)
+    if model is None or place is None:
         return {}
-    from scipy import ndimage
-
     name = f"frame_{source.placement.numbers[frame.source]:04d}"
-    result = {f"{name}.correlation": both["correlation"], f"{name}.relative_l2": both["relative_l2"]}
-    grid = read_grid(path, str(job.options["name"]))
+    result = {f"{name}.{key}": value for key, value in model.items()}
+    grid, written = read_grid(path, str(job.options["name"])), Comparison()
     if grid.bounds is None:
         return result
-    chain = np.linalg.inv(scene_from_world @ grid.transform) @ matrix.numpy()
-    points = chain[:3, :3] @ np.indices(shape, dtype=np.float64).reshape(3, -1) + chain[:3, 3:] - np.array(grid.bounds[0])[:, None]
-    found = ndimage.map_coordinates(grid.to_dense(), points, order=1, mode="grid-constant", cval=0.0).reshape(shape) / factor
-    written = agreement(truth, found)
-    assert written is not None
-    return {**result, f"{name}.file_correlation": written["correlation"], f"{name}.file_relative_l2": written["relative_l2"]}
+    dense = grid.to_dense()
+    for matrix, shape in blocks(*place):
+        chain = np.linalg.inv(scene_from_world @ grid.transform) @ matrix.numpy()
+        offset = chain[:3, 3] - np.array(grid.bounds[0])
+        found = ndimage.affine_transform(dense, chain[:3, :3], offset, shape, order=1, mode="grid-constant") / factor
+        written.add(source.grid(frame.source, matrix, shape).numpy(), found)
+    numbers = written.numbers()
+    assert numbers is not None
+    return result | {f"{name}.file_{key}": value for key, value in numbers.items()}
 
 
 EXPORTER = Exporter(

@@ -14,6 +14,7 @@ from torch import Tensor
 from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import Grid, VdbFrame, read_grid, read_header, sequence, write_vdb
 from neuprim.core.model.fields import Conditions
+from neuprim.core.volumes.grid import voxels_within
 from neuprim.core.volumes.source import VolumeSource
 from neuprim.core.volumes.truth import DensityTruth, TruthFrame
 from neuprim.plugins.inspect.field import FieldFrame
@@ -80,8 +81,6 @@ class SceneUnits(DensityTruth):
         DataError: no float grid to take, or nothing in it.
     """
 
-    resolution = 96
-
     def __init__(self, frames: Sequence[VdbFrame]) -> None:
         self._files = list(frames)
         self.frames, lows, highs = [], [], []
@@ -107,6 +106,10 @@ class SceneUnits(DensityTruth):
         if grid.channels != 1:
             raise DataError(f"{frame.path}: grid {chosen!r} has {grid.channels} channels; expected one")
         return grid
+
+    def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
+        source = self._read(self._files[frame])
+        return None if source.bounds is None else voxels_within(self.bounds, source.transform)
 
     def grid(self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int]) -> Tensor:
         source = self._read(self._files[frame])

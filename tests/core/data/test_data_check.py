@@ -13,8 +13,8 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.rays import RayCamera
-from neuprim.core.data import Dataset, Pixels, PointCloud
-from neuprim.core.data.check import DatasetFault, check_dataset, check_mask, check_pixels, check_points, extra_of
+from neuprim.core.data import Dataset, Pixels, PointCloud, PointSamples
+from neuprim.core.data.check import DatasetFault, check_dataset, check_mask, check_pixels, check_points, check_samples, extra_of
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import ConditionSpec
@@ -263,3 +263,31 @@ def test_an_orbit_has_every_condition_of_the_training_views() -> None:
     views = data.orbit(3)
     torch.testing.assert_close(torch.stack([v.conditions["time"] for v in views]), torch.tensor([0.0, 0.25, 0.5]))
     assert [v.conditions["light"].tolist() for v in views] == [[0.0, 2.0, 3.0]] * 3
+
+
+SAMPLES: dict[str, tuple[dict[str, Any], str]] = {
+    "a list": ({"points": [[0.0] * 3] * 4}, "points is a list; expected torch.float32 (4, 3)"),
+    "doubles": ({"points": torch.zeros(4, 3).double()}, "points is float64 (4, 3); expected float32 (4, 3)"),
+    "another count": ({"points": torch.zeros(5, 3)}, "points is float32 (5, 3); expected float32 (4, 3)"),
+    "no points": ({"sigma": torch.zeros(0)}, "sigma is float32 (0,); expected float32 ('M',), M at least 1"),
+    "other channels": ({"source": torch.zeros(4, 1)}, "source is float32 (4, 1); expected float32 (4, 3)"),
+    "no scale": ({"sigma_scale": 0.0}, "sigma_scale is 0.0; expected a positive number"),
+    "an endless scale": ({"source_scale": float("inf")}, "source_scale is inf; expected a positive number"),
+}
+
+
+@pytest.mark.parametrize(("changes", "text"), SAMPLES.values(), ids=SAMPLES)
+def test_points_to_learn_from(changes: dict[str, Any], text: str) -> None:
+    good = PointSamples("f", {}, torch.zeros(4, 3), torch.zeros(4), torch.zeros(4, 3), 1.0)
+    check_samples(good, tiny.two_primitives())
+    check_samples(replace(good, source=None), tiny.two_primitives())
+    with pytest.raises(DatasetFault) as caught:
+        check_samples(replace(good, **changes), tiny.two_primitives())
+    assert str(caught.value) == f"two: points of f: {text}".replace("torch.float32", "float32")
+
+
+def test_points_of_another_class_are_refused_before_training() -> None:
+    with pytest.raises(DatasetFault, match=r"^two: points is a int; expected a neuprim\.core\.data\.PointSupervision, or None$"):
+        check_dataset(tiny.two_primitives(points=3), ())
+    with pytest.raises(DatasetFault, match=r"^two: points: drew None; expected a neuprim\.core\.data\.PointSamples$"):
+        check_samples(None, tiny.two_primitives())  # type: ignore[arg-type]

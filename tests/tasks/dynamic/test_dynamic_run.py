@@ -56,6 +56,7 @@ def test_a_run_learns_and_reports_every_number(finished: Path) -> None:
     assert len(m["per_frame"]) == 4 and all({"psnr", "psnr_mask", "psnr_black_image"} <= f.keys() for f in m["per_frame"])
     assert m["psnr_srgb"] > 0 and m["ssim_srgb"] > 0 and m["color_space"] == "linear"
     assert m["sigma_correlation_middle"] > 0.5 and 0 < m["sigma_relative_l2_middle"] < 1
+    assert m["sigma_psnr_active_middle"] > 5 and 0 < m["sigma_max_error_middle"] < 2
     assert m["vdb_bytes"] > 0 and 0 <= m["invisible_fraction"] <= 1 and m["data_source"] == "real"
 
 

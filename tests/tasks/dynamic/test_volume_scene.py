@@ -16,9 +16,9 @@ from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.volumes.grid import lattice
 from neuprim.tasks.dynamic import judging
 from neuprim.tasks.dynamic.volume import capture as capturing
-from neuprim.tasks.dynamic.volume.compare import extinction_on
 from neuprim.tasks.dynamic.volume.dataset import FrameViews
 from neuprim.tasks.dynamic.volume.settings import choose_frames
+from neuprim.tasks.dynamic.volume.truth import extinction_on
 from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, recorded
 
 NUMBERS = (2, 9, 10, 11)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io import images
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.source import placement_of
+from neuprim.tasks.dynamic.volume.voxels import FrameVoxels
 
 __all__ = ["MEMORY", "MEMORY_TEST", "FrameViews", "Recording", "volume_dataset"]
 
@@ -155,7 +157,8 @@ def volume_dataset(
     learned = [c for c in range(len(capture.cameras)) if c not in held_out]
     train = FrameViews(capture, folder, learned, exposure, every)
     test = FrameViews(capture, folder, held_out, exposure, memory=MEMORY_TEST)
-    recording = Recording(name, capture, folder, exposure, [float(s["weight"]) for s in stored], every, test)
+    weights = [float(s["weight"]) for s in stored]
+    recording = Recording(name, capture, folder, exposure, weights, every, test)
     camera = capture.cameras[0]
     return Dataset(
         name=name,
@@ -173,6 +176,7 @@ def volume_dataset(
         bounds=torch.from_numpy(capture.bounds),
         exposure=exposure,
         placement=placement_of(capture),
+        points=FrameVoxels(capture, folder, train.frames, train.times, weights[::every], exposure),
         extra=recording,
     )
 
@@ -181,5 +185,5 @@ def _stored(path: Path) -> dict[str, Any]:
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in ("means", "colors", "weight", "brightest")}
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
         raise DataError(f"{path}: damaged ({error}); delete its folder to render the frame again") from error

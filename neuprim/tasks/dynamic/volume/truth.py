@@ -5,29 +5,41 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import torch
+from scipy import ndimage
 from torch import Tensor
 
 from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import VdbFrame, sequence
+from neuprim.core.volumes.grid import voxels_within
 from neuprim.core.volumes.truth import DensityTruth, TruthFrame
 from neuprim.tasks.dynamic.volume.capture import Capture
-from neuprim.tasks.dynamic.volume.compare import RESOLUTION, extinction_on
+from neuprim.tasks.dynamic.volume.medium import Medium
 
-__all__ = ["VolumeTruth"]
+__all__ = ["VolumeTruth", "extinction_on"]
+
+
+def extinction_on(medium: Medium, scene_from_index: Tensor, shape: tuple[int, int, int]) -> np.ndarray:
+    """(X, Y, Z) float32 extinction of the files at a lattice's points, trilinear."""
+    if medium.values.size == 0:
+        return np.zeros(shape, np.float32)
+    index = np.indices(shape, dtype=np.float64).reshape(3, -1)
+    chain = np.linalg.inv(medium.scene_from_index) @ scene_from_index.numpy()
+    points = chain[:3, :3] @ index + chain[:3, 3:]
+    found: np.ndarray = ndimage.map_coordinates(medium.values[..., 0], points, order=1, mode="constant", cval=0.0)
+    return found.reshape(shape).astype(np.float32)
 
 
 class VolumeTruth(DensityTruth):
     """Frames of ``path``, or the scene's own; grids, look, placement and times are those of the scene.
 
     A frame's time follows from its number: the scene's first is 0 and its last 1. Frames of a folder outside these are left out; a
-    single file outside them has no time.
+    single file outside them has no time. Models are compared with a frame on its own voxels, all that lie in the sequence's box.
 
     Raises:
         DataError: no file, or no frame within the scene's times.
     """
-
-    resolution = RESOLUTION
 
     def __init__(self, capture: Capture, path: Path | None = None) -> None:
         self.capture, self.bounds = capture, torch.from_numpy(capture.bounds).double()
@@ -42,6 +54,7 @@ class VolumeTruth(DensityTruth):
             number = re.findall(r"[0-9]{1,18}", path.stem)  # as in a folder, the last one counts
             found = [VdbFrame(int(number[-1]) if number else -1, path)]
         self._files = found
+        self._last: tuple[int, Medium] | None = None
         self.frames = [self._named(frame, first, last) for frame in found]
 
     @staticmethod
@@ -50,5 +63,21 @@ class VolumeTruth(DensityTruth):
         times = {"time": torch.tensor((frame.number - first) / max(last - first, 1))} if inside else {}
         return TruthFrame(frame.path.name, times)
 
+    def medium(self, frame: int) -> Medium:
+        """A frame's file as extinction and radiance; the last one stays in memory, as grids are asked for in parts."""
+        if self._last is None or self._last[0] != frame:
+            self._last = (frame, self.capture.medium(self._files[frame]))
+        return self._last[1]
+
+    def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
+        medium = self.medium(frame)
+        if medium.empty:
+            return None
+        inside = np.array(medium.values.shape[:3]) - 2.0  # but the empty layer around it
+        ends = np.stack(np.meshgrid(*np.stack([np.ones(3), inside], -1), indexing="ij"), -1).reshape(-1, 3)
+        corners = ends @ medium.scene_from_index[:3, :3].T + medium.scene_from_index[:3, 3]
+        low, high = self.bounds.numpy()
+        return voxels_within(np.stack([np.minimum(corners.min(0), low), np.maximum(corners.max(0), high)]), medium.scene_from_index)
+
     def grid(self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int]) -> Tensor:
-        return torch.from_numpy(extinction_on(self.capture.medium(self._files[frame]), scene_from_index, shape))
+        return torch.from_numpy(extinction_on(self.medium(frame), scene_from_index, shape))

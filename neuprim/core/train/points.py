@@ -1,0 +1,70 @@
+"""The loss on points where a data set knows extinction and source radiance, beside that on images."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neuprim.core.data import Dataset, PointSupervision
+from neuprim.core.data.check import check_samples
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render.output import Tally
+from neuprim.core.train.settings import TrainSettings
+from neuprim.core.volumes.points import Shares, values_at
+
+__all__ = ["PointStep", "point_step"]
+
+
+@dataclass(frozen=True)
+class PointStep:
+    """One frame's points, drawn and compared.
+
+    Attributes:
+        loss: with gradient. parts: its named parts, for the log.
+        psnr: of the extinction at the points, against the largest true one.
+        name: of the frame.
+        rows, shares: of the primitives that live in the frame, see :func:`~neuprim.core.volumes.points.values_at`.
+    """
+
+    loss: Tensor
+    parts: dict[str, float]
+    psnr: float
+    name: str
+    rows: Tensor | None
+    shares: Shares
+
+    def tally(self) -> Tally:
+        """What each primitive had a part in; call it after the backward pass."""
+        return Tally(self.shares.weight, self.shares.error_weight, self.rows)
+
+
+def point_step(
+    model: Primitives,
+    dataset: Dataset,
+    supervision: PointSupervision,
+    settings: TrainSettings,
+    generator: torch.Generator,
+    threads: int = 0,
+) -> PointStep:
+    """Draw points, look what the model holds there, and compare.
+
+    The loss is the mean square of errors over their scale: the extinction's, which is the square of its relative L2 error but for how
+    the points are spread, and ``train.voxel_colour`` times the source's.
+    """
+    samples = supervision.draw(settings.voxels_per_step, generator)
+    check_samples(samples, dataset)
+    colour = samples.source is not None and settings.voxel_colour > 0
+    found = values_at(model, samples.conditions, samples.points, colour, threads)
+    wrong = (found.sigma - samples.sigma) / samples.sigma_scale
+    loss = wrong.square().mean()
+    parts = {"voxel_sigma": loss.item()}
+    if found.source is not None and samples.source is not None:
+        light = ((found.source - samples.source) / samples.source_scale).square().mean()
+        parts["voxel_source"] = light.item()
+        loss = loss + settings.voxel_colour * light
+    peak = max(float(samples.sigma.max()), 1e-30) / samples.sigma_scale
+    psnr = -10 * math.log10(max(parts["voxel_sigma"] / peak**2, 1e-20))
+    return PointStep(loss, parts, psnr, samples.name, found.rows, found.watch(wrong.detach().abs()))

@@ -1,0 +1,92 @@
+"""How far a model's extinction is from that of a frame, on all the points that the truth names: of files, their own voxels.
+
+Both are asked for in blocks of planes, so that beside the truth's own memory a comparison takes a few tens of MB, however large the grid.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from torch import Tensor
+
+from neuprim.core.model.fields import Conditions
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.volumes.grid import density_grid
+from neuprim.core.volumes.truth import DensityTruth
+
+__all__ = ["NUMBERS", "Comparison", "blocks", "frame_errors"]
+
+NUMBERS = ("correlation", "relative_l2", "psnr_active", "max_error")
+"""What :func:`frame_errors` gives."""
+
+_BLOCK = 1 << 22
+"""Points at a time, 16 MiB of each grid."""
+
+_NO_ERROR = 1e-20
+"""An error below this share of the peak, squared, counts as this: 200 dB, as no number may be infinite."""
+
+
+class Comparison:
+    """Sums over the points of a grid, block by block, from which all numbers follow; float64."""
+
+    def __init__(self) -> None:
+        self.points = self.active = 0
+        self.sums = np.zeros(5)  # a, b, aa, bb, ab
+        self.error = self.error_active = self.peak = self.worst = 0.0
+
+    def add(self, truth: np.ndarray, found: np.ndarray) -> None:
+        """Two blocks of one shape."""
+        a, b = truth.reshape(-1).astype(np.float64), found.reshape(-1).astype(np.float64)
+        wrong = b - a
+        self.points += a.size
+        self.active += int(np.count_nonzero(a))
+        self.sums += (a.sum(), b.sum(), a @ a, b @ b, a @ b)
+        self.error += float(wrong @ wrong)
+        inside = wrong[a != 0]
+        self.error_active += float(inside @ inside)
+        self.peak = max(self.peak, float(a.max(initial=0.0)))
+        self.worst = max(self.worst, float(np.abs(wrong).max(initial=0.0)))
+
+    def numbers(self) -> dict[str, float] | None:
+        """See :data:`NUMBERS`; None where the truth is the same everywhere.
+
+        ``correlation`` is Pearson's, ``relative_l2`` |found - truth| / |truth|, both over all points; ``psnr_active`` is over those where the
+        truth is not 0, against its largest value; ``max_error`` is the largest error anywhere, as a share of that value.
+        """
+        n = max(self.points, 1)
+        a, b, aa, bb, ab = (float(x) for x in self.sums)
+        spread_a, spread_b = aa - a * a / n, bb - b * b / n
+        if not self.active or spread_a <= 1e-12 * aa:
+            return None
+        correlation = (ab - a * b / n) / math.sqrt(spread_a * spread_b) if spread_b > 1e-12 * bb else 0.0
+        share = self.error_active / self.active / self.peak**2
+        return {
+            "correlation": correlation,
+            "relative_l2": math.sqrt(self.error / aa),
+            "psnr_active": -10 * math.log10(max(share, _NO_ERROR)),
+            "max_error": self.worst / self.peak,
+        }
+
+
+def frame_errors(model: Primitives, conditions: Conditions, truth: DensityTruth, frame: int, threads: int = 0) -> dict[str, float] | None:
+    """The model under ``conditions`` against a frame of the truth, see :meth:`Comparison.numbers`; None where there is nothing to compare with."""
+    place = truth.points(frame)
+    if place is None:
+        return None
+    found = Comparison()
+    for matrix, shape in blocks(*place):
+        sigma = truth.grid(frame, matrix, shape).numpy()
+        found.add(sigma, density_grid(model, conditions, matrix, shape, threads).numpy())
+    return found.numbers()
+
+
+def blocks(scene_from_index: Tensor, shape: tuple[int, int, int]) -> list[tuple[Tensor, tuple[int, int, int]]]:
+    """The same points in parts of whole planes."""
+    planes = max(1, _BLOCK // max(1, shape[1] * shape[2]))
+    made = []
+    for x in range(0, shape[0], planes):
+        matrix = scene_from_index.clone()
+        matrix[:3, 3] += matrix[:3, 0] * x
+        made.append((matrix, (min(planes, shape[0] - x), shape[1], shape[2])))
+    return made

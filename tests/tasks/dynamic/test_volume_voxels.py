@@ -1,0 +1,189 @@
+"""Fitting a volume sequence to its voxels: what is drawn, what is learned, and that a run goes on where it stopped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from neuprim.config import compose
+from neuprim.core.data.points import PointSamples
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.train.trainer import Trainer
+from neuprim.runs.fit import fit, start
+from neuprim.tasks.dynamic.volume import voxels as module
+from neuprim.tasks.dynamic.volume.voxels import FrameVoxels, Voxels
+from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, recorded
+
+SMALL = ["scene.size=24", "scene.cameras=6", "scene.samples=1", "model.primitives=80", "model.neurons=0", "train.max_seconds=null"]
+SOFT = ["model.density.edge=2", "model.density.gain=true"]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Frames 1 to 4 of a ball that moves along x, and an empty frame 5."""
+    folder = tmp_path_factory.mktemp("ball")
+    for number in range(1, 5):
+        write_vdb(folder / f"ball_{number}.vdb", blob(6.0 + 3 * number))
+    empty = Grid.from_dense("density", np.zeros((8, 8, 8), np.float32), transform=scale_transform(VOXEL))
+    write_vdb(folder / "ball_5.vdb", [empty])
+    return folder
+
+
+def supervision(folder: Path, tmp_path: Path, **changes: Any) -> FrameVoxels:
+    found = dataset(folder, tmp_path, **changes).points
+    assert isinstance(found, FrameVoxels)
+    return found
+
+
+def frames_of(points: FrameVoxels, draws: int, count: int = 400) -> dict[str, list[PointSamples]]:
+    generator, found = torch.Generator().manual_seed(0), dict[str, list[PointSamples]]()
+    for _ in range(draws):
+        samples = points.draw(count, generator)
+        found.setdefault(samples.name, []).append(samples)
+    return found
+
+
+def words(folder: Path, *more: str) -> list[str]:
+    return ["task=dynamic", "scene=vdb", f"scene.vdb='{folder}'", "scene.look=smoke_fire", *SMALL, *SOFT, *more]
+
+
+def trainer(folder: Path, *more: str) -> Trainer:
+    return start(compose(words(folder, *more), check_output=False)).trainer
+
+
+# ---------------------------------------------------------------- what is drawn
+
+
+def test_points_are_voxel_centres_with_the_files_own_values(files: Path, tmp_path: Path) -> None:
+    data = dataset(files, tmp_path)
+    assert isinstance(data.points, FrameVoxels)
+    drawn = frames_of(data.points, 300)
+    capture = recorded(data).capture
+    assert sorted(drawn) == [f"frame_{n:04d}" for n in range(1, 6)]
+    for frame in capture.frames[:4]:
+        medium = capture.medium(frame)
+        for samples in drawn[f"frame_{frame.number:04d}"]:
+            assert float(samples.conditions["time"]) == pytest.approx((frame.number - 1) / 4)
+            index = samples.points.double().numpy() @ medium.index_from_scene[:3, :3].T + medium.index_from_scene[:3, 3]
+            assert np.abs(index - np.rint(index)).max() < 1e-3
+            cells = np.rint(index).astype(int)
+            inside = ((cells >= 0) & (cells < medium.values.shape[:3])).all(1)
+            expected = np.zeros((len(cells), 4), np.float32)
+            expected[inside] = medium.values[tuple(cells[inside].T)]
+            assert np.array_equal(samples.sigma.numpy(), expected[:, 0])
+            assert samples.source is not None
+            assert np.allclose(samples.source.numpy(), expected[:, 1:] / data.exposure)
+            full = medium.values[..., 0][medium.values[..., 0] > 0].astype(float)
+            assert samples.sigma_scale == pytest.approx(np.sqrt((full**2).mean()), rel=1e-5)
+            share = float((samples.sigma > 0).float().mean())
+            assert 0.7 <= share < 0.98 and not inside.all()  # some lie beside the matter, some beyond the box
+
+
+def test_an_empty_frame_is_learned_as_empty(files: Path, tmp_path: Path) -> None:
+    for samples in frames_of(supervision(files, tmp_path), 300)["frame_0005"]:
+        assert len(samples.points) == 400 and not bool(samples.sigma.any()) and samples.sigma_scale > 1
+        assert samples.source is not None and not bool(samples.source.any()) and samples.source_scale > 0
+
+
+def test_a_chunk_of_a_sequence_and_frames_left_out(files: Path, tmp_path: Path) -> None:
+    assert set(frames_of(supervision(files, tmp_path, frames="2:3"), 20)) == {"frame_0002", "frame_0003"}
+    assert set(frames_of(supervision(files, tmp_path, train_every=2), 300)) == {"frame_0001", "frame_0003", "frame_0005"}
+
+
+def test_the_generator_alone_decides(files: Path, tmp_path: Path) -> None:
+    points = supervision(files, tmp_path)
+    made = [[points.draw(50, g) for _ in range(6)] for g in (torch.Generator().manual_seed(1), torch.Generator().manual_seed(1))]
+    for a, b in zip(*made, strict=True):
+        assert a.name == b.name and torch.equal(a.points, b.points) and torch.equal(a.sigma, b.sigma)
+
+
+def test_voxels_are_read_once_kept_beside_the_images_and_bounded(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = supervision(files, tmp_path)
+    read = [first.voxels(t) for t in range(5)]
+    reads: list[int] = []
+    monkeypatch.setattr(type(first.capture), "medium", lambda self, frame: reads.append(frame.number))
+    again = supervision(files, tmp_path)
+    again.memory = read[0].bytes + read[1].bytes
+    for t, expected in enumerate(read):
+        found = again.voxels(t)
+        assert np.array_equal(found.index, expected.index) and np.array_equal(found.values, expected.values)
+        assert sum(v.bytes for v in again._kept.values()) <= again.memory
+    assert not reads
+    path = again.capture.points(again.folder, again.frames[0]).with_name("voxels.npz")
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(DataError, match=r"voxels\.npz: damaged .*delete it"):
+        supervision(files, tmp_path).voxels(0)
+
+
+def test_values_at_indices_are_those_of_the_grid() -> None:
+    rng = np.random.default_rng(0)
+    values = np.where(rng.random((5, 4, 6, 1)) > 0.6, rng.random((5, 4, 6, 4)), 0).astype(np.float32)
+    index = np.flatnonzero(values.reshape(-1, 4).any(1))
+    voxels = Voxels(index, values.reshape(-1, 4)[index], (5, 4, 6), np.eye(4))
+    cells = np.stack(np.meshgrid(*(np.arange(-2, n + 2) for n in (5, 4, 6)), indexing="ij"), -1).reshape(-1, 3)
+    padded = np.pad(values, ((2, 2), (2, 2), (2, 2), (0, 0)))
+    assert np.array_equal(voxels.at(cells), padded.reshape(-1, 4))
+
+
+# ---------------------------------------------------------------- what is learned
+
+
+@pytest.mark.parametrize("supervision", ["voxels", "both"])
+def test_it_learns_the_voxels_better_than_images_alone(files: Path, supervision: str) -> None:
+    budget = ["train.iterations=300", "train.voxels_per_step=1000", "scene.frames='1:4'"]
+    results = {}
+    for kind in ("images", supervision):
+        results[kind] = fit(compose(words(files, *budget, f"train.supervision={kind}"), check_output=False)).metrics()
+    images, voxels = results["images"], results[supervision]
+    assert voxels["sigma_relative_l2_middle"] < 0.6 * images["sigma_relative_l2_middle"]
+    assert voxels["psnr_mask"] > voxels["psnr_black_image_mask"] + (2 if supervision == "voxels" else 4)
+
+
+@pytest.mark.parametrize("supervision", ["voxels", "both"])
+@pytest.mark.parametrize("strategy", ["fixed", "relocate", "gradient"])
+def test_a_run_goes_on_where_it_stopped(files: Path, supervision: str, strategy: str) -> None:
+    more = [f"train.supervision={supervision}", "train.iterations=24", "train.voxels_per_step=200", f"train.population.strategy={strategy}"]
+    more += ["train.population.every=5", "train.population.start=0", "train.population.stop=1"]
+    whole, half, rest = (trainer(files, *more) for _ in range(3))
+    reports = list(whole.run())
+    for _ in range(11):
+        half.train_step()
+    rest.load_state(*half.state(), "here")
+    assert [(r.loss, r.psnr, r.view, r.primitives) for r in rest.run()] == [(r.loss, r.psnr, r.view, r.primitives) for r in reports[11:]]
+    a, b = whole.state(), rest.state()
+    assert a[0].keys() == b[0].keys() and all(torch.equal(value, b[0][name]) for name, value in a[0].items())
+    assert {"voxel_sigma", "voxel_source"} <= reports[0].parts.keys()
+    assert reports[0].view.startswith("frame_" if supervision == "voxels" else "cam_")
+
+
+def test_images_alone_draw_no_points(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = trainer(files, "train.iterations=3")
+    monkeypatch.setattr(module.FrameVoxels, "draw", lambda *args: pytest.fail("drawn"))
+    assert len(list(plain.run())) == 3
+
+
+def test_the_preset_learns_from_both_with_soft_edges(files: Path) -> None:
+    small = [*SMALL[:3], "model.primitives=50", "train.iterations=4", "train.max_seconds=null"]
+    words = ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'", "scene.look=smoke_fire", "preset=voxels", *small]
+    found = start(compose(words, check_output=False)).trainer
+    assert {"voxel_sigma", "voxel_source"} <= found.train_step().parts.keys()
+    assert found.model.density.settings() == {"neurons": 0, "edge": 2, "gain": True, "time": "window+motion"}
+    assert found.model.parameters_per_primitive == 23
+
+
+def test_colour_may_be_left_to_the_images(files: Path) -> None:
+    found = trainer(files, "train.supervision=voxels", "train.voxel_colour=0", "train.iterations=3")
+    before = found.model.params["sh_dc"].clone()
+    assert all("voxel_source" not in r.parts for r in found.run())
+    assert torch.equal(found.model.params["sh_dc"].detach(), before.detach())
+
+
+def test_data_without_voxels_are_refused_by_name() -> None:
+    words = ["task=static", "scene=solids", "scene.size=16", "scene.train_views=4", "scene.test_views=1", "model.primitives=10"]
+    with pytest.raises(ConfigError, match=r"^train\.supervision=both: .* has no voxels to learn from; expected images$"):
+        start(compose([*words, "train.supervision=both"], check_output=False))

@@ -36,12 +36,11 @@ RESULTS = Path(__file__).parent / "results" / "voxels.json"
 SIZE = 96
 SOFT = ("model.density.edge=2", "model.density.gain=true")
 FORMS = {
-    "K = 8, p = 0": ("model.neurons=8",),
+    "K = 8, p = 0": ("model.neurons=8", "model.density.edge=0", "model.density.gain=false"),
     "K = 0, p = 2, gain": ("model.neurons=0", *SOFT),
     "K = 2, p = 2, gain": ("model.neurons=2", *SOFT),
-    "preset voxels": ("preset=voxels",),
 }
-"""All but the last with the starting values and rates of the preset quick."""
+"""All with the starting values and rates of the preset quick."""
 
 SOURCES = ("images", "both", "voxels")
 THIRDS = ("early", "middle", "late")

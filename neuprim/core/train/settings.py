@@ -81,7 +81,7 @@ class TrainSettings:
         adam_beta2: decay of Adam's second moment per step, in [0, 1).
         warmup_steps: steps over which the rates rise linearly from zero.
         supervision: what is learned from: "images", "voxels" (points of the files that the images were made of, where the data set has
-            them), or "both".
+            them), "both", or "auto": both where the data set has voxels, else images.
         voxels_per_step: points of one frame that a step looks at.
         voxel_weight: both: weight of the points' loss beside the images'.
         voxel_colour: weight of the source radiance at the points beside their extinction; 0 leaves colours to the images.
@@ -100,7 +100,7 @@ class TrainSettings:
     final_rate: Annotated[float, Range(above=0, at_most=1)] = 0.05
     adam_beta2: Annotated[float, Range(at_least=0, below=1)] = 0.999
     warmup_steps: Annotated[int, Range(at_least=0)] = 0
-    supervision: Literal["images", "voxels", "both"] = "images"
+    supervision: Literal["auto", "images", "voxels", "both"] = "images"
     voxels_per_step: Annotated[int, Range(1, 1_000_000)] = 8192
     voxel_weight: NotNegative = 0.1
     voxel_colour: NotNegative = 0.1

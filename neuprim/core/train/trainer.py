@@ -132,6 +132,8 @@ class Trainer:
         for key in settings.rates:
             if key not in names:
                 raise ConfigError(f"train.rates.{key}: no such parameter{nearest(key, names)}")
+        if settings.supervision == "auto":
+            settings = replace(settings, supervision="images" if dataset.points is None else "both")
         if settings.supervision != "images" and dataset.points is None:
             raise ConfigError(f"train.supervision={settings.supervision}: {dataset.name} has no voxels to learn from; expected images")
         self.model, self.dataset, self.loss = model, dataset, loss

@@ -167,13 +167,19 @@ def test_images_alone_draw_no_points(files: Path, monkeypatch: pytest.MonkeyPatc
     assert len(list(plain.run())) == 3
 
 
-def test_the_preset_learns_from_both_with_soft_edges(files: Path) -> None:
+def test_the_preset_quick_learns_from_both_where_there_are_voxels(files: Path, tmp_path: Path) -> None:
     small = [*SMALL[:3], "model.primitives=50", "train.iterations=4", "train.max_seconds=null"]
-    words = ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'", "scene.look=smoke_fire", "preset=voxels", *small]
+    words = ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'", "scene.look=smoke_fire", *small]
     found = start(compose(words, check_output=False)).trainer
     assert {"voxel_sigma", "voxel_source"} <= found.train_step().parts.keys()
     assert found.model.density.settings() == {"neurons": 0, "edge": 2, "gain": True, "time": "window+motion"}
     assert found.model.parameters_per_primitive == 23
+
+
+def test_auto_is_images_where_there_are_no_voxels() -> None:
+    words = ["task=static", "scene=solids", "scene.size=16", "scene.train_views=4", "scene.test_views=1", "model.primitives=10"]
+    found = start(compose([*words, "train.supervision=auto"], check_output=False)).trainer
+    assert found.settings.supervision == "images" and "voxel_sigma" not in found.train_step().parts
 
 
 def test_colour_may_be_left_to_the_images(files: Path) -> None:

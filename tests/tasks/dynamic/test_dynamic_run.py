@@ -160,7 +160,8 @@ def test_every_variant_runs(files: Path, tmp_path: Path, time: str) -> None:
     folder = fit(
         files, tmp_path / "run", "train.iterations=5", f"model.density.time={time}", "model.colour.powers=4", "model.colour.waves=4"
     )
-    assert load_run(folder)[2].density.settings() == {"neurons": 2, "time": time if time != "window+phase" else "phase+window"}
+    named = time if time != "window+phase" else "phase+window"
+    assert load_run(folder)[2].density.settings() == {"neurons": 2, "edge": 2, "gain": True, "time": named}
 
 
 def test_the_papers_preset_runs(files: Path, tmp_path: Path) -> None:

@@ -162,7 +162,7 @@ def test_a_run_goes_on_where_it_stopped(files: Path, supervision: str, strategy:
 
 
 def test_images_alone_draw_no_points(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = trainer(files, "train.iterations=3")
+    plain = trainer(files, "train.iterations=3", "train.supervision=images")
     monkeypatch.setattr(module.FrameVoxels, "draw", lambda *args: pytest.fail("drawn"))
     assert len(list(plain.run())) == 3
 

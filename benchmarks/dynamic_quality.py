@@ -1,14 +1,17 @@
 """Quality of the dynamic task on a real sequence, and which way of varying in time is worth its parameters.
 
-    python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--rows 2000x60 5000x300] [--seeds 3]
-        [--parts main variants control between] [--readme] [--docs]
+    python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--rows 2000x60 5000x300] [--presets quick equations] [--seeds 3]
+        [--parts main variants control between equations] [--edges 0 2] [--neurons 8] [--gain] [--readme] [--docs]
 
 DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free fire animation, frames 1 to 40). Parts:
 
-    main       preset quick by primitives and seconds (--rows)
+    main       presets by primitives and seconds (--rows); presets other than quick get as many primitives as have its bytes
     variants   ways of varying in time, 2,000 primitives, the same iterations; a table of parameters and quality
     control    times shuffled among the training images: a model of time must lose by it
     between    every second frame is learned; the others are compared with the real ones, and steps between frames are measured
+    equations  the form of preset quick, that of the paper's equations 10 to 13 and their union, for each of --edges and --neurons, all at
+               the bytes of --primitives of quick's with 8 neurons; the same iterations (with --seconds N instead: the same time). Without
+               neurons equation 13 changes nothing, and the equations' colour alone varies
 
 Images are 96 x 96, 40 cameras (two held out), linear RGB over the exposure's peak, black background; means over seeds +- half the
 spread, of the last checkpoint. Results go to benchmarks/results/dynamic_quality.json, part by part. --docs puts the recorded tables
@@ -33,9 +36,12 @@ from shared.tables import README, ROOT, between_markers, spread
 from neuprim.config import compose
 from neuprim.core.compute.threads import core_count
 from neuprim.core.data import Dataset
+from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import complete, start
 from neuprim.runs.measure import draw
+from neuprim.tasks.dynamic.colour import TimeHarmonics
+from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.dynamic.judging import recording_of
 from neuprim.tasks.dynamic.volume.dataset import Recording
 
@@ -47,6 +53,13 @@ VARIANTS = {
     "phase, colour in time": ("model.density.time=phase", *COLOUR),
     "window+motion, colour in time": ("model.density.time=window+motion", *COLOUR),
 }
+FORMS = {
+    "quick: window, motion": ("model.density.time=window+motion",),
+    "equations 10 to 13, degree 3": ("preset=equations",),
+    "equations 10 to 13, degree 0": ("preset=equations", "model.sh_degree=0"),
+    "union: phase, window, motion, colour in time": ("model.density.time=phase+window+motion", *COLOUR),
+}
+WHICH = {"quick": ": windows and motion", "equations": ": the paper's equations 10 to 13"}
 KEYS = (
     "psnr", "psnr_mask", "psnr_pooled_mask", "psnr_black_image", "psnr_black_image_mask", "psnr_srgb", "ssim", "ssim_srgb",
     "sigma_correlation_early", "sigma_correlation_middle", "sigma_correlation_late",
@@ -61,6 +74,18 @@ def fit(words: list[str], change: Callable[[Trainer], None] = lambda trainer: No
     fitted = start(compose(["task=dynamic", *words], check_output=False))
     change(fitted.trainer)
     return fitted.trainer, complete(fitted).metrics()
+
+
+def numbers(*words: str) -> int:
+    """Numbers per primitive of a form whose colours are red, green and blue."""
+    model = compose(["task=dynamic", *words], check_output=False).model
+    fields = TimeDensity(model.neurons, **model.density), TimeHarmonics(model.sh_degree, 3, model.sh_every, **model.colour)
+    return sum(spec.size for spec in (*GEOMETRY_SPECS, *fields[0].parameters(), *fields[1].parameters()))
+
+
+def as_many_bytes(primitives: int, *words: str) -> int:
+    """How many primitives of a form have the bytes of ``primitives`` of the preset quick."""
+    return max(round(primitives * numbers() / numbers(*words)), 1)
 
 
 def shuffled_times(trainer: Trainer) -> None:
@@ -120,6 +145,13 @@ def main() -> None:
     parser.add_argument("--frames", default="1:40")
     parser.add_argument("--parts", nargs="*", default=["main", "variants", "control", "between"])
     parser.add_argument("--rows", nargs="*", default=["2000x60", "5000x300"], help="PRIMITIVESxSECONDS")
+    parser.add_argument("--presets", nargs="*", default=["quick", "equations"], help="of main")
+    parser.add_argument("--edges", nargs="*", type=int, default=[0, 2], help="of equations")
+    parser.add_argument("--neurons", nargs="*", type=int, default=[8], help="of equations")
+    parser.add_argument("--forms", nargs="*", default=list(FORMS), help="of equations")
+    parser.add_argument("--gain", action="store_true", help="of equations: forms with a soft edge have a gain")
+    parser.add_argument("--primitives", type=int, default=2000, help="of equations")
+    parser.add_argument("--seconds", type=float, help="of equations")
     parser.add_argument("--variants", nargs="*", default=list(VARIANTS))
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--iterations", type=int, default=2500, help="of every run but those of main")
@@ -144,16 +176,31 @@ def main() -> None:
             recorded[part] = []
         rows = [tuple(int(n) for n in row.split("x")) for row in args.rows]
         if "main" in args.parts:
-            recorded["main"] = [e for e in recorded.get("main", []) if _row(e) not in rows]
+            recorded["main"] = [e for e in recorded.get("main", []) if _budget(e) not in rows or preset_of(e) not in args.presets]
+        if "equations" in args.parts:
+            grid = set(itertools.product(args.forms, args.edges, args.neurons))
+            recorded["equations"] = [e for e in recorded.get("equations", []) if (e["form"], e["edge"], e["neurons"]) not in grid]
         if "variants" in args.parts:
             recorded["variants"] = [e for e in recorded.get("variants", []) if e["time"] not in args.variants]
         for seed in range(args.seeds):
             own = [*data, f"seed={seed}"]
             if "main" in args.parts:
-                for primitives, seconds in rows:
-                    budget = [f"model.primitives={primitives}", f"train.max_seconds={seconds}", "train.iterations=1000000"]
-                    _, m = fit([*own, *budget])
-                    keep("main", {k: m[k] for k in KEYS} | {"per_frame": [round(f["psnr_mask"], 3) for f in m["per_frame"]]})
+                for (primitives, seconds), preset in itertools.product(rows, args.presets):
+                    count = as_many_bytes(primitives, f"preset={preset}")
+                    budget = [f"model.primitives={count}", f"train.max_seconds={seconds}", "train.iterations=1000000"]
+                    _, m = fit([*own, f"preset={preset}", *budget])
+                    named = {"preset": preset, "as_many_as": primitives}
+                    keep("main", named | {k: m[k] for k in KEYS} | {"per_frame": [round(f["psnr_mask"], 3) for f in m["per_frame"]]})
+            if "equations" in args.parts:
+                for form, edge, neurons in itertools.product(args.forms, args.edges, args.neurons):
+                    words = [*FORMS[form], f"model.density.edge={edge}", f"model.neurons={neurons}"]
+                    words += ["model.density.gain=true"] if args.gain and edge else []
+                    budget = [f"train.max_seconds={args.seconds}", "train.iterations=1000000"] if args.seconds else short[1:]
+                    _, m = fit([*own, *budget, *words, f"model.primitives={as_many_bytes(args.primitives, *words)}"])
+                    keep(
+                        "equations",
+                        {"form": form, "edge": edge, "neurons": neurons, "gain": args.gain and edge > 0, **{k: m[k] for k in KEYS}},
+                    )
             if "variants" in args.parts:
                 for time in args.variants:
                     _, m = fit([*own, *short, *VARIANTS[time]])
@@ -167,10 +214,16 @@ def main() -> None:
                     trainer, m = fit([*own, *short, f"scene.train_every={every}"])
                     base = {"repeat": repeat_neighbour(trainer)} if every > 1 else {}
                     keep("between", {"every": every, "seed": seed, **between_frames(trainer), **base})
-    note = f"\nMeans over seeds ± half the spread; {recorded['cores']} cores of {recorded['cpu']}."
-    tables = {"dynamic-quality": main_table, "dynamic-variants": variants_table, "dynamic-control": control_table}
+    note = f"\n\nMeans over seeds ± half the spread; {recorded['cores']} cores of {recorded['cpu']}."
+    tables = {
+        "dynamic-quality": main_table,
+        "dynamic-variants": variants_table,
+        "dynamic-control": control_table,
+        "dynamic-equations": equations_table,
+    }
     for name, make in tables.items():
-        text = make(recorded) + "\n" + note
+        text = make(recorded)
+        text += note if text else ""
         if args.docs:
             between_markers(ROOT / "docs" / "dynamic.md", name, text)
         print(f"\n{text}")
@@ -182,16 +235,27 @@ def _spread(runs: list[dict[str, Any]], key: str, digits: int = 2) -> str:
     return spread([r[key] for r in runs], digits) if runs else "–"
 
 
-def _row(run: dict[str, Any]) -> tuple[int, int]:
-    return run["primitives"], round(run["train_seconds"])
+def preset_of(run: dict[str, Any]) -> str:
+    return str(run.get("preset", "quick"))
+
+
+def _budget(run: dict[str, Any]) -> tuple[int, int]:
+    """Primitives of the preset quick with as many bytes, and seconds."""
+    return run.get("as_many_as", run["primitives"]), round(run["train_seconds"])
+
+
+def _columns(runs: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+    """The runs of each budget and preset, quick first."""
+    keys = sorted({(_budget(r), preset_of(r) != "quick", preset_of(r)) for r in runs})
+    return [[r for r in runs if (_budget(r), preset_of(r)) == (budget, preset)] for budget, _, preset in keys]
 
 
 def main_table(recorded: dict[str, Any]) -> str:
-    """One column per budget, one row per number, beside what a black image scores."""
+    """One column per budget and preset, one row per number, beside what a black image scores."""
     runs = recorded.get("main", [])
     if not runs:
         return "not measured"
-    columns = [[r for r in runs if _row(r) == row] for row in sorted({_row(r) for r in runs})]
+    columns = _columns(runs)
     black, inside = runs[0]["psnr_black_image"], runs[0]["psnr_black_image_mask"]
 
     def line(name: str, cell: Callable[[list[dict[str, Any]]], str], baseline: str = "") -> str:
@@ -201,7 +265,7 @@ def main_table(recorded: dict[str, Any]) -> str:
         return lambda own: " / ".join(_spread(own, f"sigma_{key}_{third}", 3) for third in ("early", "middle", "late"))
 
     return "\n".join([
-        line("", lambda own: f"{own[0]['primitives']:,} primitives, {own[0]['train_seconds']:.0f} s", "black image"),
+        line("", lambda own: f"`{preset_of(own[0])}`, {own[0]['primitives']:,} primitives, {own[0]['train_seconds']:.0f} s", "black image"),
         "| --- |" + " --- |" * (len(columns) + 1),
         line("PSNR, whole image", lambda own: f"{_spread(own, 'psnr')} dB", f"{black:.1f} dB"),
         line("PSNR inside the union mask", lambda own: f"{_spread(own, 'psnr_mask')} dB", f"{inside:.1f} dB"),
@@ -223,16 +287,16 @@ def short_table(recorded: dict[str, Any]) -> str:
         return "not measured"
     frames = len(runs[0]["per_frame"])
     lines = [
-        f"| EmberGen fire, {SIZE}×{SIZE} | primitives | training | PSNR | PSNR inside the mask | SSIM | hardest of {frames} frames, inside the mask |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-        f"| black image |  |  | {runs[0]['psnr_black_image']:.1f} dB | {runs[0]['psnr_black_image_mask']:.1f} dB |  |  |",
+        f"| EmberGen fire, {SIZE}×{SIZE} | primitives | model | training | PSNR | PSNR inside the mask | SSIM | hardest of {frames} frames, inside the mask |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        f"| black image |  |  |  | {runs[0]['psnr_black_image']:.1f} dB | {runs[0]['psnr_black_image_mask']:.1f} dB |  |  |",
     ]
-    for row in sorted({_row(r) for r in runs}):
-        own = [r for r in runs if _row(r) == row]
+    for own in _columns(runs):
         hardest = min(range(frames), key=lambda t: statistics.mean(r["per_frame"][t] for r in own))
-        worst = spread([r["per_frame"][hardest] for r in own], 1)
+        worst, preset = spread([r["per_frame"][hardest] for r in own], 1), preset_of(own[0])
         lines.append(
-            f"| preset `quick` | {row[0]:,} | {row[1]} s | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB "
+            f"| preset `{preset}`{WHICH.get(preset, '')} | {own[0]['primitives']:,} | {own[0]['model_bytes'] / 1e6:.2f} MB "
+            f"| {_budget(own[0])[1]} s | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB "
             f"| {_spread(own, 'ssim', 4)} | frame {hardest + 1}: {worst} dB |"
         )
     return "\n".join(lines)
@@ -257,6 +321,29 @@ def variants_table(recorded: dict[str, Any]) -> str:
             f"\n{runs[0]['primitives']:,} primitives, {runs[0]['iterations']:,} iterations, {len({r['seed'] for r in runs})} seed(s)."
         )
     return "\n".join(lines)
+
+
+def equations_table(recorded: dict[str, Any]) -> str:
+    """The forms of quick, of the paper's equations and their union by edge and neurons, all at equal bytes; nothing where none was measured."""
+    runs = recorded.get("equations", [])
+    if not runs:
+        return ""
+    lines = [
+        "| form | edge | K | numbers | primitives | PSNR | inside the mask | pooled, inside | invisible | ms a step |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for key in dict.fromkeys((r["form"], r["edge"], r["neurons"]) for r in runs):
+        own = [r for r in runs if (r["form"], r["edge"], r["neurons"]) == key]
+        step = 1e3 * statistics.mean(r["train_seconds"] / r["iterations"] for r in own)
+        lines.append(
+            f"| {key[0]} | {key[1]}{', gain' if own[0]['gain'] else ''} | {key[2]} | {own[0]['parameters_per_primitive']} "
+            f"| {own[0]['primitives']:,} | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB | {_spread(own, 'psnr_pooled_mask')} dB "
+            f"| {100 * statistics.mean(r['invisible_fraction'] for r in own):.0f} % | {step:.0f} |"
+        )
+    steps = [r["iterations"] for r in runs]
+    many = f"{steps[0]:,}" if len(set(steps)) == 1 else f"{min(steps):,} to {max(steps):,}"
+    seeds = len({r["seed"] for r in runs})
+    return "\n".join([*lines, "", f"{runs[0]['model_bytes'] / 1e6:.2f} MB each, {many} iterations, {seeds} seed(s)."])
 
 
 def control_table(recorded: dict[str, Any]) -> str:

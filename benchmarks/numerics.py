@@ -1,13 +1,13 @@
-"""Worst errors of every backend over the named extremes of the input space.
+"""Worst errors of every backend over the named extremes of the input space, for the three edges.
 
-    python benchmarks/numerics.py [--coarse] [--cases N] [--regions NAME ...] [--markdown FILE]
+    python benchmarks/numerics.py [--coarse] [--cases N] [--regions NAME ...] [--edges 0 1 2] [--markdown FILE]
 
-Prints one line per region, backend and precision; exits with status 1 when a bound is broken. A backend and precision is
-"cpu float32", "reference float32" (float32 parameters, float64 inside) or "reference float64". The oracle runs in extended
-precision and shares no code with the backends; gradients are compared with the float64 reference's.
+Prints one line per region, backend and precision, with the edges' numbers side by side; exits with status 1 when a bound is broken. A
+backend and precision is "cpu float32", "reference float32" (float32 parameters, float64 inside) or "reference float64". The oracle runs in
+extended precision and shares no code with the backends; gradients are compared with the float64 reference's.
 
-- error/S: of the optical depth of a chord, S = (2h/m)(|b2| + sum |w2|), on chords of at least 0.45 of the central one.
-- thin: on shorter chords, misses included, error/S x (S/S_c)^2, S_c the central chord's S.
+- error/S: of the optical depth of a chord, S = (N_p h/m)(|b2| + sum |w2|), N = 2, 4/3, 16/15, on chords of at least 0.45 of the central one.
+- thin: on shorter chords, misses included, error/S_c (S_c/S)^(2p - 1), S_c the central chord's S.
 - gradient: error of a parameter's gradient over the gradient's norm, over four random functionals of the image.
 
 --markdown writes the table with an introduction; docs/numerical_limits.md is made that way.
@@ -23,7 +23,8 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from tests.numerics.extremes.sweep import document, sweep, table
+from neuprim.core.model.edge import EDGES
+from tests.numerics.extremes.sweep import document, line, sweep, table
 
 
 def main() -> int:
@@ -31,24 +32,25 @@ def main() -> int:
     parser.add_argument("--coarse", action="store_true", help="3 cases per region instead of 40")
     parser.add_argument("--cases", type=int, help="cases per region")
     parser.add_argument("--regions", nargs="*", default=[], help="only regions whose name contains one of these")
+    parser.add_argument("--edges", nargs="*", type=int, choices=EDGES, default=EDGES)
     parser.add_argument("--markdown", type=Path, help="write the documentation page here")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    results = []
+    rows = []
     cases = args.cases or (3 if args.coarse else 40)
     print(table([]), flush=True)
-    for result in sweep(cases, args.regions):
-        print(result.line(), flush=True)
-        results.append(result)
-    if not results:
+    for row in sweep(cases, args.regions, args.edges):
+        print(line(row), flush=True)
+        rows.append(row)
+    if not rows:
         print(f"no region contains {args.regions}", file=sys.stderr)
         return 2
     if args.markdown:
-        args.markdown.write_text(document(results, cases))
-    broken = [r for r in results if r.broken]
-    for r in broken:
-        print(f"broken: {r.label}: {', '.join(r.broken)}", file=sys.stderr)
-    print(f"{len(results)} rows, {len(broken)} broken")
+        args.markdown.write_text(document(rows, cases))
+    broken = [result for row in rows for result in row if result.broken]
+    for result in broken:
+        print(f"broken: {result.label}: {', '.join(result.broken)}", file=sys.stderr)
+    print(f"{len(rows)} rows, {len(broken)} results broken")
     return 1 if broken else 0
 
 

@@ -53,6 +53,29 @@ def test_tables_are_those_of_the_recorded_results(task: str, page: str, full: st
     assert re.search(r"\d+×\d+", header) and "primitives" in header and "training" in header and "hardest" in header
 
 
+def test_the_dynamic_tables_say_which_preset_is_which(benchmark: Callable[[str], ModuleType]) -> None:
+    script = benchmark("dynamic_quality")
+    recorded: dict[str, Any] = json.loads((RESULTS / "dynamic_quality.json").read_text(encoding="utf-8"))
+    quick = [run for run in recorded["main"] if script.preset_of(run) == "quick"]
+    other = [
+        run
+        | {
+            "preset": "equations",
+            "as_many_as": run["primitives"],
+            "primitives": script.as_many_bytes(run["primitives"], "preset=equations"),
+        }
+        for run in quick
+    ]
+    short = script.short_table({"main": [*other, *quick]}).splitlines()
+    assert len(short) == 5 and "windows and motion | 5,000 |" in short[3] and "equations 10 to 13 | 2,168 |" in short[4]
+    full = script.main_table({"main": [*other, *quick]}).splitlines()
+    assert (
+        "`quick`, 5,000 primitives" in full[0]
+        and "`equations`, 2,168 primitives" in full[0]
+        and len({line.count("|") for line in full}) == 1
+    )
+
+
 @pytest.mark.parametrize("task", ["static", "dynamic", "relight"])
 def test_a_benchmark_rewrites_its_tables_without_measuring(
     task: str, benchmark: Callable[[str], ModuleType], tmp_path: Any, monkeypatch: pytest.MonkeyPatch

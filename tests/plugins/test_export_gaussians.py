@@ -14,6 +14,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.io.ply import read_ply
 from neuprim.core.model.colours import sh
 from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.edge import NORMS
 from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.settings import ModelSettings
@@ -21,7 +22,7 @@ from neuprim.core.train.trainer import initial_model
 from neuprim.plugins.export import appearance
 from neuprim.plugins.export.appearance import Harmonics, harmonics_of
 from neuprim.plugins.export.gaussian_ply import LAYOUT
-from neuprim.plugins.export.gaussians import Gaussians, draw_gaussians, fit_gaussians
+from neuprim.plugins.export.gaussians import SIZES, Gaussians, draw_gaussians, fit_gaussians
 from neuprim.plugins.registry import load_task
 from neuprim.runs.export import export_run
 from neuprim.runs.open import open_run
@@ -45,7 +46,7 @@ def one_ellipsoid(tmp_path: Path, thickness: float = 6.0) -> Path:
 
 def test_moments_of_a_constant_density_are_those_of_an_ellipsoid(tmp_path: Path) -> None:
     run = open_run(one_ellipsoid(tmp_path))
-    g = fit_gaussians(run, {}, footprint=False)
+    g = fit_gaussians(run, {}, "moments")
     axes = quaternion_to_matrix(run.model.params["quats"].double())[0] * torch.tensor([0.4, 0.2, 0.1], dtype=torch.float64)
     assert torch.allclose(g.means[0], torch.tensor([0.5, 0.7, 0.9], dtype=torch.float64), atol=1e-3)
     assert torch.allclose(g.covariances[0], axes @ axes.T / 5, rtol=0.02, atol=1e-4)
@@ -62,16 +63,36 @@ def test_a_density_on_one_side_moves_the_mean_there(tmp_path: Path) -> None:
     rows["quats"] = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
     rows["W1"], rows["b1"] = torch.tensor([[[0.0, 1 / 30, 0.0]]]), torch.tensor([[-math.pi / 2 / 30]])
     rows["w2"], rows["b2"] = torch.tensor([[5.0]]), torch.tensor([[0.0]])  # sigma ~ sin(y/m): none below the middle
-    g = fit_gaussians(open_run(marked.static_run(tmp_path / "run", Primitives(CosineDensity(1), model.colour, rows))), {}, False)
+    g = fit_gaussians(open_run(marked.static_run(tmp_path / "run", Primitives(CosineDensity(1), model.colour, rows))), {}, "moments")
     assert abs(float(g.means[0, 0])) < 1e-6 and abs(float(g.means[0, 2])) < 1e-6 and 0.1 < float(g.means[0, 1]) < 0.2
     assert float(g.covariances[0, 1, 1]) < 0.5 * float(g.covariances[0, 0, 0])
+
+
+@pytest.mark.parametrize(("edge", "faint", "solid"), [(0, 0.28, 0.41), (2, 0.11, 0.26)])
+def test_the_profile_is_the_closest_bell_and_hides_as_much(tmp_path: Path, edge: int, faint: float, solid: float) -> None:
+    """A ball against its Gaussian on the screen, along an axis: RMS of what is left over that of alpha."""
+    for i, (depth, bound) in enumerate(((0.1, faint), (3.0, solid))):
+        model = marked.static_model(neurons=0, degree=0)
+        rows = {name: value[4:].clone() for name, value in model.params.items()}
+        rows |= {"log_scales": torch.full((1, 3), 0.4).log(), "b2": torch.full((1, 1), depth / NORMS[edge])}
+        run = open_run(marked.static_run(tmp_path / f"{i}", Primitives(CosineDensity(0, edge=edge), model.colour, rows)))
+        r = (torch.arange(600, dtype=torch.float64) + 0.5) / 300
+        alpha = 1 - torch.exp(-depth * (1 - r * r).clamp_min(0) ** (edge + 0.5))
+        errors, areas = {}, {}
+        for size in SIZES:
+            g = fit_gaussians(run, {}, size)
+            bell = g.opacities * torch.exp(-0.5 * (0.4 * r).square() / g.covariances[0, 0, 0])
+            errors[size] = float((((bell - alpha).square() * r).sum() / (alpha.square() * r).sum()).sqrt())
+            areas[size] = float((bell * r).sum() / (alpha * r).sum())
+        assert areas["profile"] == pytest.approx(1, abs=0.04)
+        assert errors["profile"] < min(bound, errors["footprint"] - 0.005, errors["moments"] - 0.1), errors
 
 
 def test_footprints_cover_what_thin_and_thick_primitives_cover(tmp_path: Path) -> None:
     """The area of alpha on the screen, seen from far away along an axis."""
     for i, thickness in enumerate((0.02, 6.0)):
         run = open_run(one_ellipsoid(tmp_path / str(i), thickness))
-        g = fit_gaussians(run, {}, footprint=True)
+        g = fit_gaussians(run, {}, "footprint")
         areas = []
         R = quaternion_to_matrix(run.model.params["quats"].double())[0]
         s = [0.4, 0.2, 0.1]
@@ -118,7 +139,10 @@ def test_what_it_wrote_starts_a_model_where_it_was(tmp_path: Path) -> None:
     settings = ModelSettings(primitives=9, init={"points": str(path)})
     fresh = initial_model(CosineDensity(3), field, tiny.two_primitives(), settings, 0)  # type: ignore[arg-type]
     assert torch.allclose(fresh.params["means"], marked.PLACES, atol=0.01)
-    assert torch.allclose(fresh.params["log_scales"], marked.RADII.log()[:, None], atol=0.1)
+    support, _ = CosineDensity(3).from_gaussians(
+        torch.full((len(marked.RADII),), 0.99)
+    )  # of bells; the file's are as wide as balls, seen from afar
+    assert torch.allclose(fresh.params["log_scales"], (marked.RADII / math.sqrt(5) * support).log()[:, None], atol=0.1)
     assert torch.allclose(fresh.params["sh_dc"], open_run(run).model.params["sh_dc"], atol=1e-3)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import subprocess
 from pathlib import Path
@@ -14,15 +15,18 @@ from PIL import Image, ImageSequence
 
 from neuprim.cli import main
 from neuprim.core.errors import BackendUnavailable
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.primitives import Primitives
 from neuprim.plugins.inspect import window
-from neuprim.plugins.inspect.field import FieldFrame
+from neuprim.plugins.inspect.field import FieldFrame, ViewOptions
 from neuprim.plugins.inspect.headless import prepare_headless
 from neuprim.plugins.inspect.layer_checks import fault
 from neuprim.plugins.inspect.layers import Ellipsoids, Isosurfaces, Lines, Mesh, Points, Scale, Slices, Text, Volume
 from neuprim.plugins.inspect.packing import ELLIPSOIDS_LIMIT, Packed
 from neuprim.plugins.inspect.shapes import cut_ball, level_lines
+from neuprim.plugins.inspect.views import PRIMITIVE
 from neuprim.runs.inspect import Request, inspect_run
-from tests.plugins import runs
+from tests.plugins import marked, runs
 from tests.plugins.fakes import install, site
 from tests.plugins.pages import array, layers_of
 
@@ -290,6 +294,23 @@ def test_level_lines_are_where_a_linear_function_is_zero() -> None:
     slope = np.array([0.3, -0.5, 0.8])
     ends, pairs = level_lines(points, faces, points @ slope - 0.2)
     assert len(pairs) > 30 and np.abs(ends[pairs.ravel()] @ slope - 0.2).max() < 1e-9
+
+
+@pytest.mark.parametrize("edge", [0, 1, 2])
+def test_the_zero_line_of_a_soft_primitive_is_that_of_its_field(edge: int) -> None:
+    """f = sin(2 (x + y)/m + 0.4) is zero on one plane through the ball and nowhere else: not on the surface, where the weight is."""
+    any_model = marked.static_model(neurons=1, degree=0)
+    rows = {name: value[:1].clone() for name, value in any_model.params.items()}
+    rows |= {"means": torch.tensor([[0.3, -0.2, 0.1]]), "log_scales": torch.tensor([[0.5, 0.4, 0.3]]).log(), "quats": torch.eye(4)[:1]}
+    rows |= {"W1": torch.tensor([[[2 / 30, 2 / 30, 0.0]]]), "b1": torch.tensor([[(0.4 - math.pi / 2) / 30]])}
+    rows |= {"w2": torch.tensor([[3.0]]), "b2": torch.zeros(1, 1)}
+    model = Primitives(CosineDensity(1, edge=edge), any_model.colour, rows)
+    frame = FieldFrame(model, {}, "", torch.eye(4, dtype=torch.float64), (2, 2, 2), 8.0, 1.0, options=ViewOptions(primitive=0))
+    (lines,) = (layer for layer in PRIMITIVE.layers(frame) if isinstance(layer, Lines))
+    local = (lines.vertices - np.array([0.3, -0.2, 0.1])) / 0.5
+    assert len(lines.pairs) > 60 and np.abs(local[:, 0] + local[:, 1] + 0.2).max() < 0.02
+    reached = np.linalg.norm(local / [1.0, 0.8, 0.6], axis=1)
+    assert reached.max() > 0.99 and reached.min() < 0.4, "around the surface, and across the cut to it"
 
 
 def test_the_frame_has_the_scale_of_all_frames() -> None:

@@ -93,7 +93,7 @@ def check_points(cloud: PointCloud, count: int, dataset: Dataset) -> None:
         raise DatasetFault(f"{where}: found {found} points; expected at most {count}")
     _floats(f"{where}: means", cloud.means, (found, 3))
     _floats(f"{where}: colors", cloud.colors, (found, dataset.channels))
-    for name, columns in (("axes", (3,)), ("quats", (4,)), ("alphas", ())):
+    for name, columns in (("axes", (3,)), ("quats", (4,)), ("alphas", ()), ("deviations", (3,))):
         if getattr(cloud, name) is not None:
             _floats(f"{where}: {name}", getattr(cloud, name), (found, *columns))
     for name, value in cloud.conditions.items():

@@ -87,6 +87,8 @@ class PointCloud:
             empty for scenes without conditions.
         axes, quats: (N, 3) semi-axes and (N, 4) orientations wxyz, where the points are ellipsoids.
         alphas: (N,) opacities 0..1 through their middles.
+        deviations: (N, 3) standard deviations along the axes in place of ``axes``, where the points are Gaussians: the density says how large
+            an ellipsoid looks like each.
     """
 
     means: Tensor
@@ -95,10 +97,11 @@ class PointCloud:
     axes: Tensor | None = None
     quats: Tensor | None = None
     alphas: Tensor | None = None
+    deviations: Tensor | None = None
 
     def rows(self, index: Tensor) -> PointCloud:
         """The points at ``index``, (M,) int64 or (N,) bool, with all that belongs to them."""
-        ellipsoids = (None if value is None else value[index] for value in (self.axes, self.quats, self.alphas))
+        ellipsoids = (None if value is None else value[index] for value in (self.axes, self.quats, self.alphas, self.deviations))
         return PointCloud(self.means[index], self.colors[index], {n: value[index] for n, value in self.conditions.items()}, *ellipsoids)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +16,6 @@ from neuprim.core.model.colours.sh import C0
 
 __all__ = ["read_points"]
 
-_SUPPORT = math.sqrt(5.0)
-"""An ellipsoid of constant density has semi-axes of this many of its standard deviations."""
-
 _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _LARGEST = 1e6
 
@@ -28,8 +24,8 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     """The vertices of a PLY file as starting points, in the file's own coordinates.
 
     Properties ``x y z`` are required. Colours come from ``f_dc_0..2`` or from ``red green blue`` (bytes, or floats 0..1), both taken for
-    sRGB; points without are mid-grey. ``scale_0..2`` (logarithms of standard deviations) with ``rot_0..3`` (wxyz) make ellipsoids of
-    the same covariance, and ``opacity`` (a logit) says how opaque they are. All else is ignored, view-dependent colour too.
+    sRGB; points without are mid-grey. ``scale_0..2`` (logarithms of standard deviations) with ``rot_0..3`` (wxyz) make Gaussians of them,
+    and ``opacity`` (a logit) says how opaque they are. All else is ignored, view-dependent colour too.
 
     Args:
         channels: of the data set. color_space: "srgb" or "linear", what the colours become.
@@ -52,13 +48,13 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     quats = _numbers(found, ("rot_0", "rot_1", "rot_2", "rot_3"), path)
     opacity = _numbers(found, ("opacity",), path)
     if scales is None or quats is None:
-        axes, quats = None, None
+        deviations, quats = None, None
     else:
         if bool((scales.abs() > 50).any()) or bool((quats.norm(dim=1) < 1e-12).any()):
             raise DataError(f"{path}: scale or rot of a vertex is out of proportion; expected logarithms, and quaternions of some length")
-        axes = _SUPPORT * scales.double().exp().float()
+        deviations = scales.double().exp().float()
     alphas = None if opacity is None else torch.sigmoid(opacity[:, 0])
-    return PointCloud(means, colors.contiguous(), {}, axes, quats, alphas)
+    return PointCloud(means, colors.contiguous(), {}, None, quats, alphas, deviations)
 
 
 def _colors(found: PlyVertices, path: Path) -> Tensor:

@@ -6,11 +6,13 @@ folded into one of a few closed forms that the renderer knows. The renderer neve
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
@@ -139,6 +141,12 @@ class DensityField(Field):
     def move(self, params: Params, geometry: Geometry, conditions: Conditions) -> Geometry:
         """Where the ellipsoids are under these conditions; differentiable."""
         return geometry
+
+    def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
+        """How fresh primitives look like Gaussians of opacities ``alphas`` (N,), 0..1: (N,) standard deviations from the middle to the edge of
+        the support, and (N,) opacities through the middle. By default those of an ellipsoid of constant density with the same covariance.
+        """
+        return torch.full_like(alphas, math.sqrt(5.0)), alphas
 
     def divide(self, params: Params, geometry: Geometry) -> tuple[Tensor, dict[str, Tensor], Geometry] | None:
         """A split along a condition instead of in space, for densities that live for a part of its range.

@@ -48,6 +48,17 @@ class InitContext:
     alphas: Tensor | None = None
 
     @property
+    def thickness(self) -> Tensor:
+        """(N,) float64 chord through the middle over the longest axis: the mean over the three axes, each weighted by what is seen along it.
+
+        1 for balls. So weighted, primitives hide as much from all sides together as they would if every chord were that long.
+        """
+        if self.axes is None:
+            return torch.ones(self.count, dtype=torch.float64)
+        axes = self.axes.double()
+        return 3 / (axes.amax(1, keepdim=True) / axes).sum(1)
+
+    @property
     def count(self) -> int:
         return int(self.means.shape[0])
 

@@ -36,6 +36,10 @@ from neuprim.core.train.settings import ModelSettings, TrainSettings
 __all__ = ["StepReport", "Trainer", "initial_model"]
 
 
+_USUAL_OPACITY = 0.5
+"""Of Gaussians that say how large they are, but not how opaque."""
+
+
 @dataclass(frozen=True)
 class StepReport:
     """What one step did. ``psnr`` is of the training view just seen; ``change`` says what the population did, if anything."""
@@ -85,8 +89,14 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
     context = InitContext(cloud.means.float(), scales, cloud.colors.float(), generator, settings.init, cloud.conditions)
     factor = context.number("scale", 1.0, 0)
     context.scales, context.quats, context.alphas = scales * factor, cloud.quats, cloud.alphas
-    if cloud.axes is not None:
-        context.axes = cloud.axes.clamp_min(1e-6 * dataset.extent) * factor
+    axes = cloud.axes
+    if cloud.deviations is not None:
+        opacities = torch.full((len(cloud.means),), _USUAL_OPACITY) if cloud.alphas is None else cloud.alphas
+        support, opacities = density.from_gaussians(opacities.clamp(0, 1))
+        axes = cloud.deviations * support[:, None]
+        context.alphas = None if cloud.alphas is None else opacities
+    if axes is not None:
+        context.axes = axes.clamp_min(1e-6 * dataset.extent) * factor
     return Primitives.initialise(density, colour, context)
 
 

@@ -27,14 +27,15 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
 from neuprim.plugins.export.appearance import Harmonics, comparison_views, harmonics_of, rgb_of
-from neuprim.plugins.export.gaussians import Gaussians, draw_gaussians, fit_gaussians
+from neuprim.plugins.export.gaussians import SIZES, Gaussians, draw_gaussians, fit_gaussians
 
 __all__ = ["EXPORTER", "LAYOUT"]
 
 OPTIONS = {
     "size": (
         "auto",
-        "moments: covariance of the density (solids); footprint: as much screen as the primitive covers (smoke); auto: the better",
+        "profile: the bell closest to the primitive's opacity; footprint: as much screen as it covers; moments: covariance of the density; "
+        "auto: the best",
     ),
     "views": ("auto", "cameras of the PSNR: test, orbit, or auto (test for models without conditions)"),
 }
@@ -47,13 +48,13 @@ LAYOUT = (
 
 
 def _write(job: ExportJob) -> ExportReport:
-    size, which = job.choice("size", "auto", "footprint", "moments"), job.choice("views", "auto", "test", "orbit")
+    size, which = job.choice("size", "auto", *SIZES), job.choice("views", "auto", "test", "orbit")
     (conditions,) = job.frames()
     channels, rgb = job.run.channels, rgb_of(job.run)
     job.progress("fitting Gaussians", 0.0)
     colours = harmonics_of(job.run, conditions).picked(rgb)
     images, seen = _images(job, which, conditions, rgb)
-    fits = {name: fit_gaussians(job.run, conditions, name == "footprint") for name in ("moments", "footprint") if size in ("auto", name)}
+    fits = {name: fit_gaussians(job.run, conditions, name) for name in SIZES if size in ("auto", name)}
     if not all(len(g.means) for g in fits.values()):
         raise ConfigError(f"{job.run.directory}: no primitive absorbs anything under these conditions; nothing to export")
     scores = {name: _psnrs(job, fit, colours, images, rgb, name) for name, fit in fits.items()}

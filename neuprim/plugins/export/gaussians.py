@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,11 +16,17 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.model.geometry import Geometry
 from neuprim.plugins.export.appearance import Harmonics
 
-__all__ = ["Gaussians", "draw_gaussians", "fit_gaussians"]
+__all__ = ["SIZES", "Gaussians", "draw_gaussians", "fit_gaussians"]
+
+SIZES = ("moments", "footprint", "profile")
+"""What the size of a Gaussian may be fitted to."""
+
 
 _SIDE = 12
 """Points of the quadrature along an axis of the unit ball; a density of 30 rad across a primitive has five waves in it."""
 _CHUNK = 512
+_FACTORS = [1.06**i for i in range(-24, 25)]
+"""On the covariance, a quarter to four: how much wider than its density's a footprint may be. Steps of three percent in size."""
 _NEAR, _BLUR, _ALPHA_MAX, _ALPHA_MIN, _TRANSMITTANCE_MIN = 0.2, 0.3, 0.99, 1.0 / 255.0, 1e-4  # of the authors' rasteriser
 
 
@@ -46,20 +53,21 @@ class Gaussians:
         return np.sqrt(np.maximum(values, 1e-30)), quats
 
 
-def fit_gaussians(run: TrainedModel, conditions: Conditions, footprint: bool) -> Gaussians:
+def fit_gaussians(run: TrainedModel, conditions: Conditions, size: str) -> Gaussians:
     """One Gaussian per primitive that absorbs anything.
 
     By quadrature on the ellipsoid, with rho = max(0, sigma): mean and covariance are those of rho; the opacity is the mean over the
-    ellipsoid's three axes of 1 - exp(-tau), tau the integral of rho along the axis' ray through that mean. A 3DGS footprint is
-    opacity x exp(-d^2/2) on the screen, never more than a bell, while an opaque primitive is flat with an edge: with ``footprint``
-    the covariance is scaled so that both cover the same area, the mean over the axes of the integral of alpha across the screen.
+    ellipsoid's three axes of 1 - exp(-tau), tau the integral of rho along the axis' ray through that mean. That is ``size="moments"``. A 3DGS
+    footprint is opacity x exp(-d^2/2) on the screen, never more than a bell, while an opaque primitive is flat with an edge, so the covariance
+    is scaled: with "footprint" so that both cover the same area, the mean over the axes of the integral of alpha across the screen; with
+    "profile" so that the bell is closest to alpha, by least squares over the three axes' screens, among those whose opacity makes up the area.
     """
     model = run.model
     with torch.no_grad():
         living = model.living(conditions)
         own, still, moved = living.own, living.stored, living.geometry
         parts = [
-            _fit(model.density.density, {n: v[i : i + _CHUNK] for n, v in own.items()}, still[i : i + _CHUNK], moved[i : i + _CHUNK], conditions, footprint)
+            _fit(model.density.density, {n: v[i : i + _CHUNK] for n, v in own.items()}, still[i : i + _CHUNK], moved[i : i + _CHUNK], conditions, size)
             for i in range(0, still.count, _CHUNK)
         ]  # fmt: skip
     empty = (torch.zeros(0, 3), torch.zeros(0, 3, 3), torch.zeros(0), torch.zeros(0, dtype=torch.bool))
@@ -68,7 +76,7 @@ def fit_gaussians(run: TrainedModel, conditions: Conditions, footprint: bool) ->
     return Gaussians(means[found].double(), covariances[found].double(), opacities[found].double(), found)
 
 
-def _fit(density, own, still: Geometry, moved: Geometry, conditions: Conditions, footprint: bool) -> tuple[Tensor, ...]:  # type: ignore[no-untyped-def]
+def _fit(density, own, still: Geometry, moved: Geometry, conditions: Conditions, size: str) -> tuple[Tensor, ...]:  # type: ignore[no-untyped-def]
     n, step = still.count, 2.0 / _SIDE
     ticks = (torch.arange(_SIDE, dtype=torch.float64) + 0.5) * step - 1
     ball = torch.cartesian_prod(ticks, ticks, ticks)
@@ -86,18 +94,49 @@ def _fit(density, own, still: Geometry, moved: Geometry, conditions: Conditions,
     cube = rho.reshape(n, _SIDE, _SIDE, _SIDE)
     middle = ((mean + 1) / step).floor().long().clamp(0, _SIDE - 1)
     every = torch.arange(n)
-    alphas, areas, bells = [], [], []
+    alphas, areas, bells, screens = [], [], [], []
     for axis in range(3):
         alpha = -torch.expm1(-cube.sum(axis + 1) * step * scales[:, axis, None, None])
         u, v = (a for a in range(3) if a != axis)
+        flat = spread[:, [u, u, v, v], [u, v, u, v]].reshape(n, 2, 2)
         alphas.append(alpha[every, middle[:, u], middle[:, v]])
         areas.append(alpha.sum((1, 2)) * step * step)
-        bells.append(2 * torch.pi * (spread[:, u, u] * spread[:, v, v] - spread[:, u, v].square()).clamp_min(1e-12).sqrt())
+        bells.append(2 * torch.pi * torch.linalg.det(flat).clamp_min(1e-12).sqrt())
+        screens.append((alpha, flat, mean[:, [u, v]], scales[:, u] * scales[:, v]))
     opacity = torch.stack(alphas).mean(0).clamp(1e-6, 1 - 1e-6)
-    if footprint:
+    if size == "footprint":
         spread = spread * (torch.stack(areas) / (opacity * torch.stack(bells))).mean(0)[:, None, None]
+    elif size == "profile":
+        wider, opacity = _closest(screens, torch.stack(areas), torch.stack(bells), ticks)
+        spread = spread * wider[:, None, None]
     world = R * scales[:, None, :]
     return moved.means.double() + (world @ mean[:, :, None])[..., 0], world @ spread @ world.transpose(1, 2), opacity, kept
+
+
+def _closest(screens: Sequence[tuple[Tensor, ...]], areas: Tensor, bells: Tensor, ticks: Tensor) -> tuple[Tensor, Tensor]:
+    """(n,) factors on the covariance and (n,) opacities of the bells closest to what three screens show, (alpha, covariance, mean, area) each.
+
+    For each of some factors, the opacity is that with the same integral of alpha over the screens, at most 0.99; taken is the factor with the
+    least squares of what is left, over the whole of the screens: the part of a bell that is outside the primitive's own is known in closed form.
+    """
+    step = ticks[1] - ticks[0]
+    weights = torch.stack([screen[3] for screen in screens])
+    u, v = torch.meshgrid(ticks, ticks, indexing="ij")
+    away = []
+    for _, flat, mean, _ in screens:
+        d = torch.stack([u - mean[:, 0, None, None], v - mean[:, 1, None, None]], -1)
+        inverse = torch.linalg.inv(flat + 1e-12 * torch.eye(2, dtype=torch.float64))
+        away.append(torch.einsum("nuvi,nij,nuvj->nuv", d, inverse, d))
+    best: tuple[Tensor, ...] = ()
+    for factor in _FACTORS:
+        opacity = ((weights * areas).sum(0) / (weights * bells * factor).sum(0)).clamp(1e-6, _ALPHA_MAX)
+        error = torch.zeros_like(opacity)
+        for weight, bell, square, (alpha, *_) in zip(weights, bells, away, screens, strict=True):
+            common = (alpha * (-0.5 / factor * square).exp()).sum((1, 2)) * step * step
+            error = error + weight * (opacity.square() * bell * factor / 2 - 2 * opacity * common)
+        new = (error, torch.full_like(error, factor), opacity)
+        best = tuple(torch.where(error < best[0], x, y) for x, y in zip(new, best, strict=True)) if best else new
+    return best[1], best[2]
 
 
 def draw_gaussians(gaussians: Gaussians, colours: Harmonics, camera: Camera, background: Tensor) -> Tensor:

@@ -6,6 +6,8 @@ import numpy as np
 import torch
 
 from neuprim.core.extensions import Inspector
+from neuprim.core.model.edge import fade
+from neuprim.core.model.fields import Cosine
 from neuprim.core.task import API_VERSION
 from neuprim.plugins.inspect.field import FieldFrame
 from neuprim.plugins.inspect.layers import Ellipsoids, Isosurfaces, Layer, Lines, Mesh, Scale, Slices, Text, Volume
@@ -16,6 +18,7 @@ __all__ = ["DIFFERENCE", "ISOSURFACE", "PRIMITIVE", "PRIMITIVES", "SLICES", "VOL
 SURFACES = "plasma"  # brighter at its lower end, where the outermost surface is
 SIGNED = "coolwarm"
 _LIFT = 0.004  # of lines above the surface that they are on, so that it hides none of them; of the semi-axes
+_BELOW = 0.98  # how far out the sign of a density with a soft edge is looked for, in radii
 
 FAINT = 1.0 / 255.0
 """Opacity from which an ellipsoid is drawn."""
@@ -63,6 +66,22 @@ def _primitives(frame: FieldFrame) -> list[Layer]:
     return [Ellipsoids(one.means.detach().numpy(), axes, colours=colours), Text(words)]
 
 
+def _factor(frame: FieldFrame, position: int, unit: np.ndarray) -> np.ndarray:
+    """(P,) a primitive's density at points (P, 3) of the unit ball, less the weight that a soft edge fades it by: it has the same zeros inside,
+    but does not vanish with the weight, whose rounding would draw the line on the surface. There, it is that of a point just below.
+    """
+    _, form = frame.model.lower_density(frame.conditions)
+    edge = form.edge if isinstance(form, Cosine) else 0
+    inner = torch.from_numpy(unit)
+    if edge:
+        radius = inner.norm(dim=1, keepdim=True)
+        inner = inner * (_BELOW / radius.clamp_min(_BELOW))
+    one = frame.geometry[position : position + 1]
+    axes = (one.rotations * one.scales[:, None, :])[0].double()
+    sigma = frame.density(int(frame.alive[position]), one.means[0].double() + inner @ axes.T)
+    return np.asarray(sigma / fade(inner.square().sum(1), edge).numpy())
+
+
 def _primitive(frame: FieldFrame) -> list[Layer]:
     position, (unit, faces, normals) = frame.row(), cut_ball()
     one = frame.geometry[position : position + 1]
@@ -76,8 +95,8 @@ def _primitive(frame: FieldFrame) -> list[Layer]:
     points, sigma, surface = placed.numpy()[used], sigma[used], surface.reshape(faces.shape)
     found: list[Layer] = [Mesh(points, surface, values=sigma, scale=scale)]
     if low < 0 < high:
-        lifted = points + _LIFT * normals[used] @ axes.numpy().T
-        found.append(Lines(*level_lines(lifted, surface, sigma), colours=np.zeros(3)))
+        lifted, factor = points + _LIFT * normals[used] @ axes.numpy().T, _factor(frame, position, unit[used])
+        found.append(Lines(*level_lines(lifted, surface, factor), colours=np.zeros(3)))
     scales = ", ".join(f"{s:.3g}" for s in frame.geometry.scales[position].tolist())
     center = ", ".join(f"{s:.3g}" for s in frame.geometry.means[position].tolist())
     words = f"primitive {frame.alive[position]}\ncentre ({center})\nradii ({scales})\nextinction {low:.3g} to {high:.3g}, unclamped"

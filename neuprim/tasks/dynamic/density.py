@@ -161,6 +161,9 @@ class TimeDensity(DensityField):
         rows = Geometry(means, *(torch.cat([x, x]) for x in (geometry.log_scales, geometry.quats)))
         return tau[:, 0] > self.divide_above, halves, rows
 
+    def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
+        return self.static.from_gaussians(alphas)
+
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         scaled = self.static.scale_density(params, factor)
         for name in ("offset_cos", "offset_sin"):

@@ -8,12 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from neuprim.core.data.points_file import read_points
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.ply import write_ply
+from neuprim.core.io.ply import read_ply, write_ply
 from neuprim.core.model.colours import sh
 from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.densities.gaussian import GaussianDensity
+from neuprim.core.model.edge import EDGES, NORMS
+from neuprim.core.model.footprint import gaussian_support
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.settings import ModelSettings
@@ -22,9 +26,9 @@ from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.core import tiny
 
 
-def fresh(path: Path | str, primitives: int = 50, **init: object) -> Primitives:
+def fresh(path: Path | str, primitives: int = 50, edge: int = 0, **init: object) -> Primitives:
     settings = ModelSettings(primitives=primitives, init={"points": str(path), **init})
-    return initial_model(CosineDensity(4), SphericalHarmonics(1), tiny.two_primitives(), settings, 0)
+    return initial_model(CosineDensity(4, edge=edge), SphericalHarmonics(1), tiny.two_primitives(), settings, 0)
 
 
 def splats(path: Path, **changes: float) -> Path:
@@ -44,12 +48,66 @@ def test_gaussians_give_places_colours_shapes_and_opacities(tmp_path: Path) -> N
     model = fresh(splats(tmp_path / "g.ply"))
     assert torch.equal(model.params["means"], torch.tensor([[0.0, 0.5, -1.0], [1.0, 0.6, 0.0], [2.0, 0.7, 1.0]]))
     assert torch.allclose(model.params["sh_dc"][:, 0], torch.tensor(1.0), atol=1e-5) and not bool(model.params["sh_rest"].any())
+
+
+@pytest.mark.parametrize("edge", EDGES)
+def test_primitives_cover_what_their_gaussians_do(tmp_path: Path, edge: int) -> None:
+    """Axes and mass: seen along one of its axes, a primitive hides as much of the screen as the footprint o exp(-r^2/2), on the whole."""
+    model = fresh(splats(tmp_path / "g.ply"), edge=edge)
     geometry: Geometry = model.geometry
-    spread = geometry.rotations * geometry.scales[:, None] / math.sqrt(5)
+    alphas = torch.sigmoid(torch.tensor([0.0, 20.0, -20.0]))
+    support, middle = CosineDensity(0, edge=edge).from_gaussians(alphas)
+    spread = geometry.rotations * geometry.scales[:, None] / support[:, None, None]
     covariance = spread @ spread.transpose(1, 2)
     assert torch.allclose(covariance, torch.diag(torch.tensor([0.04, 0.01, 0.09])).expand(3, 3, 3), atol=1e-6)
-    alpha = 1 - torch.exp(-2 * model.params["b2"][:, 0])
+    chord = 3 / (1 + 3 / 2 + 3)  # the mean over the axes, each weighted by what is seen along it, over the longest
+    depth = model.params["b2"][:, 0] * NORMS[edge] * chord
+    assert torch.allclose(1 - torch.exp(-depth), middle.clamp(0.02, 0.98), atol=1e-5)
+
+
+@pytest.mark.parametrize("edge", EDGES)
+@pytest.mark.parametrize("volume", [False, True])
+def test_the_footprint_is_the_closest_of_those_that_hide_as_much(edge: int, volume: bool) -> None:
+    r = (torch.arange(4000, dtype=torch.float64) + 0.5) / 4000 * 6
+    opacities = torch.tensor([0.02, 0.3, 0.8, 0.97], dtype=torch.float64)
+    c, depth = gaussian_support(edge, opacities, volume)
+    bell = (-r * r / 2).exp()
+    for i, o in enumerate(opacities):
+        target = 1 - torch.exp(torch.log1p(-o) * bell) if volume else o * bell
+
+        def left(c: Tensor, target: Tensor = target, o: Tensor = o) -> tuple[Tensor, Tensor]:
+            shape = (1 - (r / c).square()).clamp_min(0) ** (edge + 0.5)
+            low, high = 0.0, 50.0
+            for _ in range(60):
+                middle = (low + high) / 2
+                low, high = (middle, high) if ((1 - (-middle * shape).exp()) * r).sum() < (target * r).sum() else (low, middle)
+            return ((1 - (-low * shape).exp() - target).square() * r).sum(), torch.tensor(low)
+
+        error, exact = left(c[i])
+        assert float(depth[i]) == pytest.approx(float(exact), rel=5e-3)
+        assert all(float(error) <= float(left(c[i] * f)[0]) * 1.001 for f in (0.9, 0.97, 1.03, 1.1))
+    assert bool((c[0] > 1.9) & (c[0] < 2.9)), "well inside what is searched"
+
+
+def test_a_gaussian_density_starts_as_the_gaussians_are(tmp_path: Path) -> None:
+    settings = ModelSettings(primitives=50, init={"points": str(splats(tmp_path / "g.ply"))})
+    model = initial_model(GaussianDensity(3.0), SphericalHarmonics(1), tiny.two_primitives(), settings, 0)
+    assert torch.allclose(model.geometry.scales, 3 * torch.tensor([[0.1, 0.2, 0.3]]).expand(3, 3))
+    central = math.sqrt(2 * math.pi) / 3 * math.erf(3 / math.sqrt(2)) * 3 / (1 + 3 / 2 + 3)
+    alpha = 1 - torch.exp(-model.params["log_amplitude"].exp()[:, 0] * central)
     assert torch.allclose(alpha, torch.tensor([0.5, 0.98, 0.02]), atol=1e-5)
+
+
+def test_gaussians_without_opacities_start_as_opaque_as_ever(tmp_path: Path) -> None:
+    found = read_ply(splats(tmp_path / "g.ply"))
+    names = [n for n in found.names if n != "opacity"]
+    rows = np.zeros(len(found.rows), [(n, "<f4") for n in names])
+    for n in names:
+        rows[n] = found.rows[n]
+    write_ply(tmp_path / "bare.ply", rows)
+    model = fresh(tmp_path / "bare.ply", edge=2)
+    assert torch.allclose(1 - torch.exp(-NORMS[2] * model.params["b2"]), torch.tensor(0.8), atol=1e-5)
+    assert float(model.geometry.scales[0].max()) == pytest.approx(0.3 * float(gaussian_support(2, torch.tensor([0.5]))[0]), rel=1e-4)
 
 
 def test_sizes_can_be_scaled_and_the_count_is_kept(tmp_path: Path) -> None:
@@ -73,7 +131,7 @@ def test_plain_clouds(tmp_path: Path, form: str) -> None:
                 rows[name] = value if form == "bytes" else value / 255
         write_ply(path, rows)
     cloud = read_points(path, 3, "srgb")
-    assert cloud.means.tolist() == [[0, 0, 0], [1, 2, 3]] and cloud.axes is None and cloud.alphas is None
+    assert cloud.means.tolist() == [[0, 0, 0], [1, 2, 3]] and cloud.axes is None and cloud.alphas is None and cloud.deviations is None
     expected = [0.5, 0.5, 0.5] if form == "none" else [0.2, 0.4, 1.0]
     assert torch.allclose(cloud.colors, torch.tensor(expected), atol=1e-6)
     linear = read_points(path, 3, "linear").colors

@@ -13,9 +13,11 @@ from neuprim.core.cameras import Camera
 from neuprim.core.model.geometry import quaternion_to_matrix
 from tests import scenes
 from tests.numerics.extremes.measure import OPEN, Case
-from tests.numerics.extremes.oracle import Integrals, long_integrals
+from tests.numerics.extremes.oracle import GAIN_LIMIT, Integrals, long_integrals
 
-__all__ = ["SIZE", "aimed", "crowd", "cut", "grazing", "log_uniform", "networked", "normalised", "primitive", "signed", "single"]
+__all__ = [
+    "SIZE", "aimed", "amplified", "crowd", "cut", "grazing", "log_uniform", "networked", "normalised", "primitive", "signed", "silhouette", "single",
+]  # fmt: skip
 
 SIZE = 24  # pixels on a side
 
@@ -141,6 +143,34 @@ def grazing(rng: np.random.Generator) -> Case:
                 return replace(found, tensors=normalised(found.tensors, exact, None, 1.0))
             inside, outside = ((inside + outside) / 2, outside) if exact.hit.mean() > 0.5 else (inside, (inside + outside) / 2)
     raise RuntimeError("no view of a rim found")
+
+
+def silhouette(rng: np.random.Generator) -> Case:
+    """The same with one pixel on the rim itself, |D| of 1e-12 or less, where a hard edge has no bounded gradient; no floor under D."""
+    case = grazing(rng)
+    exact = long_integrals(case.tensors, 0, case.camera, case.settings.near)
+    y, x = (int(i[0]) for i in np.nonzero(np.abs(exact.D) == np.abs(exact.D).min()))
+    c = case.camera
+    for axis in ("cx", "cy"):  # where D changes its sign as the principal point moves along the one or the other
+        for way in (1.0, -1.0):
+            low, high = 0.0, 30.0 * way
+            for _ in range(80):
+                middle = (low + high) / 2
+                moved = replace(c, **{axis: getattr(c, axis) + middle})  # type: ignore[arg-type]
+                inside = bool(long_integrals(case.tensors, 0, moved, case.settings.near).D[y, x] > 0)
+                low, high = (middle, high) if inside == bool(exact.D[y, x] > 0) else (low, middle)
+            found = replace(c, **{axis: getattr(c, axis) + low})  # type: ignore[arg-type]
+            if abs(float(long_integrals(case.tensors, 0, found, case.settings.near).D[y, x])) < 1e-12:
+                return replace(case, camera=found, settings=replace(case.settings, depth_floor=1e-30))
+    raise RuntimeError("no pixel on the rim found")
+
+
+def amplified(rng: np.random.Generator, case: Case) -> Case:
+    """The same with a gain, up to four times beyond its clamp, and weights that make up for it."""
+    log_gain = float(rng.choice([-1, 1]) * rng.choice([5.0, 19.9, 20.1, 80.0]))
+    undone = math.exp(-max(min(log_gain, GAIN_LIMIT), -GAIN_LIMIT))
+    t = {k: (v * undone).float().double() if k in ("w2", "b2") else v for k, v in case.tensors.items()}
+    return replace(case, tensors=t | {"log_gain": torch.full((1, 1), log_gain, dtype=torch.float32).double()})
 
 
 def signed(rng: np.random.Generator) -> Case:

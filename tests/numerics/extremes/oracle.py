@@ -21,6 +21,7 @@ __all__ = ["Integrals", "long_colours", "long_integrals", "mp_integral"]
 L = np.longdouble
 Array = np.ndarray[Any, Any]
 OMEGA0 = 30.0
+GAIN_LIMIT = 20.0
 
 
 @dataclass
@@ -62,32 +63,47 @@ def _rotation(q: Any) -> list[list[Any]]:
     ]
 
 
+def _nodes(count: int) -> tuple[Array, Array]:
+    """Nodes and weights of Gauss-Legendre quadrature, to longdouble's last digits."""
+    x = np.polynomial.legendre.leggauss(count)[0].astype(L)
+    for _ in range(3):  # Newton from float64's nodes
+        low, high = np.ones_like(x), x
+        for n in range(1, count):
+            low, high = high, ((2 * n + 1) * x * high - n * low) / (n + 1)
+        slope = count * (x * high - low) / (x * x - 1)
+        x = x - high / slope
+    return x, 2 / ((1 - x * x) * slope * slope)
+
+
+_SLOW = 4  # radians over half a chord up to which the quadrature is exact to longdouble's digits
+_NODES = _nodes(16)
+
+
 def _faded(quadratic: Array, edge: int, phase: Array, change: Array) -> Array:
     """1/2 integral over u in [-1, 1] of (c0 + c1 u + c2 u^2)^p cos(phase + change u): Gauss-Legendre, or by parts where that turns too fast.
 
     Shapes broadcast; ``quadratic`` holds c0, c1, c2 in its last axis.
     """
-    x, w = (q.astype(L) for q in np.polynomial.legendre.leggauss(32))
+    x, w = _NODES
     weight = (quadratic[..., 0, None] + quadratic[..., 1, None] * x + quadratic[..., 2, None] * x * x) ** edge
     slow = (w * weight * np.cos(phase[..., None] + change[..., None] * x)).sum(-1) / 2
     # derivatives of the weight, as coefficients of u^0..u^4
     c0, c1, c2 = np.moveaxis(quadratic, -1, 0)
     zero = np.zeros_like(c0)
     q = [c0, c1, c2, zero, zero] if edge == 1 else [c0 * c0, 2 * c0 * c1, c1 * c1 + 2 * c0 * c2, 2 * c1 * c2, c2 * c2]
-    safe = np.where(np.abs(change) < 8, L(8), change)
+    safe = np.where(np.abs(change) < _SLOW, L(_SLOW), change)
     fast = np.zeros(np.broadcast(phase, change, c0).shape, L)
-    for n in range(5):  # the antiderivative: sum over n of q^(n)(u) sin(phase + change u - n pi/2 + ...)/change^(n + 1)
-        for u, sign in ((L(1), 1), (L(-1), -1)):
-            value = sum(q[k] * u**k for k in range(len(q)))
-            angle = phase + safe * u
-            wave = (np.sin(angle), np.cos(angle), -np.sin(angle), -np.cos(angle))[n % 4]
-            fast = fast + sign * value * wave / safe ** (n + 1)
+    ends = [(sign, np.sin(phase + sign * safe), np.cos(phase + sign * safe)) for sign in (L(1), L(-1))]
+    for n in range(2 * edge + 1):  # the antiderivative: sum over n of q^(n)(u) sin(phase + change u + n pi/2)/change^(n + 1)
+        for sign, sine, cosine in ends:
+            value = sum(q[k] * sign**k for k in range(len(q)))
+            fast = fast + sign * value * (sine, cosine, -sine, -cosine)[n % 4] / safe ** (n + 1)
         q = [k * q[k] for k in range(1, len(q))] or [zero]
-    return np.where(np.abs(change) < 8, slow, fast / 2)
+    return np.where(np.abs(change) < _SLOW, slow, fast / 2)
 
 
 def long_integrals(t: dict[str, Tensor], row: int, camera: Camera, near: float, edge: int = 0) -> Integrals:
-    """All pixels of a view against primitive ``row`` of ``t``."""
+    """All pixels of a view against primitive ``row`` of ``t``, its gain included where ``t`` has one."""
     R, shift = _long(camera.viewmat[:3, :3]), _long(camera.viewmat[:3, 3])
     center = R @ _long(t["means"][row]) + shift
     s = np.exp(_long(t["log_scales"][row]))
@@ -112,6 +128,9 @@ def long_integrals(t: dict[str, Tensor], row: int, camera: Camera, near: float, 
     middle = closest + (np.where(half > 0, (t0 + t1) / 2 - tm, 0))[..., None] * v
     norm = np.sqrt((e * e).sum(-1))
     W1, b1, w2, b2 = (_long(t[k][row]) for k in ("W1", "b1", "w2", "b2"))
+    if "log_gain" in t:
+        gain = np.exp(np.clip(_long(t["log_gain"][row]), -GAIN_LIMIT, GAIN_LIMIT))
+        w2, b2 = w2 * gain, b2 * gain
     phase = OMEGA0 * ((middle * axes) @ (W1 @ local).T + b1)
     change = OMEGA0 * ((v * axes) @ (W1 @ local).T) * half[..., None]
     sinc = np.where(change == 0, 1, np.sin(change) / np.where(change == 0, 1, change))
@@ -119,8 +138,11 @@ def long_integrals(t: dict[str, Tensor], row: int, camera: Camera, near: float, 
     if edge:
         shift = np.where(half > 0, (t0 + t1) / 2 - tm, 0)
         quadratic = np.stack([D - a * shift**2, -2 * a * shift * half, -a * half**2], -1)
-        waves = _faded(quadratic[..., None, :], edge, phase, change)
-        one = _faded(quadratic, edge, np.zeros_like(half), np.zeros_like(half))
+        met = half > 0
+        still = np.zeros(int(met.sum()), L)
+        waves[met] = _faded(quadratic[met][:, None, :], edge, phase[met], change[met])
+        one = np.zeros_like(half)
+        one[met] = _faded(quadratic[met], edge, still, still)
     field = b2.reshape(-1)[0] * one + (w2 * waves).sum(-1)
     norm = norm * (1, L(2) / 3, L(8) / 15)[edge]
     field = field / (1, L(2) / 3, L(8) / 15)[edge]
@@ -138,8 +160,14 @@ def long_colours(t: dict[str, Tensor], row: int, exact: Integrals) -> tuple[Arra
     return np.maximum(base + waves @ Wout.T, 0), np.abs(base) + np.abs(Wout).sum(1)
 
 
-def mp_integral(t: dict[str, Tensor], row: int, camera: Camera, near: float, px: int, py: int, digits: int = 50) -> tuple[Any, Any]:
-    """(I, S) of one pixel from the roots of |p + t v|^2 = 1 and the antiderivative of the density, in ``digits`` digits."""
+def mp_integral(
+    t: dict[str, Tensor], row: int, camera: Camera, near: float, px: int, py: int, edge: int = 0, digits: int = 50
+) -> tuple[Any, Any]:
+    """(I, S) of one pixel from the roots of |p + t v|^2 = 1 and the antiderivative of the density, in ``digits`` digits.
+
+    That of a soft edge is divided by the rate 2p + 1 times: it takes as many more digits as slow neurons then cost.
+    """
+    digits += 75 * edge
     with mpmath.workdps(digits):
         M = mpmath.mpf
 
@@ -167,16 +195,27 @@ def mp_integral(t: dict[str, Tensor], row: int, camera: Camera, near: float, px:
         t0 = max(t0, M(near) * norm)
         if t1 <= t0:
             return M(0), M(0)
-        b2 = numbers(t["b2"][row])[0]
-        total, amplitude = b2 * (t1 - t0), abs(b2)
+        gain = mpmath.exp(min(max(numbers(t["log_gain"][row])[0], -M(GAIN_LIMIT)), M(GAIN_LIMIT))) if "log_gain" in t else M(1)
+        b2 = numbers(t["b2"][row])[0] * gain
+        weight = [M(1)]  # 1 - |p + t v|^2 to the power p, coefficients of t^0..t^2p
+        for _ in range(edge):
+            old = [*weight, M(0), M(0)]
+            weight = [-C * old[k] - 2 * Bh * (old[k - 1] if k > 0 else 0) - A * (old[k - 2] if k > 1 else 0) for k in range(len(old))]
+        plain = sum(c * (t1 ** (k + 1) - t0 ** (k + 1)) / (k + 1) for k, c in enumerate(weight))
+        total, amplitude = b2 * plain, abs(b2)
         for W, b, w in zip(t["W1"][row], numbers(t["b1"][row]), numbers(t["w2"][row]), strict=True):
             weights = numbers(W)
             on_axis = [sum(weights[i] * local[i][axis] for i in range(3)) * s[axis] / m for axis in range(3)]
             rate = OMEGA0 * sum(on_axis[a] * v[a] for a in range(3))
             start = OMEGA0 * (sum(on_axis[a] * p[a] for a in range(3)) + b)
             if rate == 0:
-                total += w * mpmath.cos(start) * (t1 - t0)
+                total += w * gain * mpmath.cos(start) * plain
             else:
-                total += w * (mpmath.sin(start + rate * t1) - mpmath.sin(start + rate * t0)) / rate
-            amplitude += abs(w)
+                q, n = weight, 0
+                while q:
+                    ends = [sum(c * at**k for k, c in enumerate(q)) * mpmath.sin(start + rate * at + n * mpmath.pi / 2) for at in (t1, t0)]
+                    total += w * gain * (ends[0] - ends[1]) / rate ** (n + 1)
+                    q, n = [k * c for k, c in enumerate(q)][1:], n + 1
+            amplitude += abs(w) * gain
+        amplitude *= (1, M(2) / 3, M(8) / 15)[edge]
         return total / m, (t1 - t0) / m * amplitude

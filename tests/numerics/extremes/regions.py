@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tests.numerics.extremes.draw import crowd, cut, grazing, log_uniform, networked, signed, single
+from neuprim.core.model.edge import EDGES
+from tests.numerics.extremes.draw import amplified, crowd, cut, grazing, log_uniform, networked, signed, silhouette, single
 from tests.numerics.extremes.measure import Case
 
 __all__ = ["COLOUR", "FORWARD", "GRADIENT", "REGIONS", "THIN", "Region"]
@@ -27,6 +28,7 @@ class Region:
         forward, gradient, thin: bounds (see :class:`~tests.numerics.extremes.measure.Errors`).
         reason: why a bound is wider than the usual one; empty where none is.
         whole: cases have several primitives: their images are compared, not single integrals.
+        edges: the exponents p that it is for.
     """
 
     name: str
@@ -36,11 +38,26 @@ class Region:
     thin: float = THIN
     reason: str = ""
     whole: bool = False
+    edges: tuple[int, ...] = EDGES
 
-    def case(self, number: int) -> Case:
-        """Case ``number`` of this region; the same on every machine."""
+    def case(self, number: int, edge: int = 0) -> Case:
+        """Case ``number`` of this region; the same on every machine, and for every edge."""
         case = self.make(np.random.default_rng([zlib.crc32(self.name.encode()), number]))
-        return replace(case, name=f"{self.name} #{number}")
+        return replace(case, name=f"{self.name} #{number}", edge=edge)
+
+    def thin_at(self, edge: int) -> float:
+        """The bound ``thin`` for an edge: an integral that goes as D^(p + 1/2) is 2p + 1 times as sensitive to D."""
+        return self.thin if self.whole or self.name.startswith("colour network") else self.thin * (2 * edge + 1)
+
+    def gradient_at(self, edge: int) -> float:
+        """The bound ``gradient`` for an edge.
+
+        Where only a rim lets light through, it is all that there is to differentiate. What float32 does not know about D, 4e-7, is
+        sqrt(4e-7) = 6e-4 of dI/dD on the rim itself at p = 1, beside 0.1 on the rim's other pixels; at p = 2 next to nothing.
+        """
+        if self.name == "huge densities":
+            return self.gradient * (2 * edge + 1)
+        return 6 * self.gradient if self.name == "on the silhouette" and edge == 1 else self.gradient
 
 
 def _distances() -> list[Region]:
@@ -52,8 +69,14 @@ def _distances() -> list[Region]:
 
 
 def _rates() -> list[Region]:
-    values = (0.0, 1e-12, 1e-6, 1e-3, 1.0, 10.0, 1e2, 1e3)
-    return [Region(f"phase rate {v:g} rad per chord", lambda r, v=v: single(r, rate=v, neurons=int(r.choice([1, 8])))) for v in values]  # type: ignore[misc]
+    values = (0.0, 1e-12, 1e-6, 1e-3, 1.0, 10.0, 1e2, 1e3, 2e3)
+    regions = [Region(f"phase rate {v:g} rad per chord", lambda r, v=v: single(r, rate=v, neurons=int(r.choice([1, 8])))) for v in values]  # type: ignore[misc]
+    return [*regions, Region("phase rates where series end", lambda r: single(r, rate=_seam(r), neurons=int(r.choice([1, 8]))))]
+
+
+def _seam(rng: np.random.Generator) -> float:
+    """Twice a z at which some backend changes from a series or a polynomial of B_p to another form, less or more by a millionth."""
+    return float(2 * rng.choice([1e-3, 2.0, np.pi, 3 * np.pi]) * (1 + 1e-6 * rng.choice([-1, 1])))
 
 
 def _ratios() -> list[Region]:
@@ -125,6 +148,8 @@ REGIONS: tuple[Region, ...] = (
     Region("scales 1e20", lambda r: single(r, scale=1e20)),
     Region("far from the scene's origin", lambda r: single(r, mean=1e4)),
     Region("grazing", grazing),
+    Region("on the silhouette", silhouette, edges=(1, 2)),
+    Region("gains of e^-80 to e^80", lambda r: amplified(r, single(r))),
     Region("negative densities", signed),
     Region("dense", lambda r: single(r, depth=log_uniform(r, 5.0, 50.0))),
     Region("huge densities", lambda r: single(r, depth=log_uniform(r, 1e3, 1e30))),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+from neuprim.core.model.edge import EDGES
 from neuprim.core.render.backends import ORACLE, available
-from tests.numerics.extremes.measure import OPAQUE, RIM, SOLID, Errors, compare
+from tests.numerics.extremes.measure import OPAQUE, RIM, SOLID, Errors, compare, integrals
 from tests.numerics.extremes.regions import COLOUR, REGIONS, THIN, Region
 
-__all__ = ["BACKENDS", "Result", "document", "measure", "sweep", "table"]
+__all__ = ["BACKENDS", "Result", "document", "line", "measure", "sweep", "table"]
 
 BACKENDS = (*((backend.name, "float32") for backend in available()), (ORACLE, "float64"))
 _HEADER = (
@@ -20,84 +21,97 @@ _HEADER = (
 
 @dataclass
 class Result:
-    """Worst errors of one region on one backend."""
+    """Worst errors of one region on one backend, for one edge."""
 
     region: Region
     backend: str
     precision: str
+    edge: int
     errors: Errors
-    edge: int = 0
 
     @property
     def label(self) -> str:
         return f"{self.region.name}, edge {self.edge}, {self.backend} {self.precision}"
 
     @property
-    def thin(self) -> float:
-        """The region's bound; an integral that goes as D^(p + 1/2) is 2p + 1 times as sensitive to D."""
-        return self.region.thin * (2 * self.edge + 1) if not self.region.name.startswith("colour network") else self.region.thin
-
-    @property
-    def gradient(self) -> float:
-        """The region's bound; where only a rim lets light through, it is all that there is to differentiate."""
-        return self.region.gradient * (2 * self.edge + 1) if self.region.name == "huge densities" else self.region.gradient
-
-    @property
     def broken(self) -> list[str]:
         e, r = self.errors, self.region
         parts = (
             ("error/S", "forward", e.forward, r.forward),
-            ("thin", "thin", e.thin, self.thin),
-            ("gradient", "gradient", e.gradient, self.gradient),
+            ("thin", "thin", e.thin, r.thin_at(self.edge)),
+            ("gradient", "gradient", e.gradient, r.gradient_at(self.edge)),
         )
         texts = [
-            f"{label} {found:.1e} > {bound:.0e} in {e.worst.get(key, '?')}" for label, key, found, bound in parts if not found <= bound
+            f"{label} {found:.1e} > {bound:.1e} in {e.worst.get(key, '?')}" for label, key, found, bound in parts if not found <= bound
         ]
         return texts if e.hits else [*texts, "nothing was drawn"]
 
-    def line(self) -> str:
-        e, r = self.errors, self.region
-        gradient = "" if self.backend == ORACLE else f"{e.gradient:.1e} {e.parameter}"
-        thin = "" if r.whole else f"{e.thin:.1e}"
-        bounds = f"{r.forward:.0e}, {self.thin:.0e}, {self.gradient:.0e}" if not r.whole else f"{r.forward:.0e}, {self.gradient:.0e}"
-        wide = f"{e.wide}/{e.primitives}" if self.backend == "cpu" else ""
-        state = "**broken**" if self.broken else "ok"
-        return f"| {r.name} | {self.backend} {self.precision} | {e.forward:.1e} | {thin} | {gradient} | {wide} | {bounds} | {state} |"
 
-
-def measure(region: Region, backend: str, precision: str, cases: int, edge: int = 0) -> Result:
-    """Worst of the first ``cases`` cases. Gradients are compared on the fast backends; the reference's are the standard."""
-    worst = Errors()
+def measure(region: Region, edge: int, cases: int) -> list[Result]:
+    """Worst of the first ``cases`` cases, per backend. Gradients are compared on the fast ones; the reference's are the standard."""
+    found = [Result(region, backend, precision, edge, Errors()) for backend, precision in BACKENDS]
     for number in range(cases):
-        case = replace(region.case(number), edge=edge)
-        worst.absorb(compare(case, backend, precision, region.whole, backend != ORACLE), case.name)
-    return Result(region, backend, precision, worst, edge)
+        case = region.case(number, edge)
+        exact = None if region.whole else integrals(case)
+        for result in found:
+            result.errors.absorb(compare(case, result.backend, result.precision, region.whole, result.backend != ORACLE, exact), case.name)
+    return found
 
 
-def sweep(cases: int, names: Sequence[str] = ()) -> Iterator[Result]:
-    """Every region whose name contains one of ``names`` (all if none) on every backend."""
+def sweep(cases: int, names: Sequence[str] = (), edges: Sequence[int] = EDGES) -> Iterator[list[Result]]:
+    """Every region whose name contains one of ``names`` (all if none): what each backend found for each edge that the region is for."""
     for region in REGIONS:
         if not names or any(n in region.name for n in names):
-            for backend, precision in BACKENDS:
-                yield measure(region, backend, precision, cases)
+            columns = [measure(region, edge, cases) for edge in edges if edge in region.edges]
+            yield from ([column[i] for column in columns] for i in range(len(BACKENDS) if columns else 0))
 
 
-def table(results: Sequence[Result]) -> str:
-    return "\n".join([*_HEADER, *(r.line() for r in results)])
+def line(row: Sequence[Result]) -> str:
+    """One region on one backend, what was found for each edge side by side."""
+    first, region = row[0], row[0].region
+
+    def beside(cells: Sequence[str]) -> str:
+        """The cells of all edges; a dash where the region is not for one that others are for."""
+        found = dict(zip((r.edge for r in row), cells, strict=True))
+        return " / ".join(found.get(edge, "–") for edge in (EDGES if len(region.edges) < len(EDGES) else found)) if any(cells) else ""
+
+    thin = "" if region.whole else beside([f"{r.errors.thin:.1e}" for r in row])
+    gradient = "" if first.backend == ORACLE else beside([f"{r.errors.gradient:.1e}" for r in row])
+    wide = beside([f"{r.errors.wide}" for r in row]) + f" of {first.errors.primitives}" if first.backend == "cpu" else ""
+    bounds = [f"{region.forward:.0e}"]
+    if not region.whole:
+        bounds.append(_once([f"{region.thin_at(r.edge):.0e}" for r in row]))
+    if first.backend != ORACLE:
+        bounds.append(_once([f"{region.gradient_at(r.edge):.0e}" for r in row]))
+    state = "**broken**" if any(r.broken for r in row) else "ok"
+    forward = beside([f"{r.errors.forward:.1e}" for r in row])
+    return (
+        f"| {region.name} | {first.backend} {first.precision} | {forward} | {thin} | {gradient} | {wide} | {', '.join(bounds)} | {state} |"
+    )
+
+
+def _once(texts: Sequence[str]) -> str:
+    return texts[0] if len(set(texts)) == 1 else " / ".join(texts)
+
+
+def table(rows: Sequence[Sequence[Result]]) -> str:
+    return "\n".join([*_HEADER, *(line(row) for row in rows)])
 
 
 _PAGE = """# Numerical limits
 
 Made by `python benchmarks/numerics.py --markdown docs/numerical_limits.md`; the command exits non-zero when a bound is broken. Every
 region draws random primitives and cameras with the proportions in its name; each row is the worst of {cases} cases of 24 x 24 pixels.
-The oracle is the closed form in extended precision (numpy's longdouble, checked against fifty digits of another form); gradients are
+Numbers side by side are of edges p = 0 / 1 / 2: the same primitives and cameras, a hard edge and two soft ones ((1 - |y|^2)^p; a gain of its
+own for each primitive in the region of gains). One bound for all three is written once. The oracle is the closed form in extended precision (numpy's longdouble, checked against fifty digits of another form); gradients are
 compared with the float64 reference.
 
 What is compared:
 
-- **error/S**: error of a chord's optical depth over S = (2h/m)(|b2| + sum |w2|), on chords at least {solid} as long as the one through
-  the centre; the error of alpha itself where the depth exceeds {opaque}. For several primitives, the largest error of a pixel.
-- **thin**: on shorter chords, misses included, error/S x (S/S_c)^2, with S_c of the chord through the centre.
+- **error/S**: error of a chord's optical depth over S = (N h/m)(|b2| + sum |w2|), N = 2, 4/3, 16/15, on chords at least {solid} as long as
+  the one through the centre; the error of alpha itself where the depth exceeds {opaque}. For several primitives, the largest error of a pixel.
+- **thin**: on shorter chords, misses included, error/S_c x (S_c/S)^(2p - 1), with S_c of the chord through the centre (S/S_c counts as 0.01 where it
+  is less and p > 0).
 - **gradient**: error of a parameter's gradient over its norm, over four random functionals of the image.
 - **colour network**: the density is everyday; in place of its integral the colour is compared, over |base| + sum |Wout|, with the network
   in extended precision at the middle of the chord, on solid chords ("error/S") and on the others ("thin", without a factor). Radians
@@ -106,12 +120,16 @@ What is compared:
 
 ## Where the usual bounds do not hold
 
-- **Thin chords, float32.** D = 1 - |x_m|^2 is a difference of numbers near one, which float32 knows to about 1e-7, and h = sqrt(D/a)
-  turns that into error/S = dD/2D. So error/S <= 1e-6 needs D of 0.2 or more; below, the bound is {thin:.0e} (S_c/S)^2. Against the chord
-  through the centre the error is never above {root:.0e}: that of a rim pixel on the wrong side of the silhouette. The near plane leaves
-  short chords of the same kind. The reference backend has no such limit.
-- **Silhouettes, backward.** dh/dD grows as D^-1/2. Every backend takes max(D, `renderer.depth_floor`) there. Pixels with |D| < {rim:.0e}
-  are left out of the comparison: float32 may not know whether they meet the primitive.
+- **Thin chords, float32.** With l = S/S_c, the chord's length over that of the one through the centre, D = 1 - |x_m|^2 is l^2: a difference of
+  numbers near one, which float32 knows to about 1e-7. The integral goes as D^(p + 1/2), so its error over S_c is (p + 1/2) l^(2p - 1) dD. A hard
+  edge's grows on thin chords, as 1/l: error/S <= 1e-6 needs D of 0.2 or more, below the bound on error/S_c is {thin:.0e}/l; it is never above
+  {root:.0e}, that of a rim pixel on the wrong side of the silhouette. A soft edge's shrinks: the bounds are {thin1:.1e} l for p = 1 and
+  {thin2:.0e} l^3 for p = 2. The near plane leaves short chords of the same kind. The reference backend has no such limit.
+- **Silhouettes, backward.** dI/dD grows as D^-1/2 with a hard edge: every backend takes max(D, `renderer.depth_floor`) there, and pixels with
+  |D| < {rim:.0e} are left out of the comparison, as float32 may not know whether they meet the primitive. With a soft edge it goes as
+  D^(p - 1/2), to nothing: there is no floor, no pixel is left out, and in "on the silhouette" one has |D| < 1e-12. What float32 does not
+  know about that pixel's D is up to sqrt({thin:.0e}) = 6e-4 of a derivative at p = 1, beside some 0.1 on the other pixels of such a view.
+- **Gains.** Beyond |log g| = 20 a gain counts as e^20 or e^-20, forward, and its gradient is zero; up to there it costs a rounding or two.
 - **Fast colour networks, float32.** A unit of up to 4 turns over half a chord is drawn in float32, which knows its phase to about
   3e-6 radians; nothing like the sinc of the density's integral damps it. From 30 rad over 2 m on the bound is {colour:.0e}.
 - **Cuts.** A pixel whose alpha lies within 1e-6 of alpha_min, or whose transmittance lies within a thousandth of
@@ -126,7 +144,17 @@ What is compared:
 """
 
 
-def document(results: Sequence[Result], cases: int) -> str:
+def document(rows: Sequence[Sequence[Result]], cases: int) -> str:
     """The documentation page."""
-    numbers = {"cases": cases, "solid": SOLID, "opaque": OPAQUE, "rim": RIM, "thin": THIN, "root": THIN**0.5, "colour": COLOUR}
-    return _PAGE.format(table=table(results), **numbers)
+    numbers = {
+        "cases": cases,
+        "solid": SOLID,
+        "opaque": OPAQUE,
+        "rim": RIM,
+        "thin": THIN,
+        "thin1": 3 * THIN,
+        "thin2": 5 * THIN,
+        "root": THIN**0.5,
+        "colour": COLOUR,
+    }
+    return _PAGE.format(table=table(rows), **numbers)

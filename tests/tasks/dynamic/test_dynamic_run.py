@@ -21,6 +21,7 @@ from neuprim.runs.run import run
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.time import parse_times
 from tests.reports import offered
+from tests.tasks.dynamic import sequences
 from tests.tasks.dynamic.sequences import blob
 
 SMALL = ["scene.size=24", "scene.cameras=6", "scene.samples=1", "model.primitives=60", "model.neurons=2", "train.max_seconds=null"]
@@ -165,6 +166,19 @@ def test_the_papers_preset_runs(files: Path, tmp_path: Path) -> None:
     words = ["preset=paper", "train.iterations=20", "train.population.every=5", "model.neurons=8"]
     model = load_run(fit(files, tmp_path / "run", *words))[2]
     assert model.parameters_per_primitive == 143
+
+
+def test_the_preset_of_the_equations_is_the_papers_form_at_the_bytes_of_quick(files: Path, tmp_path: Path) -> None:
+    quick, equations, paper = (compose(["task=dynamic", f"preset={name}"]) for name in ("quick", "equations", "paper"))
+    assert equations.model.density == paper.model.density == {"time": "phase"}
+    assert equations.model.colour == {"powers": 4, "waves": 4, "frequencies": "printed"} and equations.model.sh_degree == 3
+    assert (equations.train, equations.renderer) == (quick.train, quick.renderer), "the budget and the rates are those of quick"
+    words = ["preset=equations", "train.iterations=20", "train.population.every=5", "train.population.start=0", "model.neurons=8"]
+    model = load_run(fit(files, tmp_path / "run", *words))[2]
+    assert model.parameters_per_primitive == 143 and bool(model.params["W_t"].any()) and bool(model.params["time_sin"].any())
+    fields = TASK.build(vars(quick.model), sequences.dataset(files, tmp_path))
+    numbers = 10 + sum(spec.size for field in fields for spec in field.parameters())
+    assert abs(143 * equations.model.primitives - numbers * quick.model.primitives) <= 143 / 2
 
 
 def test_a_simulated_scene_says_so(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from torch import Tensor
 from neuprim.core.checked import Range
 from neuprim.core.model.edge import EDGES, NORMS, fade
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
+from neuprim.core.model.footprint import gaussian_support
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.tensors import number_fault
@@ -96,6 +97,10 @@ class CosineDensity(DensityField):
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
         return split_cosine(params, old, new, self.omega0, self.edge)
 
+    def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
+        support, depth = gaussian_support(self.edge, alphas)
+        return support.to(alphas), -torch.expm1(-depth).to(alphas)
+
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         return {**params, "w2": params["w2"] * factor[:, None], "b2": params["b2"] * factor[:, None]}
 
@@ -118,7 +123,8 @@ def _initial_offset(ctx: InitContext, amplitude: float, norm: float) -> Tensor:
     if mode == "paper" and amplitude:
         return ctx.uniform(1, bound=amplitude)
     if ctx.alphas is not None:
-        return -torch.log1p(-ctx.alphas.float().clamp(_FAINT, _SOLID))[:, None] / norm
+        depth = -torch.log1p(-ctx.alphas.float().clamp(_FAINT, _SOLID))
+        return (depth / ctx.thickness.float())[:, None] / norm
     return torch.full((ctx.count, 1), opaque)
 
 

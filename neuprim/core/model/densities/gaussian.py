@@ -25,6 +25,7 @@ __all__ = ["GaussianDensity", "bell_integral"]
 _SHORT = 0.2
 """Intervals with w (1 + |u|) below this are integrated by their Taylor series: differences of erfc lose a digit per decade of w."""
 _TERMS = 8  # of that series; the first one left out is below 1e-17 of the sum
+_START = 0.02, 0.98  # bounds of the opacities that starting points may ask for
 _FAINTEST = 1e-30  # a density scaled by zero keeps a finite logarithm
 
 
@@ -58,7 +59,14 @@ class GaussianDensity(DensityField):
     def _initial(self, ctx: InitContext) -> Tensor:
         alpha = 0.1 if ctx.choice("mode", "opaque", "paper") == "paper" else ctx.number("alpha", 0.8, 0, 1)
         central = math.sqrt(2 * math.pi) / self.deviations * math.erf(self.deviations / math.sqrt(2))  # a sphere's depth at kappa = 1
-        return torch.full((ctx.count, 1), math.log(-math.log1p(-alpha) / central))
+        if ctx.alphas is None:
+            return torch.full((ctx.count, 1), math.log(-math.log1p(-alpha) / central))
+        depth = -torch.log1p(-ctx.alphas.double().clamp(*_START))
+        return (depth / ctx.thickness / central).log().float()[:, None]
+
+    def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
+        """As wide as they are: the support ends where it ends for every Gaussian."""
+        return torch.full_like(alphas, self.deviations), alphas
 
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Opaque:
         """The line integral over a chord [t0, t1] in closed form, in float64; differentiable in every argument.

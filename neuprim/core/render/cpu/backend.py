@@ -242,7 +242,6 @@ class _Rasterize(torch.autograd.Function):
             count,
             _PRIMITIVES_PER_CHUNK,
             s.threads,
-            frame.lists.order,
             frame.lists.first,
             frame.lists.slots,
             pair_rows,

@@ -20,7 +20,7 @@ from neuprim.core.render.cpu.ray_colours import (
     uncomposite_rgb_ray_colours,
     weigh_ray_colours,
 )
-from neuprim.core.render.cpu.tiles import compact, row_spans
+from neuprim.core.render.cpu.tiles import aligned, compact, fetch_ahead, row_spans
 from neuprim.core.render.cpu.trigonometry import one_minus_exp
 
 __all__ = ["backward_tiles", "opacity", "sum_rows"]
@@ -136,11 +136,11 @@ def backward_tiles(  # type: ignore[no-untyped-def]
     scratch = L.BACKWARD_SCRATCH
     if net is not None:
         scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
-        waves = np.zeros((net.hidden, L.NET_SCRATCH), np.float32)
-    S, D = np.zeros(scratch + 1024, np.float32), np.zeros(FLOAT64_SCRATCH, np.float64)
-    V = np.zeros((neurons, L.NEURON_SCRATCH), np.float32)
-    state = np.zeros((6 + C) * L.PIXELS + 2 * L.TILE, np.float32)
-    w, cg, sums = np.zeros(L.TILE, np.float32), np.zeros(L.TILE, np.float32), np.zeros((2 + C) * L.TILE, np.float32)
+        waves = aligned(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
+    S, D = aligned(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64)
+    V = aligned(neurons * L.NEURON_SCRATCH).reshape((neurons, L.NEURON_SCRATCH))
+    state = aligned((6 + C) * L.PIXELS + 2 * L.TILE)
+    w, cg, sums = aligned(L.TILE), aligned(L.TILE), aligned((2 + C) * L.TILE)
     bounds, offset = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32)
     rows_live, reach = np.zeros(L.TILE, np.float32), np.zeros(L.TILE, np.float32)
     evaluated = 0
@@ -169,22 +169,24 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             pair_rows[q, :] = f(0)
         for back in range(deepest):
             q = first + deepest - 1 - back
+            if back + 1 < deepest:
+                fetch_ahead(np.int64(ids[q - 1]), rows, spans, boxes)
             i = ids[q]
             p, out = rows[i], pair_rows[q]
             rank = f(q - first + 1)
             y0, y1 = max(boxes[i, 1] - ty, 0), min(boxes[i, 3] - ty, L.TILE)
             x0, x1 = max(boxes[i, 0] - tx, 0), min(boxes[i, 2] - tx, L.TILE)
             fx0, fy0 = f(tx) + f(0.5) - p[L.UX], f(ty) + f(0.5) - p[L.UY]
-            row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, bounds)
-            for y in range(y0, y1):
+            for y in range(L.TILE):
                 rows_live[y] = f(1) if reach[y] >= rank else f(0)
-            n = compact(S, state, offset, bounds, y0, y1, rows_live, fx0, fy0)
+            row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, rows_live, bounds)
+            n = compact(S, state, offset, bounds, y0, y1)
             out[:] = f(0)
             if n == 0:
                 continue
             n16 = ((n + 15) // 16) * 16
             evaluated += n16
-            field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, edge)
+            field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, edge)
             opacity(S, n16, amin, amax, edge)
             for k in range(n, n16):
                 S[L.GRAD + k] = f(0)
@@ -250,13 +252,12 @@ def backward_tiles(  # type: ignore[no-untyped-def]
 
 
 @exact_kernel
-def sum_rows(start, stop, order, first, slots, pair_rows, grads, touched):  # type: ignore[no-untyped-def]
-    """grads[i] = sum of primitive i's pair rows, in pair order, for depth ranks ``start:stop``."""
-    for r in range(start, stop):
-        i = order[r]
+def sum_rows(start, stop, first, slots, pair_rows, grads, touched):  # type: ignore[no-untyped-def]
+    """grads[i] = sum of primitive i's pair rows, in pair order, for primitives ``start:stop``."""
+    for i in range(start, stop):
         g = grads[i]
         g[:] = np.float32(0)
-        for k in range(first[r], first[r + 1]):
+        for k in range(first[i], first[i + 1]):
             row = pair_rows[slots[k]]
             if row[L.G_WEIGHT] > np.float32(0):
                 for c in range(g.shape[0]):

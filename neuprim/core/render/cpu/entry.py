@@ -38,12 +38,12 @@ _CUT = f(-1e30)  # entry of every chord that the near plane cuts: in front of al
 
 @inline
 def _lanes_of(S, state, offset, bounds, rows_live, span, box, p, tx, ty):  # type: ignore[no-untyped-def]
-    """Compact the pixels of one pair into lanes; returns (lanes, first row, row after the last)."""
+    """Compact the pixels of one pair into lanes; returns (lanes, first row, row after the last, and the tile's corner from the anchor)."""
     y0, y1 = max(box[1] - ty, 0), min(box[3] - ty, L.TILE)
     x0, x1 = max(box[0] - tx, 0), min(box[2] - tx, L.TILE)
     fx0, fy0 = f(tx) + f(0.5) - p[L.UX], f(ty) + f(0.5) - p[L.UY]
-    row_spans(span, fx0, fy0, y0, y1, x0, x1, bounds)
-    return compact(S, state, offset, bounds, y0, y1, rows_live, fx0, fy0), y0, y1
+    row_spans(span, fx0, fy0, y0, y1, x0, x1, rows_live, bounds)
+    return compact(S, state, offset, bounds, y0, y1), y0, y1, fx0, fy0
 
 
 @inline
@@ -84,12 +84,12 @@ def _list_hits(  # type: ignore[no-untyped-def]
         i = ids[q]
         p = rows[i]
         starts_of[q - first] = count
-        n, y0, y1 = _lanes_of(S, state, offset, bounds, rows_live, spans[i], boxes[i], p, tx, ty)
+        n, y0, y1, fx0, fy0 = _lanes_of(S, state, offset, bounds, rows_live, spans[i], boxes[i], p, tx, ty)
         if n == 0:
             continue
         n16 = ((n + 15) // 16) * 16
         evaluated += n16
-        field_values(S, D, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, False, True, edge)
+        field_values(S, D, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, False, True, edge)
         opacity(S, n16, amin, amax, edge)
         if net is not None:
             ray_colours(S, D, waves, n16, i, net, slots, colors[i], False)
@@ -291,10 +291,10 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
             if weight == f(0):
                 continue  # hidden or below the cut everywhere: every gradient is zero
             out[L.G_WEIGHT], out[L.G_ERROR] = weight, wrong
-            n, y0, y1 = _lanes_of(S, state, offset, bounds, rows_live, spans[i], boxes[i], p, tx, ty)
+            n, y0, y1, fx0, fy0 = _lanes_of(S, state, offset, bounds, rows_live, spans[i], boxes[i], p, tx, ty)
             n16 = ((n + 15) // 16) * 16
             evaluated += n16
-            field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, edge)
+            field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, edge)
             for k in range(n16):
                 S[L.GRAD + k], S[L.GMID + k] = f(0), f(0)
             if net is not None:

@@ -59,7 +59,7 @@ def chords_float64(S, X, bounds, y0, y1, tx, ty, n, p, depth_floor, with_mid, ba
             if with_mid:
                 S[L.MID + at] = f(mid)
             if backward:
-                S[L.PX + at], S[L.PY + at], S[L.PZ + at] = f(px), f(py), f(pz)
+                S[L.DU + at], S[L.DV + at] = f(du), f(dv)
                 S[L.MID + at], S[L.TM + at], S[L.IA + at], S[L.UNCUT + at] = f(mid), f(tm), f(ia), uncut
                 S[L.HEIGHT + at], S[L.SLIDE + at] = f(h), f(0)
                 S[L.DH + at] = f(0.5 * ia / np.sqrt(max(D, np.float64(depth_floor)) * ia))
@@ -73,7 +73,7 @@ def chords_float64(S, X, bounds, y0, y1, tx, ty, n, p, depth_floor, with_mid, ba
         if with_mid or backward:
             S[L.MID + k] = f(0)
         if backward:
-            for a in (L.PX, L.PY, L.PZ, L.TM, L.IA, L.UNCUT, L.HEIGHT, L.SLIDE, L.DH):
+            for a in (L.DU, L.DV, L.TM, L.IA, L.UNCUT, L.HEIGHT, L.SLIDE, L.DH):
                 S[a + k] = f(0)
 
 

@@ -9,7 +9,7 @@ from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.neurons import field_values
 from neuprim.core.render.cpu.ray_colours import add_ray_colours, composite_rgb_ray_colours, ray_colours
-from neuprim.core.render.cpu.tiles import compact, row_spans
+from neuprim.core.render.cpu.tiles import aligned, compact, fetch_ahead, row_spans
 from neuprim.core.render.cpu.trigonometry import one_minus_exp
 
 __all__ = ["composite_tiles"]
@@ -81,9 +81,9 @@ def composite_tiles(  # type: ignore[no-untyped-def]
     scratch = L.FORWARD_SCRATCH
     if net is not None:
         scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
-        waves = np.zeros((net.hidden, L.NET_SCRATCH), np.float32)
-    S, D = np.zeros(scratch + 1024, np.float32), np.zeros(FLOAT64_SCRATCH, np.float64)
-    state = np.zeros((4 + C) * L.PIXELS + 2 * L.TILE, np.float32)
+        waves = aligned(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
+    S, D = aligned(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64)
+    state = aligned((4 + C) * L.PIXELS + 2 * L.TILE)
     w = np.zeros(L.TILE, np.float32)
     bounds, offset = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32)
     rows_live = np.zeros(L.TILE, np.float32)
@@ -99,17 +99,21 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                 if tx + x < width and ty + y < height:
                     state[j + L.T_], state[j + L.NORM] = f(1), norms[ty + y, tx + x]
         for q in range(starts[t], starts[t + 1]):
+            if q + 1 < starts[t + 1]:
+                fetch_ahead(np.int64(ids[q + 1]), rows, spans, boxes)
             i = ids[q]
             p = rows[i]
             y0, y1 = max(boxes[i, 1] - ty, 0), min(boxes[i, 3] - ty, L.TILE)
             x0, x1 = max(boxes[i, 0] - tx, 0), min(boxes[i, 2] - tx, L.TILE)
             fx0, fy0 = f(tx) + f(0.5) - p[L.UX], f(ty) + f(0.5) - p[L.UY]
-            row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, bounds)
-            n = compact(S, state, offset, bounds, y0, y1, rows_live, fx0, fy0)
+            row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, rows_live, bounds)
+            n = compact(S, state, offset, bounds, y0, y1)
             if n > 0:
                 n16 = ((n + 15) // 16) * 16
                 evaluated += n16
-                field_values(S, D, n16, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, with_depth, False, edge)
+                field_values(
+                    S, D, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, with_depth, False, edge
+                )
                 _opacity(S, n16, amin, amax, edge)
                 if net is not None:
                     ray_colours(S, D, waves, n16, i, net, slots, colors[i], False)

@@ -36,33 +36,35 @@ def two_neurons(S, V0, V1, n, p, m, out):  # type: ignore[no-untyped-def]
     bx, by, bz, ba = p[o2 + L.WX], p[o2 + L.WY], p[o2 + L.WZ], p[o2 + L.AMPLITUDE]
     s0, s1, s2, s3, s4 = f(0), f(0), f(0), f(0), f(0)
     r0, r1, r2, r3, r4 = f(0), f(0), f(0), f(0), f(0)
+    # amplitudes once per neuron, not per lane: in the weights here, in the sums below
+    ax1, ay1, az1, bx1, by1, bz1 = ax * aa, ay * aa, az * aa, bx * ba, by * ba, bz * ba
     for k in range(n):
         gf, half = S[L.GF + k], S[L.HALF + k]
         qx, qy, qz = S[L.QX + k], S[L.QY + k], S[L.QZ + k]
         ex, ey, ez = S[L.EXL + k] * half, S[L.EYL + k] * half, S[L.EZL + k] * half
         s0 += gf * V0[L.N_COS + k]
-        u = gf * aa * V0[L.N_SIN + k]
-        v = gf * aa * V0[L.N_DSINC + k]
+        u = gf * V0[L.N_SIN + k]
+        v = gf * V0[L.N_DSINC + k]
         s1 += u
         s2 += u * qx + v * ex
         s3 += u * qy + v * ey
         s4 += u * qz + v * ez
         r0 += gf * V1[L.N_COS + k]
-        u1 = gf * ba * V1[L.N_SIN + k]
-        v1 = gf * ba * V1[L.N_DSINC + k]
+        u1 = gf * V1[L.N_SIN + k]
+        v1 = gf * V1[L.N_DSINC + k]
         r1 += u1
         r2 += u1 * qx + v1 * ex
         r3 += u1 * qy + v1 * ey
         r4 += u1 * qz + v1 * ez
-        S[L.GQX + k] += u * ax + u1 * bx
-        S[L.GQY + k] += u * ay + u1 * by
-        S[L.GQZ + k] += u * az + u1 * bz
-        S[L.GEX + k] += v * ax + v1 * bx
-        S[L.GEY + k] += v * ay + v1 * by
-        S[L.GEZ + k] += v * az + v1 * bz
+        S[L.GQX + k] += u * ax1 + u1 * bx1
+        S[L.GQY + k] += u * ay1 + u1 * by1
+        S[L.GQZ + k] += u * az1 + u1 * bz1
+        S[L.GEX + k] += v * ax1 + v1 * bx1
+        S[L.GEY + k] += v * ay1 + v1 * by1
+        S[L.GEZ + k] += v * az1 + v1 * bz1
     o, o2 = L.G_NEURONS + L.PER_NEURON * m, L.G_NEURONS + L.PER_NEURON * (m + 1)
-    out[o + L.AMPLITUDE], out[o + L.PHASE], out[o + L.WX], out[o + L.WY], out[o + L.WZ] = s0, s1, s2, s3, s4
-    out[o2 + L.AMPLITUDE], out[o2 + L.PHASE], out[o2 + L.WX], out[o2 + L.WY], out[o2 + L.WZ] = r0, r1, r2, r3, r4
+    out[o + L.AMPLITUDE], out[o + L.PHASE], out[o + L.WX], out[o + L.WY], out[o + L.WZ] = s0, aa * s1, aa * s2, aa * s3, aa * s4
+    out[o2 + L.AMPLITUDE], out[o2 + L.PHASE], out[o2 + L.WX], out[o2 + L.WY], out[o2 + L.WZ] = r0, ba * r1, ba * r2, ba * r3, ba * r4
 
 
 @inline
@@ -87,7 +89,9 @@ def chord_gradient(S, n, p, out, edge, in_float64):  # type: ignore[no-untyped-d
     for k in range(n):
         half, ex, ey, ez = S[L.HALF + k], S[L.EXL + k], S[L.EYL + k], S[L.EZL + k]
         mid, tm, ia, uncut, dh = S[L.MID + k], S[L.TM + k], S[L.IA + k], S[L.UNCUT + k], S[L.DH + k]
-        px, py, pz, h, slide = S[L.PX + k], S[L.PY + k], S[L.PZ + k], S[L.HEIGHT + k], S[L.SLIDE + k]
+        h, slide = S[L.HEIGHT + k], S[L.SLIDE + k]
+        shift = mid - tm  # the closest point again: three stores fewer before
+        px, py, pz = S[L.QX + k] - shift * ex, S[L.QY + k] - shift * ey, S[L.QZ + k] - shift * ez
         gqx, gqy, gqz = S[L.GQX + k], S[L.GQY + k], S[L.GQZ + k]
         vx, vy, vz = S[L.GEX + k], S[L.GEY + k], S[L.GEZ + k]
         g, field = S[L.GRAD + k], S[L.FIELD + k]

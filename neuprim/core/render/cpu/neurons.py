@@ -83,14 +83,14 @@ _slopes_slow, _slopes_medium, _slopes_fast = _slopes(slopes_slow), _slopes(slope
 
 
 @inline
-def field_values(S, D, n, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, with_mid, backward, edge):  # type: ignore[no-untyped-def]
+def field_values(S, D, n, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, with_mid, backward, edge):  # type: ignore[no-untyped-def]
     """Chords and FIELD of ``n`` lanes of primitive ``i``, in float64 where float32 is too coarse; see :func:`~tiles.chords`."""
     if slots[i] >= 0:
         chords_float64(S, D, bounds, y0, y1, tx, ty, n, wide[slots[i]], floor, with_mid, backward)
         neurons_float64(edge, S, D, n, wide[slots[i]], neurons)
     else:
         p = rows[i]
-        chords(S, n, p, floor, with_mid, backward, edge)
+        chords(S, n, p, fx0, fy0, floor, with_mid, backward, edge)
         for m in range(0, neurons, 2):
             o = L.NEURONS + L.PER_NEURON * m
             if kinds[i, m // 2] == L.MEDIUM:
@@ -102,14 +102,14 @@ def field_values(S, D, n, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, n
 
 
 @inline
-def field_with_slopes(S, D, V, n, bounds, y0, y1, tx, ty, i, rows, wide, slots, kinds, neurons, floor, edge):  # type: ignore[no-untyped-def]
+def field_with_slopes(S, D, V, n, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, edge):  # type: ignore[no-untyped-def]
     """The same for the backward pass: also the three products per neuron, in ``V``, that the gradients need."""
     if slots[i] >= 0:
         chords_float64(S, D, bounds, y0, y1, tx, ty, n, wide[slots[i]], floor, False, True)
         slopes_float64(edge, S, D, V, n, wide[slots[i]], neurons)
     else:
         p = rows[i]
-        chords(S, n, p, floor, False, True, edge)
+        chords(S, n, p, fx0, fy0, floor, False, True, edge)
         for m in range(0, neurons, 2):
             o = L.NEURONS + L.PER_NEURON * m
             if kinds[i, m // 2] == L.MEDIUM:

@@ -34,6 +34,7 @@ _FLOAT32_MAX = 3.0e38
 _FLOAT64_RADII = 8.0  # terms of a point on the ray this many radii of the thinnest axis long: they cancel
 _FLOAT64_ANCHOR = 1.25  # the same of the centre seen from an anchor at the camera: most cameras outside, but near
 FLOAT64_TURNS = 4.0  # of a neuron, or a unit of a colour network, over half a chord
+_ANCHOR_RADII = 1.5  # a centre at least so many radii in front of the camera is its own anchor, also where the near plane cuts it
 _CUT = 1e-3  # of the reach: float32 may find a chord cut that float64 does not
 _FLOAT64_PIXELS = 16384.0  # from the corner of the image to the anchor
 _FLOAT64_RATIO = 256.0  # of the axes; for the gradients
@@ -101,11 +102,11 @@ def _frame(mean, log_scale, quat, R, t, cam, near, local, B, axes, c, anchor):  
         for j in range(3):
             B[i, j] = R[i, 0] * local[0, j] + R[i, 1] * local[1, j] + R[i, 2] * local[2, j]
     fx, fy, cx, cy = cam[0], cam[1], cam[2], cam[3]
-    if c[2] > 1.5 * m + near:
+    if c[2] > _ANCHOR_RADII * m and c[2] + m > near:
         anchor[0] = m * np.float64(np.float32(c[2] / m))
         anchor[1] = np.float64(np.float32(fx * c[0] / c[2] + cx))
         anchor[2] = np.float64(np.float32(fy * c[1] / c[2] + cy))
-    else:  # the centre is near or behind the camera: anchor at the camera itself
+    else:  # the centre is near or behind the camera, or nothing is seen of it: anchor at the camera itself
         anchor[0] = 0.0
         anchor[1] = np.float64(np.float32(cx))
         anchor[2] = np.float64(np.float32(cy))
@@ -113,10 +114,11 @@ def _frame(mean, log_scale, quat, R, t, cam, near, local, B, axes, c, anchor):  
 
 
 @strict
-def _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, rate, order, row):  # type: ignore[no-untyped-def]
+def _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, waves, rate, order, row):  # type: ignore[no-untyped-def]
     """Fill the float64 kernel row of primitive ``i`` and ``order[i]``; returns (m, whether all is finite, largest number).
 
-    ``work`` (10, 3): scratch, of which rows 0..2 return B, 3 the axes s/m, 4 the centre in camera axes.
+    ``work`` (10, 3): scratch, of which rows 0..2 return B, 3 the axes s/m, 4 the centre in camera axes. ``waves`` (K, 4): scratch.
+    ``rate`` (K,) returns the neurons' rates, rising.
     """
     K = W1.shape[1]
     B, axes, c, local, anchor, w = work[0:3], work[3], work[4], work[5:8], work[8], work[9]
@@ -141,32 +143,31 @@ def _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turn
     biggest = max(biggest, tc, abs(row[L.NEAR]), m, abs(row[L.OFFSET]))
     total += tc + row[L.NEAR] + m + row[L.OFFSET]
     for k in range(K):
-        w0 = turns * axes[0] * (W1[i, k, 0] * local[0, 0] + W1[i, k, 1] * local[1, 0] + W1[i, k, 2] * local[2, 0])
-        w1 = turns * axes[1] * (W1[i, k, 0] * local[0, 1] + W1[i, k, 1] * local[1, 1] + W1[i, k, 2] * local[2, 1])
-        w2_ = turns * axes[2] * (W1[i, k, 0] * local[0, 2] + W1[i, k, 1] * local[1, 2] + W1[i, k, 2] * local[2, 2])
-        speed = np.sqrt(w0 * w0 + w1 * w1 + w2_ * w2_)
-        phase = turns * np.float64(b1[i, k])
+        waves[k, 0] = turns * axes[0] * (W1[i, k, 0] * local[0, 0] + W1[i, k, 1] * local[1, 0] + W1[i, k, 2] * local[2, 0])
+        waves[k, 1] = turns * axes[1] * (W1[i, k, 0] * local[0, 1] + W1[i, k, 1] * local[1, 1] + W1[i, k, 2] * local[2, 1])
+        waves[k, 2] = turns * axes[2] * (W1[i, k, 0] * local[0, 2] + W1[i, k, 1] * local[1, 2] + W1[i, k, 2] * local[2, 2])
+        speed = np.sqrt(waves[k, 0] * waves[k, 0] + waves[k, 1] * waves[k, 1] + waves[k, 2] * waves[k, 2])
+        waves[k, 3] = speed
         biggest = max(biggest, speed, abs(np.float64(w2[i, k])))
-        total += speed + phase + w2[i, k]
-        at = k  # insertion sort
-        while at > 0 and rate[at - 1] > speed:
-            rate[at], order[i, at] = rate[at - 1], order[i, at - 1]
-            for j in range(L.NEURONS + L.PER_NEURON * at, L.NEURONS + L.PER_NEURON * (at + 1)):
-                row[j] = row[j - L.PER_NEURON]
-            at -= 1
-        o = L.NEURONS + L.PER_NEURON * at
+        total += speed + turns * np.float64(b1[i, k]) + w2[i, k]
+    for k in range(K):
+        at, speed = np.int64(0), waves[k, 3]  # counting the slower ones sorts without a branch; neurons as fast keep their order
+        for j in range(K):
+            at += np.int64((waves[j, 3] < speed) | ((waves[j, 3] == speed) & (j < k)))
+        o, phase = L.NEURONS + L.PER_NEURON * at, turns * np.float64(b1[i, k])
         rate[at], order[i, at] = speed, k
-        row[o + L.WX], row[o + L.WY], row[o + L.WZ], row[o + L.PHASE], row[o + L.AMPLITUDE] = w0, w1, w2_, phase - np.rint(phase), w2[i, k]
+        row[o + L.WX], row[o + L.WY], row[o + L.WZ] = waves[k, 0], waves[k, 1], waves[k, 2]
+        row[o + L.PHASE], row[o + L.AMPLITUDE] = phase - np.rint(phase), w2[i, k]
     return m, np.isfinite(total), biggest
 
 
 @exact_kernel
 def prepare_wide(start, stop, which, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, order, wide):  # type: ignore[no-untyped-def]
     """float64 rows of primitives ``which[start:stop]``, which the pixel stage draws in float64."""
-    work, rate = np.empty((10, 3)), np.empty(W1.shape[1])
+    work, waves, rate = np.empty((10, 3)), np.empty((W1.shape[1], 4)), np.empty(W1.shape[1])
     for n in range(start, stop):
         wide[n, :] = 0.0
-        _wide_row(which[n], means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, rate, order, wide[n])
+        _wide_row(which[n], means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, waves, rate, order, wide[n])
 
 
 @exact_kernel
@@ -181,11 +182,11 @@ def prepare(  # type: ignore[no-untyped-def]
     ``in_float64[i]`` says that float32 is not enough for the primitive's pixels (see :func:`prepare_wide`).
     """
     K = W1.shape[1]
-    work, rate, row = np.empty((10, 3)), np.empty(K), np.zeros(rows.shape[1])
+    work, waves, rate, row = np.empty((10, 3)), np.empty((K, 4)), np.empty(K), np.zeros(rows.shape[1])
     B, axes, c, e0, ex, ey, xa = work[0:3], work[3], work[4], row[L.E0 : L.EX], row[L.EX : L.EY], row[L.EY : L.XA], row[L.XA : L.XU]
     k0, ka, kb, tmp = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(start, stop):
-        m, finite, biggest = _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, rate, order, row)
+        m, finite, biggest = _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, waves, rate, order, row)
         for n in range(kinds.shape[1]):
             fastest = rate[min(2 * n + 1, K - 1)]
             kinds[i, n] = L.SLOW if fastest < L.SLOW_TURNS else (L.MEDIUM if fastest < L.MEDIUM_TURNS else L.FAST)

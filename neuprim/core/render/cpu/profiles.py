@@ -127,7 +127,7 @@ def _medium(p: int) -> tuple[Kernel, Kernel]:
 
 def _fast(p: int) -> tuple[Kernel, Kernel]:
     value, slope = _horner(_SLOW[p]), _horner(_SLOW_SLOPE[p])
-    hard = p == 1
+    first = p == 1
 
     @inline
     def one(v, near, r, iv):  # type: ignore[no-untyped-def]
@@ -135,7 +135,7 @@ def _fast(p: int) -> tuple[Kernel, Kernel]:
         z, iz = r * r, iv * f(1 / T.TAU)  # iz = 1/(2 pi v)
         b0, cosine = T.sinc_turns(z) * r * iv, T.cos_turns(z)
         b1 = f(3) * (b0 - cosine) * iz * iz
-        if hard:
+        if first:
             b, db = b1, f(-3) * (b1 - b0) * iv
         else:
             b2 = f(15) * (b1 - b0) * iz * iz

@@ -6,13 +6,18 @@ chord and neurons over that list, scatter back row by row. Evaluated lanes then 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 from neuprim.core.compute.kernels import inline
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cpu import layout as L
 
-__all__ = ["chords", "compact", "row_spans"]
+__all__ = ["aligned", "chords", "compact", "fetch_ahead", "row_spans"]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
@@ -22,8 +27,41 @@ _MARGIN, _ROUNDING = f(2e-3), f(4e-7)  # pixels, and per pixel of the ellipse; a
 
 
 @inline
-def row_spans(span, fx0, fy0, y0, y1, x0, x1, bounds):  # type: ignore[no-untyped-def]
-    """Pixels [bounds[y], bounds[y + 16]) of each tile row inside the silhouette, equal outside rows y0:y1.
+def aligned(floats):  # type: ignore[no-untyped-def]
+    """Zeros that begin a cache line: numba aligns to 32 bytes, and a vector of 64 that lies across two lines costs twice."""
+    room = np.zeros(floats + 16, np.float32)
+    shift = -(np.int64(room.ctypes.data) // 4) % 16
+    return room[shift : shift + floats]
+
+
+def _prefetch(context, address):  # type: ignore[no-untyped-def]
+    """Ask memory for the cache line at an address. Nothing is read, so that no address is wrong."""
+
+    def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        byte, i32 = ir.IntType(8).as_pointer(), ir.IntType(32)
+        function = builder.module.declare_intrinsic("llvm.prefetch", (byte,), ir.FunctionType(ir.VoidType(), [byte, i32, i32, i32]))
+        builder.call(function, [builder.inttoptr(arguments[0], byte), i32(0), i32(3), i32(1)])  # to read, to stay, data
+        return context.get_dummy_value()
+
+    return types.void(types.intp), code
+
+
+_ask: Any = intrinsic(_prefetch)
+
+
+@inline
+def fetch_ahead(i, rows, spans, boxes):  # type: ignore[no-untyped-def]
+    """Ask memory for what the pair after this one, of primitive ``i``, reads first: tiles meet primitives in no order that it could guess."""
+    row = rows.ctypes.data + i * rows.strides[0]
+    for at in range(0, rows.strides[0], 64):
+        _ask(row + at)
+    _ask(spans.ctypes.data + i * spans.strides[0])
+    _ask(boxes.ctypes.data + i * boxes.strides[0])
+
+
+@inline
+def row_spans(span, fx0, fy0, y0, y1, x0, x1, rows_live, bounds):  # type: ignore[no-untyped-def]
+    """Pixels [bounds[y], bounds[y + 16]) of each live tile row inside the silhouette, equal in the others and outside rows y0:y1.
 
     fx0, fy0: the tile corner's pixel centre from the anchor. All 16 rows at once: one vector.
     """
@@ -40,42 +78,36 @@ def row_spans(span, fx0, fy0, y0, y1, x0, x1, bounds):  # type: ignore[no-untype
         half += _MARGIN + _ROUNDING * (half + abs(mid))
         lo = max(np.ceil(mid - half), low)
         hi = min(np.floor(mid + half) + f(1), high)
-        inside = (s > f(-1e-2)) & (row >= top) & (row < bottom)
+        inside = (s > f(-1e-2)) & (row >= top) & (row < bottom) & (rows_live[y] > f(0)) & (hi > lo)
         bounds[y] = np.int32(lo if inside else f(0))
         bounds[y + L.TILE] = np.int32(hi if inside else f(0))
 
 
 @inline
-def compact(S, state, offset, bounds, y0, y1, rows_live, fx0, fy0):  # type: ignore[no-untyped-def]
-    """Gather pixel offsets and ray norms of live rows into lanes; ``offset[y]`` is where row y starts. Returns the lane count.
+def compact(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-def]
+    """Gather pixels and their ray norms into lanes; ``offset[y]`` is where row y starts. Returns the lane count.
 
-    Every row writes a whole vector; the next row, or the final padding, overwrites what stands over, so tail lanes
-    always hold finite numbers.
+    Every row writes a whole vector, without a branch that would be guessed wrong every other time; the next row, or the final padding,
+    overwrites what stands over, so tail lanes always hold numbers of pixels of the tile.
     """
     n = 0
     for y in range(y0, y1):
         offset[y] = n
         a = bounds[y]
-        m = bounds[y + L.TILE] - a
-        if m > 0 and rows_live[y] > f(0):
-            x0, dv = fx0 + f(a), fy0 + f(y)
-            j = L.NORM + y * L.TILE + a
-            for k in range(L.TILE):
-                S[index(L.DU + n + k)] = x0 + _STEPS[k]
-                S[index(L.DV + n + k)] = dv
-                S[index(L.NORM_L + n + k)] = state[index(j + k)]
-            n += m
-        else:
-            bounds[y + L.TILE] = a
+        pixel = f(y * L.TILE + a)
+        j = L.NORM + y * L.TILE + a
+        for k in range(L.TILE):
+            S[index(L.PIXEL + n + k)] = pixel + _STEPS[k]
+            S[index(L.NORM_L + n + k)] = state[index(j + k)]
+        n += bounds[y + L.TILE] - a
     for k in range(L.TILE):
-        S[index(L.DU + n + k)] = f(0)
-        S[index(L.DV + n + k)] = f(0)
+        S[index(L.PIXEL + n + k)] = f(y0 * L.TILE)
         S[index(L.NORM_L + n + k)] = f(0)
     return n
 
 
 @inline
-def chords(S, n, p, depth_floor, with_mid, backward, edge):  # type: ignore[no-untyped-def]
+def chords(S, n, p, fx0, fy0, depth_floor, with_mid, backward, edge):  # type: ignore[no-untyped-def]
     """Chord middle Q, direction E and half length of n lanes (method: "Line integral"); HALF = 0 where the ray misses.
 
     Where the edge is soft, no chord may be cut: such primitives are drawn in float64.
@@ -90,7 +122,9 @@ def chords(S, n, p, depth_floor, with_mid, backward, edge):  # type: ignore[no-u
     v0, v1, v2 = p[L.XV], p[L.XV + 1], p[L.XV + 2]
     tu, tv, near, offset = p[L.TU], p[L.TV], p[L.NEAR], p[L.OFFSET]
     for k in range(n):
-        du, dv = S[L.DU + k], S[L.DV + k]
+        pixel = S[L.PIXEL + k]
+        y = np.floor(pixel * f(1 / L.TILE))
+        du, dv = fx0 + (pixel - y * f(L.TILE)), fy0 + y
         slide = du * tu + dv * tv
         gx, gy, gz = du * x0 + dv * y0, du * x1 + dv * y1, du * x2 + dv * y2
         ex, ey, ez = e0 + gx, e1 + gy, e2 + gz
@@ -122,7 +156,7 @@ def chords(S, n, p, depth_floor, with_mid, backward, edge):  # type: ignore[no-u
         if with_mid:
             S[L.MID + k] = mid + slide
         if backward:
-            S[L.PX + k], S[L.PY + k], S[L.PZ + k] = px, py, pz
+            S[L.DU + k], S[L.DV + k] = du, dv
             S[L.MID + k], S[L.TM + k], S[L.IA + k], S[L.UNCUT + k] = mid, tm, ia, uncut
             S[L.HEIGHT + k], S[L.SLIDE + k] = h, slide
             S[L.DH + k] = f(0.5) * ia / np.sqrt(max(D, depth_floor) * ia)

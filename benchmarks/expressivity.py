@@ -1,217 +1,223 @@
-"""What one primitive can express: neural, Gaussian and constant-density primitives at equal count and at equal bytes.
+"""What one primitive can express, and what its bytes are worth: the forms of the family, the paper's and a Gaussian, at equal bytes and equal seconds.
 
-    python benchmarks/expressivity.py [DIR] [--seeds 3] [--primitives 100] [--iterations 400] [--keep] [--docs]
+    python benchmarks/expressivity.py [--scenes solids chair fire smoke_fire lit_solids] [--chair DIR] [--fire DIR]
+        [--parts forms slope gaussian] [--sizes 100 400 2000] [--seeds 3] [--docs] [--print]
 
-Trains on the embedded scene `solids` and, if DIR is given, on that NeRF-synthetic folder. Every run is the static task
-with the preset `quick`, cut to a fixed number of iterations rather than seconds: the Gaussian does not lower to a form that the
-fast kernels know and runs on the reference backend, so equal seconds would compare backends. For the same reason the images are
-small. Equal bytes means that the forms with fewer parameters get more primitives. Numbers are means over seeds +- half the
-spread, on the test views, of the last checkpoint.
+Each run is its task's preset `quick`, cut to a number of steps. A size is the bytes of so many of the paper's primitives; every form gets as many primitives
+as these bytes hold. Parts:
 
-Results go to benchmarks/results/expressivity.json after every run (--keep goes on from there), models to outputs/expressivity, and
-from the models of seed 0 the picture docs/pictures/expressivity.png is drawn (Figure 9 of the paper). --docs puts the table between
-the markers in docs/expressivity.md; --print runs nothing and prints the recorded table.
+    forms     every form at every size, for as many steps as fit into the seconds that the paper's form takes for its own: the forms take turns
+              on this machine first, and each has its pace
+    slope     the same with half the steps, first seed: what the last doubling of the budget still brought
+    gaussian  a true Gaussian has no fast kernel and runs on the reference backend: small images of the static scenes and few steps, equal count
+              and equal bytes, beside the other forms in the same conditions
+
+Each form learns at the best rates of `screening.py`, which sees no test view (RATES). Means over seeds +- half the spread, of the last
+checkpoint, on the test views. Results go to benchmarks/results/expressivity.json after every run, and only what is missing is run; models to
+outputs/expressivity, from which docs/pictures/expressivity.png is drawn (Figure 9 of the paper). --docs puts the tables between the markers in
+docs/expressivity.md; --print runs nothing.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
-import sys
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-import torch
+from shared.forms import PAPER, SCENES, Form
 from shared.machine import cpu_name
 from shared.tables import between_markers, spread
-
-from neuprim.config import compose
-from neuprim.core.checkpoint import save_model
-from neuprim.runs.fit import fit
+from shared.trials import Trial, begin, paces_of, recorded, run_all
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "expressivity.json"
 DOCS = HERE.parent / "docs" / "expressivity.md"
 PICTURE = HERE.parent / "docs" / "pictures" / "expressivity.png"
-KEYS = ("psnr", "psnr_worst", "ssim", "iterations", "parameters", "parameters_per_primitive", "primitives", "backend", "seed")
+KEYS = (
+    "psnr", "psnr_worst", "ssim", "psnr_mask", "psnr_linear_clamped", "psnr_pooled_cast_shadow", "psnr_pooled_highlight",
+    "sigma_relative_l2_early", "sigma_relative_l2_middle", "sigma_relative_l2_late",
+    "parameters", "parameters_per_primitive", "primitives", "backend",
+)  # fmt: skip
 
+RATES = {"static": ("train.rates.b2=0.03", "train.rates.w2=0.03", "train.rates.log_scales=0.06")}
+"""Settings of each task's runs where they differ from the preset's: the best of `screening.py`, in dB of (solids, chair) at the bytes of 400 and 1,500 steps.
 
-@dataclass(frozen=True)
-class Form:
-    """One kind of primitive: its name in the table, its overrides, and its parameters besides the 48 of the colour."""
-
-    label: str
-    words: tuple[str, ...]
-    size: int
-
-
-# Each form's amplitudes learn at the best of the rates tried at 150 primitives and 400 iterations of solids: the preset's own were found
-# for runs ten times as long. Tried were, in dB of seed 0: neural, (b2, w2) = (0.01, 0.01) 24.68, (0.03, 0.01) 24.91, (0.1, 0.01) 24.45,
-# (0.01, 0.03) 24.73, (0.03, 0.03) 25.25, (0.05, 0.06) 24.72, (0.1, 0.03) 25.15, (0.1, 0.1) 24.87, (0.2, 0.1) 23.87; Gaussian, 0.02 23.63,
-# 0.1 25.18, 0.2 25.37; constant, 0.01 22.73, 0.03 22.93, 0.1 22.32, 0.3 20.39.
-FORMS = {
-    "neural": Form("neural, K = 8", ("model.neurons=8", "train.rates.b2=0.03", "train.rates.w2=0.03"), 51),
-    "gaussian": Form("Gaussian", ("model.density.form=gaussian", "train.rates.log_amplitude=0.2"), 11),
-    "constant": Form("constant density, K = 0", ("model.neurons=0", "train.rates.b2=0.03"), 11),
+K = 8 hard: preset 27.60, 29.88; b2, w2 0.03 28.16, 30.08; 0.1 28.08, 30.26; 0.03 and log_scales 0.06 **28.29, 30.22**; 0.03 and means 1e-3 28.01, -.
+K = 2 p = 2: b2, w2 0.01 29.64, 30.82; 0.03 29.68, 30.78; 0.1 29.71, 30.74; 0.03 and log_scales 0.02 29.29, 30.63; and 0.06 **29.96, 30.92**; and log_gain 0.05 29.49,
+30.69; and 0.5 29.59, 30.91; and W1, b1 0.02 29.73, 30.88; and means 1e-3 29.77, 30.83; and model.init.scale 1.4 29.41, 30.70; log_scales 0.06 and W1, b1 0.02 29.92, 30.90.
+K = 0 p = 2: 0.01 29.32, 30.58; 0.03 29.35, 30.54; 0.1 29.21, 30.56; 0.03 and log_scales 0.06 **29.51, 30.66**; and log_gain 0.5 29.22, 30.51; and means 1e-3 29.30, 30.59.
+So the same rates are best for each, and are used for all."""
+FORMS = ("8:0", "0:2", "2:2", "4:2")
+STEPS = {
+    "solids": {100: 2000, 400: 2000, 2000: 3000},
+    "chair": {100: 2000, 400: 2000, 2000: 3000},
+    "fire": {2000: 2500},
+    "smoke_fire": {1000: 3000},
+    "lit_solids": {2000: 2000},
 }
-COLOUR = 48
+"""Of the paper's form; the others train as long in seconds."""
+SMALL = {"iterations": 400, "primitives": 100, "size": 64, "downsample": 4}
+"""What the part ``gaussian`` is reduced to."""
 
 
-@dataclass(frozen=True)
-class Job:
-    scene: str
-    form: str
-    primitives: int
-    seed: int
-
-    @property
-    def name(self) -> str:
-        return f"{self.scene}-{self.form}-{self.primitives}-{self.seed}"
+def reduced(scene: str) -> tuple[str, ...]:
+    """The small images of the part ``gaussian``."""
+    return (f"scene.size={SMALL['size']}",) if scene == "solids" else (f"scene.downsample={SMALL['downsample']}",)
 
 
-def equal_bytes(form: str, primitives: int) -> int:
-    """As many primitives of ``form`` as have the parameters of ``primitives`` neural ones."""
-    return round(primitives * (FORMS["neural"].size + COLOUR) / (FORMS[form].size + COLOUR))
+def words_of(form: str, scene: str, args: argparse.Namespace, count: int) -> tuple[str, ...]:
+    own = SCENES[scene]
+    return (*own.all_words(vars(args), scene), *Form.named(form).words, *RATES.get(own.task, ()), f"model.primitives={count}")
 
 
-def plan(scenes: list[str], forms: list[str], primitives: int, seeds: int) -> list[Job]:
-    """Every run; seed 0 of everything first, so that an early end leaves whole rows."""
-    jobs = []
-    for seed in range(seeds):
-        for scene in scenes:
-            for form in forms:
-                for count in dict.fromkeys((primitives, equal_bytes(form, primitives))):
-                    jobs.append(Job(scene, form, count, seed))
-    return jobs
+def measured_paces(args: argparse.Namespace) -> dict[str, float]:
+    """Time of a step over that of the paper's form, by "scene size form"; what is recorded stays."""
+    found: dict[str, float] = json.loads(RESULTS.read_text()).get("paces", {}) if RESULTS.exists() else {}
+    for scene in args.scenes:
+        for size in sizes(scene, args):
+            missing = [f for f in args.forms if f"{scene} {size} {f}" not in found]
+            if not missing:
+                continue
+            turns = dict.fromkeys([str(PAPER), *missing])  # ratios travel, seconds do not: the reference takes part every time
+            counts = {f: Form.named(f).equal_bytes(size, SCENES[scene].task) for f in turns}
+            took = paces_of({f: begin(Trial(f, words_of(f, scene, args, n), 10_000)).trainer for f, n in counts.items()})
+            found |= {f"{scene} {size} {f}": took[f] / took[str(PAPER)] for f in turns}
+            print(f"paces of {scene}, {size}:", {f: round(took[f] / took[str(PAPER)], 3) for f in turns}, flush=True)
+    return found
 
 
-def scene_words(scene: str, folder: Path | None, args: argparse.Namespace) -> list[str]:
-    if scene == "solids":
-        return ["scene=solids", f"scene.size={args.size}"]
-    assert folder is not None
-    return ["scene=blender", f"scene.path='{folder.resolve()}'", f"scene.downsample={args.downsample}"]
+def sizes(scene: str, args: argparse.Namespace) -> list[int]:
+    return [size for size in STEPS[scene] if not args.sizes or size in args.sizes]
 
 
-def train(job: Job, words: list[str], iterations: int, backend: str, target: Path) -> dict[str, Any]:
-    """One run of one thread: what `neuprim run` does, less its pictures and report. Leaves configuration and model in ``target``."""
-    torch.set_num_threads(1)
-    config = compose([
-        "task=static", *words, *FORMS[job.form].words, f"model.primitives={job.primitives}", f"seed={job.seed}", "train.background=white",
-        f"train.iterations={iterations}", "train.max_seconds=null", f"train.population.every={max(iterations // 20, 1)}",
-        f"renderer.backend={backend}", "renderer.threads=1", f"output_dir='{target.resolve()}'",
-    ], check_output=False)  # fmt: skip
-    fitted = fit(config)
-    dataset = fitted.dataset
-    target.mkdir(parents=True, exist_ok=True)
-    (target / "config.yaml").write_text(config.to_yaml())
-    save_model(target / "model.safetensors", fitted.model, config.task, {"color_space": dataset.color_space})
-    metrics = fitted.metrics()
-    return {"scene": dataset.name, "form": job.form, "job": job.name, **{k: metrics[k] for k in KEYS}, "versions": metrics["versions"]}
+def plan(args: argparse.Namespace, paces: dict[str, float]) -> list[Trial]:
+    """Every run; the first seed of everything first, so that an early end leaves whole rows."""
+    trials = []
+
+    def add(part: str, scene: str, size: int, form: str, count: int, steps: int, seed: int, further: tuple[str, ...] = ()) -> None:
+        facts = (("part", part), ("scene", scene), ("form", form), ("size", size))
+        name = f"{part}-{scene}-{size}-{form}-{count}-{steps}-{seed}"
+        kept = args.models / name if seed == 0 and part != "slope" and SCENES[scene].task == "static" else None
+        trials.append(Trial(name, (*words_of(form, scene, args, count), *further), steps, seed, 0, facts, kept))
+
+    for seed in range(args.seeds):
+        for scene in args.scenes:
+            task = SCENES[scene].task
+            for size in sizes(scene, args) if paces else []:
+                for form in args.forms:
+                    count, steps = Form.named(form).equal_bytes(size, task), round(STEPS[scene][size] / paces[f"{scene} {size} {form}"])
+                    if "forms" in args.parts:
+                        add("forms", scene, size, form, count, steps, seed)
+                    if "slope" in args.parts and seed == 0:
+                        add("slope", scene, size, form, count, steps // 2, seed)
+            if "gaussian" in args.parts and task == "static":
+                for form in [*args.forms, "gaussian"]:
+                    size = SMALL["primitives"]
+                    for count in dict.fromkeys((size, Form.named(form).equal_bytes(size, task))):
+                        add("gaussian", scene, size, form, count, SMALL["iterations"], seed, reduced(scene))
+    return trials
 
 
-# ---------------------------------------------------------------- the table
+# ---------------------------------------------------------------- the tables
 
 
-def table(results: dict[str, Any]) -> str:
-    """Markdown; the note below states everything that was reduced."""
+def forms_table(trials: list[dict[str, Any]]) -> str:
+    """One row per form, scene and size; the best in bold, and all whose mean lies within its half spread."""
     lines = [
-        "| scene | primitive | primitives | parameters | PSNR | worst view | SSIM | backend |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| scene | bytes of | primitive | primitives | numbers each | steps | PSNR | worst view | SSIM | last doubling |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
-    groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
-    for run in results["runs"]:
-        groups.setdefault((run["scene"], run["form"], run["primitives"]), []).append(run)
-    settings = results["settings"]
-    order = list(FORMS)
-    for scene, form, count in sorted(groups, key=lambda k: (k[0] != "solids", k[0], k[2] != settings["primitives"], order.index(k[1]))):
-        runs = groups[scene, form, count]
-        same = "" if count == settings["primitives"] else " (equal bytes)"
+    groups: dict[tuple[str, int, str], list[dict[str, Any]]] = {}
+    for run in trials:
+        if run["part"] == "forms":
+            groups.setdefault((run["scene"], run["size"], run["form"]), []).append(run)
+    order = list(SCENES)
+    for (scene, size, form), runs in sorted(groups.items(), key=lambda g: (order.index(g[0][0]), g[0][1], -_mean(g[1]))):
+        judged = SCENES[scene].judged
+        top = max((own for key, own in groups.items() if key[:2] == (scene, size)), key=_mean)
+        values = [r[judged] for r in top]
+        text = f"{spread([r[judged] for r in runs], 2)} dB"
+        half = [r[judged] for r in trials if r["part"] == "slope" and (r["scene"], r["size"], r["form"]) == (scene, size, form)]
+        first = next(r[judged] for r in runs if r["seed"] == 0)
         lines.append(
-            f"| {scene} | {FORMS[form].label} | {count}{same} | {runs[0]['parameters']} | {spread([r['psnr'] for r in runs], 2)} dB "
-            f"| {spread([r['psnr_worst'] for r in runs], 1)} dB | {spread([r['ssim'] for r in runs], 4)} | {runs[0]['backend']} |"
+            f"| {scene} | {size} | {Form.named(form).label} | {runs[0]['primitives']} | {runs[0]['parameters_per_primitive']} | {runs[0]['iterations']} "
+            f"| {f'**{text}**' if _mean(runs) >= _mean(top) - (max(values) - min(values)) / 2 else text} | {spread([r['psnr_worst'] for r in runs], 1)} dB "
+            f"| {spread([r['ssim'] for r in runs], 4)} | {f'{first - half[0]:+.2f} dB' if half else ''} |"
         )
     seeds = sorted({len(runs) for runs in groups.values()})
-    count = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
-    data = f"solids at {settings['size']}×{settings['size']}"
-    if settings["folder"]:
-        data += f", {settings['folder']} averaged down {settings['downsample']} times"
-    note = (
-        f"{data}; {settings['iterations']} iterations of the preset `quick`, white background, {count} seed(s); mean ± half the spread over "
-        "the test views of the last checkpoint. Reduced sizes: the Gaussian has no fast kernel and runs on the reference backend, which is why "
-        f"the budget counts iterations. {results['cpu']}."
+    lines.append(
+        f"\nPreset `quick`, {' to '.join(str(n) for n in seeds)} seed(s), mean ± half the spread; *bytes of* so many of the paper's primitives; steps: as many as fit into "
+        "the seconds of the paper's form, at paces measured in turns; *last doubling*: what the second half of the budget brought, first seed. PSNR is of "
+        f"the whole image (solids, chair at 200×200 on white), inside the mask (fire, smoke_fire), clamped linear (lit_solids). {cpu_name()}, one thread."
     )
-    return "\n".join(lines) + "\n\n" + note
+    return "\n".join(lines)
 
 
-# ---------------------------------------------------------------- the whole
+def gaussian_table(trials: list[dict[str, Any]]) -> str:
+    """Equal count and equal bytes in the conditions that a Gaussian can be trained in."""
+    lines = ["| scene | primitive | primitives | parameters | PSNR | worst view | backend |", "| --- | --- | --- | --- | --- | --- | --- |"]
+    groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
+    for run in trials:
+        if run["part"] == "gaussian":
+            groups.setdefault((run["scene"], run["form"], run["primitives"]), []).append(run)
+    size = SMALL["primitives"]
+    for (scene, form, count), runs in sorted(groups.items(), key=lambda g: (g[0][0] != "solids", g[0][0], g[0][2] != size, -_mean(g[1]))):
+        same = "" if count == size and form != str(PAPER) else " (equal bytes)" if count != size else " (both)"
+        lines.append(
+            f"| {scene} | {Form.named(form).label} | {count}{same} | {runs[0]['parameters']} | {spread([r['psnr'] for r in runs], 2)} dB "
+            f"| {spread([r['psnr_worst'] for r in runs], 1)} dB | {runs[0]['backend']} |"
+        )
+    lines.append(
+        f"\nReduced: solids at {SMALL['size']}×{SMALL['size']}, the folder's images averaged down {SMALL['downsample']} times, {SMALL['iterations']} steps of every form "
+        "(not equal seconds: the backends differ)."
+    )
+    return "\n".join(lines)
 
 
-def fit_all(args: argparse.Namespace) -> None:
-    """Train what is missing, ``args.jobs`` runs at a time, and record each as it ends."""
-    scenes = ["solids"] + ([args.folder.name] if args.folder else [])
-    names = ("size", "downsample", "primitives", "iterations", "backend")
-    settings = {**{k: getattr(args, k) for k in names}, "folder": args.folder.name if args.folder else None}
-    results: dict[str, Any] = {"cpu": cpu_name(), "settings": settings, "runs": []}
-    if args.keep and RESULTS.exists():
-        recorded = json.loads(RESULTS.read_text())
-        differing = [k for k in names if recorded["settings"][k] != settings[k]]
-        if differing:
-            raise SystemExit(f"--keep: {RESULTS} was recorded with another {', '.join(differing)}")
-        results["runs"] = recorded["runs"]
-        settings["folder"] = settings["folder"] or recorded["settings"]["folder"]
-    known = {run["job"] for run in results["runs"]}
-    jobs = [job for job in plan(scenes, args.forms, args.primitives, args.seeds) if job.name not in known]
-    for scene in scenes if jobs else []:  # drawn images and compiled kernels are kept for the runs side by side
-        train(Job(scene, "neural", 8, 0), scene_words(scene, args.folder, args), 2, "auto", args.models / "warm-up")
-    with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
-        waiting = {
-            pool.submit(train, job, scene_words(job.scene, args.folder, args), args.iterations, args.backend, args.models / job.name): job
-            for job in jobs
-        }
-        for future in as_completed(waiting):
-            row = future.result()
-            results["runs"] = sorted([*results["runs"], row], key=lambda r: r["job"])
-            RESULTS.parent.mkdir(exist_ok=True)
-            RESULTS.write_text(json.dumps(results, indent=1) + "\n")  # after every run: a long benchmark may be cut short
-            print(f"{waiting[future].name}: {row['psnr']:.2f} dB, {row['backend']} backend", flush=True)
+def _mean(runs: list[dict[str, Any]]) -> float:
+    return sum(float(r[SCENES[r["scene"]].judged]) for r in runs) / len(runs)
+
+
+def _pictured(trials: list[dict[str, Any]], scene: str) -> list[dict[str, Any]]:
+    """Of each form the run of seed 0 at the bytes of 400; of the Gaussian the one at equal bytes."""
+    own = [r for r in trials if r["scene"] == scene and r["seed"] == 0]
+    rows = [r for r in own if r["part"] == "forms" and r["size"] == 400]
+    rows.sort(key=lambda r: r["form"] != str(PAPER))
+    gaussians = [r for r in own if r["part"] == "gaussian" and r["form"] == "gaussian" and r["primitives"] != SMALL["primitives"]]
+    return [*rows, *gaussians]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, nargs="?", help="a NeRF-synthetic scene beside solids")
+    parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=list(SCENES))
+    parser.add_argument("--chair", type=Path, help="a NeRF-synthetic folder")
+    parser.add_argument("--fire", type=Path, help="a folder of EmberGen's .vdb files")
+    parser.add_argument("--parts", nargs="*", default=["forms", "slope", "gaussian"], choices=("forms", "slope", "gaussian"))
+    parser.add_argument("--forms", nargs="*", default=list(FORMS), metavar="K:EDGE")
+    parser.add_argument("--sizes", nargs="*", type=int, default=[], help="some of the scenes' sizes")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--forms", nargs="*", choices=tuple(FORMS), default=list(FORMS))
-    parser.add_argument("--primitives", type=int, default=100, help="of the neural model; the others get as many, and as many bytes")
-    parser.add_argument("--iterations", type=int, default=400)
-    parser.add_argument("--size", type=int, default=64, help="pixels on a side of the images of solids")
-    parser.add_argument("--downsample", type=int, default=4, help="factor by which the images of DIR are averaged down")
-    parser.add_argument("--backend", default="auto", choices=("auto", "reference"), help="reference: the same for all three")
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
     parser.add_argument("--models", type=Path, default=Path("outputs") / "expressivity", help="folder for the fitted models")
-    parser.add_argument("--keep", action="store_true", help="keep the recorded runs, train only what is missing")
     parser.add_argument("--print", action="store_true", help="train nothing")
-    parser.add_argument("--docs", action="store_true", help="write the recorded table into docs/expressivity.md")
+    parser.add_argument("--docs", action="store_true", help="write tables and picture into docs")
     args = parser.parse_args()
     if not args.print:
-        fit_all(args)
-        models = [
-            args.models / Job(scene, form, args.primitives, 0).name
-            for scene in ("solids", *([args.folder.name] if args.folder else []))
-            for form in FORMS
-        ]
-        if all((folder / "model.safetensors").exists() for folder in models):
-            from expressivity_picture import draw_figure
-
-            draw_figure(models, PICTURE)
-    results = json.loads(RESULTS.read_text())
-    print(table(results))
+        paces = measured_paces(args) if {"forms", "slope"} & set(args.parts) else {}
+        run_all(plan(args, paces), RESULTS, KEYS, args.jobs, lambda row: f"{row[SCENES[row['scene']].judged]:.2f} dB", {"paces": paces} if paces else {})
+    trials = recorded(RESULTS)
+    tables = {"expressivity": forms_table(trials), "expressivity-gaussian": gaussian_table(trials)}
+    for name, text in tables.items():
+        print(f"\n{text}")
+        if args.docs:
+            between_markers(DOCS, name, text)
     if args.docs:
-        between_markers(DOCS, "expressivity", table(results))
+        from expressivity_picture import draw_figure
+
+        static = [scene for scene in args.scenes if SCENES[scene].task == "static"]
+        wanted = [args.models / row["trial"] for scene in static for row in _pictured(trials, scene)]
+        if wanted and all((folder / "model.safetensors").exists() for folder in wanted):
+            draw_figure(wanted, PICTURE, len(wanted) // len(static))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 """Figure 9 of the paper from fitted models: render, error, a slice through the density, and the primitives in colour.
 
-    python benchmarks/expressivity_picture.py TARGET.png RUN_DIR RUN_DIR RUN_DIR [RUN_DIR ...]
+    python benchmarks/expressivity_picture.py TARGET.png ROWS RUN_DIR [RUN_DIR ...]
 
-The run directories are those of benchmarks/expressivity.py: a neural, a Gaussian and a constant-density one per scene. A fitted
-model has no resolution, so it is drawn larger than it was trained, beside the truth at that size.
+The run directories are those of benchmarks/expressivity.py, ROWS of each scene one after another. A fitted model has no resolution, so one that was
+trained on smaller images is drawn as large as the others, beside the truth at that size.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from torch import Tensor
 
 from neuprim.core.channels import Channels
 from neuprim.core.data import Dataset, View
+from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Constant
 from neuprim.core.model.geometry import Geometry
@@ -56,7 +57,8 @@ def title(model: Primitives) -> str:
     if isinstance(model.density, GaussianDensity):
         kind = "Gaussian"
     else:
-        kind = "neural, K = 8" if model.params["W1"].shape[1] else "constant, K = 0"
+        assert isinstance(model.density, CosineDensity)
+        kind = f"K = {model.density.neurons}, p = {model.density.edge}" + (", gain" if model.density.gain else "")
     return f"{kind}\n{model.count} primitives\n{model.count * model.parameters_per_primitive} parameters"
 
 
@@ -132,8 +134,8 @@ def ellipsoids(geometry: Geometry, view: View, colors: Tensor, reach: float) -> 
     return image.reshape(camera.height, camera.width, 3)
 
 
-def draw_figure(runs: list[Path], target: Path) -> None:
-    """Three rows per scene. Error maps share the report's scale; slices share one scale per scene, printed beside them."""
+def draw_figure(runs: list[Path], target: Path, per_scene: int) -> None:
+    """``per_scene`` rows of each scene. Error maps share the report's scale; slices share one scale per scene, printed beside them."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -142,7 +144,7 @@ def draw_figure(runs: list[Path], target: Path) -> None:
     rows = [panels(run) for run in runs]
     figure, axes = plt.subplots(len(rows), len(COLUMNS), figsize=(12.6, 2.05 * len(rows) + 0.35), squeeze=False, layout="constrained")
     for r, row in enumerate(rows):
-        scene = rows[3 * (r // 3) : 3 * (r // 3) + 3]
+        scene = rows[per_scene * (r // per_scene) : per_scene * (r // per_scene + 1)]
         top = max(float(torch.quantile(p.slice[p.slice > 0], 0.9)) for p in scene if bool((p.slice > 0).any()))
         shown: tuple[tuple[Tensor, dict[str, Any]], ...] = (
             (row.truth, {}), (row.render, {}), (row.error, {"cmap": "inferno", "vmin": 0, "vmax": ERROR_SCALE}),
@@ -154,7 +156,7 @@ def draw_figure(runs: list[Path], target: Path) -> None:
             axis.set_yticks([])
             pixels: NDArray[Any] = np.asarray(image.clamp(0, 1) if image.dim() == 3 else image)
             drawn = axis.imshow(pixels, interpolation="nearest", **how)
-            if r % 3 == 0:
+            if r % per_scene == 0:
                 axis.set_title(COLUMNS[c] + (f", 0 to {top:.0f}" if c == 3 else ""), fontsize=9)
             if how:
                 figure.colorbar(drawn, ax=axis, fraction=0.046, pad=0.02).ax.tick_params(labelsize=6)
@@ -165,6 +167,6 @@ def draw_figure(runs: list[Path], target: Path) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) < 5 or (len(sys.argv) - 2) % 3:
+    if len(sys.argv) < 4 or not sys.argv[2].isdigit() or (len(sys.argv) - 3) % max(int(sys.argv[2]), 1):
         sys.exit(__doc__)
-    draw_figure([Path(text) for text in sys.argv[2:]], Path(sys.argv[1]))
+    draw_figure([Path(text) for text in sys.argv[3:]], Path(sys.argv[1]), int(sys.argv[2]))

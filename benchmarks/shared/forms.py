@@ -1,0 +1,101 @@
+"""The family of primitives, as benchmarks name it, how many of each make equal bytes, and the scenes on which they are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from neuprim.config import compose, task_of
+from neuprim.core.uses import build_settings
+from neuprim.runs.open import load_dataset
+
+__all__ = ["PAPER", "SCENES", "Form", "Scene", "parameters"]
+
+
+@dataclass(frozen=True)
+class Form:
+    """K cosines under an edge; ``gaussian`` is the baseline with none. A soft edge has a gain."""
+
+    neurons: int
+    edge: int
+    gaussian: bool = False
+
+    @classmethod
+    def named(cls, text: str) -> Form:
+        """'K:EDGE' or 'gaussian'."""
+        if text == "gaussian":
+            return cls(0, 0, True)
+        neurons, edge = text.split(":")
+        return cls(int(neurons), int(edge))
+
+    def __str__(self) -> str:
+        return "gaussian" if self.gaussian else f"{self.neurons}:{self.edge}"
+
+    @property
+    def label(self) -> str:
+        if self.gaussian:
+            return "Gaussian"
+        kind = "hard edge" if self.edge == 0 else f"soft edge p = {self.edge}, gain"
+        return f"K = {self.neurons}, {kind}" + (" (the paper's)" if self == PAPER else "")
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Of the model."""
+        if self.gaussian:
+            return ("model.density.form=gaussian",)
+        gain = "true" if self.edge else "false"
+        return (f"model.neurons={self.neurons}", f"model.density.edge={self.edge}", f"model.density.gain={gain}")
+
+    def equal_bytes(self, primitives: int, task: str, words: Sequence[str] = ()) -> int:
+        """As many of these as have the parameters of ``primitives`` of the paper's form, all else equal."""
+        return round(primitives * parameters(PAPER, task, tuple(words)) / parameters(self, task, tuple(words)))
+
+
+PAPER = Form(8, 0)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What forms are compared on.
+
+    Attributes:
+        words: of task, scene and what is done alike to all.
+        folder: the setting that names the data, None for embedded scenes.
+        tuning: words for tuning, which keep the test views unseen: other cameras, or views held out of the training ones.
+        judged: the metric that decides.
+    """
+
+    task: str
+    words: tuple[str, ...]
+    folder: str | None = None
+    tuning: tuple[str, ...] = ()
+    judged: str = "psnr"
+
+    def all_words(self, folders: Mapping[str, Path], name: str) -> tuple[str, ...]:
+        own = (f"{self.folder}='{folders[name].resolve()}'",) if self.folder else ()
+        return (f"task={self.task}", *self.words, *own)
+
+
+_FIRE = ("scene=vdb", "scene.frames='1:40'", "scene.look=embergen_fire", "scene.size=96")
+SCENES = {
+    "solids": Scene("static", ("scene=solids", "scene.size=200", "train.background=white")),
+    "chair": Scene("static", ("scene=blender", "train.background=white"), "scene.path"),
+    "fire": Scene("dynamic", _FIRE, "scene.vdb", ("scene.cameras=38",), "psnr_mask"),
+    "smoke_fire": Scene("dynamic", ("scene=smoke_fire",), None, ("scene.cameras=38",), "psnr_mask"),
+    "lit_solids": Scene("relight", ("scene=lit_solids", "scene.size=128"), None, ("scene.hold_out=8",), "psnr_linear_clamped"),
+}
+
+
+@cache
+def parameters(form: Form, task: str, words: tuple[str, ...] = ()) -> int:
+    """Of one primitive, colour included, of the task's preset with further ``words`` of model and train."""
+    scene = {"static": "solids", "dynamic": "smoke_fire", "relight": "lit_solids"}[task]
+    small = ("scene.size=8", "scene.resolution=16", "scene.timesteps=2") if task == "dynamic" else ("scene.size=16",)
+    own = [word for word in words if not word.startswith("scene.")]
+    config = compose([f"task={task}", f"scene={scene}", *small, *form.words, *own], check_output=False)
+    spec = task_of(config)
+    density, colour = spec.build(build_settings(spec, config.model, config.options), load_dataset(config, spec))
+    geometry = 3 + 3 + 4
+    return geometry + sum(parameter.size for parameter in (*density.parameters(), *colour.parameters()))

@@ -1,0 +1,155 @@
+"""Many short trainings side by side: one thread each, budgets in steps, every result kept as it comes."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from neuprim.config import compose, task_of
+from neuprim.core.checkpoint import save_model
+from neuprim.core.data import Dataset, View, ViewSet
+from neuprim.core.data.dataset import Pixels
+from neuprim.core.train.trainer import Trainer
+from neuprim.runs.fit import Fitted, compile_kernels, complete, start
+from neuprim.runs.open import load_dataset
+
+__all__ = ["Trial", "begin", "held_out", "paces_of", "recorded", "run_all"]
+
+_GROWN, _ROUNDS, _STEPS = 150, 6, 15
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One training.
+
+    Attributes:
+        name: unique; what has been recorded under it is not run again.
+        words: of the command line, without budget and seed.
+        iterations: the budget, in steps.
+        hold_out: n > 1: judge by every n-th training view instead of the test views.
+        facts: what the record says of it besides its numbers.
+        keep: folder for configuration and model, or None.
+    """
+
+    name: str
+    words: tuple[str, ...]
+    iterations: int
+    seed: int = 0
+    hold_out: int = 0
+    facts: tuple[tuple[str, Any], ...] = ()
+    keep: Path | None = None
+
+
+class Chosen(ViewSet):
+    """Some views of another set."""
+
+    def __init__(self, views: ViewSet, indices: Sequence[int]) -> None:
+        self.views, self.indices = views, list(indices)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def view(self, index: int) -> View:
+        return self.views.view(self.indices[index])
+
+    def pixels(self, index: int) -> Pixels:
+        return self.views.pixels(self.indices[index])
+
+
+def held_out(dataset: Dataset, every: int) -> Dataset:
+    """The same without its test views: every n-th training view takes their place."""
+    count = range(len(dataset.train))
+    test = [i for i in count if i % every == 0]
+    return replace(dataset, train=Chosen(dataset.train, [i for i in count if i % every]), test=Chosen(dataset.train, test))
+
+
+def begin(trial: Trial) -> Fitted:
+    """Data and a fresh model; the population is looked at as often as in a run of the preset's own length."""
+    words = [
+        *trial.words,
+        f"seed={trial.seed}",
+        f"train.iterations={trial.iterations}",
+        "train.max_seconds=null",
+        "train.eval_every=0",
+        "renderer.threads=1",
+    ]
+    if not any(word.startswith("train.population.every=") for word in words):
+        words.append(f"train.population.every={max(trial.iterations // 20, 1)}")
+    if trial.keep is not None:
+        words.append(f"output_dir='{trial.keep.resolve()}'")
+    config = compose(words, check_output=False)
+    dataset = None
+    if trial.hold_out:
+        dataset = held_out(load_dataset(config, task_of(config)), trial.hold_out)
+    return start(config, dataset=dataset)
+
+
+def train(trial: Trial, keys: Sequence[str]) -> dict[str, Any]:
+    """One run; its numbers of ``keys`` where the metrics have them."""
+    torch.set_num_threads(1)
+    fitted = complete(begin(trial))
+    metrics = fitted.metrics()
+    if trial.keep is not None:
+        trial.keep.mkdir(parents=True, exist_ok=True)
+        (trial.keep / "config.yaml").write_text(fitted.config.to_yaml())
+        save_model(trial.keep / "model.safetensors", fitted.model, fitted.config.task, {"color_space": fitted.dataset.color_space})
+    return {
+        "trial": trial.name,
+        "seed": trial.seed,
+        "iterations": trial.iterations,
+        **dict(trial.facts),
+        **{k: metrics[k] for k in keys if k in metrics},
+    }
+
+
+def recorded(path: Path) -> list[dict[str, Any]]:
+    """The trials of a file, none if there is no file."""
+    found: list[dict[str, Any]] = json.loads(path.read_text())["trials"] if path.exists() else []
+    return found
+
+
+def run_all(
+    trials: Sequence[Trial],
+    path: Path,
+    keys: Sequence[str],
+    jobs: int,
+    shown: Callable[[dict[str, Any]], str],
+    beside: Mapping[str, Any] = {},
+) -> None:
+    """Train what ``path`` does not have yet, ``jobs`` at a time, and write it after every one, with what stands ``beside`` the trials."""
+    known = {row["trial"] for row in recorded(path)}
+    waiting = [trial for trial in trials if trial.name not in known]
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        futures = {pool.submit(train, trial, keys): trial for trial in waiting}
+        for future in as_completed(futures):
+            row = future.result()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            whole = json.loads(path.read_text()) if path.exists() else {}
+            whole |= {**beside, "trials": sorted([*recorded(path), row], key=lambda r: r["trial"])}
+            path.write_text(json.dumps(whole, indent=1) + "\n")
+            print(f"{time.strftime('%H:%M')} {row['trial']}: {shown(row)}", flush=True)
+
+
+def paces_of(trainers: Mapping[str, Trainer]) -> dict[str, float]:
+    """Seconds a step of each, taking turns so that all meet the same noise; medians over rounds, of models that have trained a little."""
+    for trainer in trainers.values():
+        compile_kernels(trainer)
+        for _ in range(_GROWN):
+            trainer.train_step()
+    took: dict[str, list[float]] = {name: [] for name in trainers}
+    for _ in range(_ROUNDS):
+        for name, trainer in trainers.items():
+            start = time.perf_counter()
+            for _ in range(_STEPS):
+                trainer.train_step()
+            took[name].append((time.perf_counter() - start) / _STEPS)
+    return {name: statistics.median(seconds) for name, seconds in took.items()}

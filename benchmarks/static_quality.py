@@ -1,9 +1,9 @@
-"""Quality of the static task on a NeRF-synthetic scene: PSNR by primitives and seconds, beside the K = 0 baseline.
+"""Quality of the static task on a NeRF-synthetic scene: PSNR by primitives and seconds, of the preset and of other forms of the primitive.
 
-    python benchmarks/static_quality.py DIR [--seeds 3] [--rows 2000x60 5000x120 ...] [--keep] [--readme] [--docs]
+    python benchmarks/static_quality.py DIR [--seeds 3] [--rows 2800x60 2000x60x8:0 ...] [--keep] [--readme] [--docs]
 
 DIR holds the scene (transforms_train.json, ...). Every run is `neuprim run task=static scene=blender` with the preset
-`quick`; numbers are means over seeds +- half the spread, on the test views, of the last checkpoint. Results go to
+`quick`, its own form or another, K:EDGE; numbers are means over seeds +- half the spread, on the test views, of the last checkpoint. Results go to
 benchmarks/results/static_quality.json. --docs puts the table between the markers in docs/static.md, --readme a short one in README.md;
 without DIR nothing is run, and both are made of the recorded results.
 """
@@ -20,18 +20,21 @@ from pathlib import Path
 from typing import Any
 
 from PIL import Image
+from shared.forms import PAPER, Form
 from shared.machine import cpu_name
 from shared.tables import README, ROOT, between_markers, spread
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "static_quality.json"
-ROWS = ("1000x60", "2000x60", "5000x120", "5000x300", "2000x60xK0", "5000x120xK0")
+ROWS = ("2800x60", "7000x120", "7000x300", "2000x60x8:0", "5000x120x8:0", "5000x300x8:0")
+DEFAULT = "2:2"
+"""What the preset has."""
 
 
-def one_run(scene: Path, primitives: int, seconds: int, neurons: int, seed: int) -> dict[str, Any]:
+def one_run(scene: Path, primitives: int, seconds: int, form: str, seed: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        words = [f"scene.path='{scene}'", f"model.primitives={primitives}", f"model.neurons={neurons}", f"train.max_seconds={seconds}"]
+        words = [f"scene.path='{scene}'", f"model.primitives={primitives}", *Form.named(form).words, f"train.max_seconds={seconds}"]
         words += [f"seed={seed}", f"output_dir='{out}'", "train.iterations=1000000", "train.background=white", "train.eval_every=0"]
         subprocess.run(
             [sys.executable, "-m", "neuprim", "run", "task=static", "scene=blender", *words], check=True, stdout=subprocess.DEVNULL
@@ -48,13 +51,13 @@ def image_size(scene: Path) -> int:
 
 def table(results: dict[str, Any]) -> str:
     lines = [
-        "| primitives | neurons | training | PSNR | worst view | SSIM | steps | model |",
+        "| primitives | form | training | PSNR | worst view | SSIM | steps | model |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for row in results["rows"]:
         runs = row["runs"]
         lines.append(
-            f"| {row['primitives']} | {row['neurons'] or '0 (constant density)'} | {row['seconds']} s | {spread([r['psnr'] for r in runs], 2)} dB "
+            f"| {row['primitives']} | {shown(row)} | {row['seconds']} s | {spread([r['psnr'] for r in runs], 2)} dB "
             f"| {spread([r['psnr_worst'] for r in runs], 1)} dB | {spread([r['ssim'] for r in runs], 4)} "
             f"| {round(statistics.mean(r['iterations'] for r in runs))} | {runs[0]['model_bytes'] / 1e6:.2f} MB |"
         )
@@ -62,29 +65,37 @@ def table(results: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n" + note
 
 
+def shown(row: dict[str, Any]) -> str:
+    return Form.named(row["form"]).label + (", the default" if row["form"] == DEFAULT else "")
+
+
 def short_table(results: dict[str, Any]) -> str:
-    """The fewest and the most primitive-seconds with neurons, and the fewest without."""
+    """The default and the paper's form, the fewest and the most primitive-seconds of each."""
     rows = sorted(results["rows"], key=lambda row: row["primitives"] * row["seconds"])
-    with_neurons = [row for row in rows if row["neurons"]]
-    chosen = [with_neurons[0], with_neurons[-1], *[row for row in rows if not row["neurons"]][:1]]
     lines = [
         f"| {results['name']}, {results['size']}×{results['size']} | primitives | training | PSNR | SSIM | hardest of {results['views']} views |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
-    for row in chosen:
-        runs, what = row["runs"], f"K = {row['neurons']} neurons" if row["neurons"] else "K = 0, constant density"
-        lines.append(
-            f"| {what} | {row['primitives']:,} | {row['seconds']} s | {spread([r['psnr'] for r in runs], 2)} dB "
-            f"| {spread([r['ssim'] for r in runs], 4)} | {spread([r['psnr_worst'] for r in runs], 1)} dB |"
-        )
+    for form in (DEFAULT, str(PAPER)):
+        own = [row for row in rows if row["form"] == form]
+        for row in dict.fromkeys((id(own[0]), id(own[-1]))) if own else ():
+            lines.append(_short(next(r for r in own if id(r) == row)))
     return "\n".join(lines)
+
+
+def _short(row: dict[str, Any]) -> str:
+    runs = row["runs"]
+    return (
+        f"| {shown(row)} | {row['primitives']:,} | {row['seconds']} s | {spread([r['psnr'] for r in runs], 2)} dB "
+        f"| {spread([r['ssim'] for r in runs], 4)} | {spread([r['psnr_worst'] for r in runs], 1)} dB |"
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("scene", type=Path, nargs="?")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--rows", nargs="*", default=list(ROWS), help="PRIMITIVESxSECONDS[xKNEURONS]")
+    parser.add_argument("--rows", nargs="*", default=list(ROWS), help="PRIMITIVESxSECONDS[xK:EDGE]")
     parser.add_argument("--keep", action="store_true", help="keep the recorded rows that are not measured now")
     parser.add_argument("--readme", action="store_true", help="write the recorded results into README.md, in short")
     parser.add_argument("--docs", action="store_true", help="write the recorded table into docs/static.md")
@@ -98,14 +109,12 @@ def main() -> None:
         for text in args.rows:
             parts = text.split("x")
             primitives, seconds = int(parts[0]), int(parts[1])
-            neurons = int(parts[2].lstrip("K")) if len(parts) > 2 else 8
-            runs = [one_run(args.scene.resolve(), primitives, seconds, neurons, seed) for seed in range(args.seeds)]
+            form = parts[2] if len(parts) > 2 else DEFAULT
+            runs = [one_run(args.scene.resolve(), primitives, seconds, form, seed) for seed in range(args.seeds)]
             keys = ("psnr", "psnr_worst", "ssim", "iterations", "train_seconds", "model_bytes", "parameters_per_primitive", "seed")
-            results["rows"] = [
-                r for r in results["rows"] if (r["primitives"], r["seconds"], r["neurons"]) != (primitives, seconds, neurons)
-            ]
+            results["rows"] = [r for r in results["rows"] if (r["primitives"], r["seconds"], r["form"]) != (primitives, seconds, form)]
             results["rows"].append(
-                {"primitives": primitives, "seconds": seconds, "neurons": neurons, "runs": [{k: r[k] for k in keys} for r in runs]}
+                {"primitives": primitives, "seconds": seconds, "form": form, "runs": [{k: r[k] for k in keys} for r in runs]}
             )
             results["name"], results["size"] = "NeRF-synthetic " + args.scene.resolve().name.partition("_")[0], image_size(args.scene)
             results["scene"], results["views"], results["versions"] = runs[0]["dataset"], len(runs[0]["per_view"]), runs[0]["versions"]

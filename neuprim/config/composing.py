@@ -237,12 +237,25 @@ def _merge(base: Mapping[str, Any], values: Sequence[Assignment]) -> tuple[dict[
     from omegaconf.errors import OmegaConfBaseException
 
     tree = OmegaConf.create(copy.deepcopy(dict(base)))
+    if _another_form(base, values):
+        OmegaConf.update(tree, "model.density", {}, merge=False)
     for a in values:
         try:
             OmegaConf.update(tree, a.key, a.value, merge=True, force_add=True)
         except (OmegaConfBaseException, ValueError, TypeError, AssertionError) as error:
             raise ConfigError(f"{a.text}: {' '.join(str(error).split())}") from error
     return _plain(OmegaConf.create(dict(base))), _plain(tree)
+
+
+def _another_form(base: Mapping[str, Any], values: Sequence[Assignment]) -> bool:
+    """Whether the user chose another form of the density than the one whose settings the preset has; they would mean nothing to it."""
+    own = (base["model"].get("density") or {}).get("form")
+    typed = [a.value if a.key == "model.density.form" else a.value.get("form") for a in values if _says_form(a)]
+    return own is not None and bool(typed) and typed[-1] not in (None, own)
+
+
+def _says_form(a: Assignment) -> bool:
+    return a.key == "model.density.form" or (a.key == "model.density" and isinstance(a.value, Mapping))
 
 
 def _plain(node: Any, resolve: bool = True, place: str = "configuration") -> dict[str, Any]:

@@ -362,7 +362,8 @@ def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pr
     path = [] if scene == "solids" else ["scene.path=data"]
     c = compose([f"scene={scene}", f"preset={preset}", *path])
     assert (c.task, c.scene_name, c.preset) == ("static", scene, preset)
-    assert set(c.train.rates) == {"means", "log_scales", "quats", "W1", "b1", "w2", "b2", "sh_dc", "sh_rest"}
+    gain = {"log_gain"} if preset == "quick" else set()
+    assert set(c.train.rates) == {"means", "log_scales", "quats", "W1", "b1", "w2", "b2", "sh_dc", "sh_rest"} | gain
     assert c.train.population.strategy == {"quick": "relocate", "paper": "gradient"}[preset]
 
 

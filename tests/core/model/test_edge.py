@@ -140,6 +140,14 @@ def test_wrong_words_are_refused_before_data_load(words: list[str], message: str
         compose(words, check_output=False)
 
 
+def test_another_form_takes_none_of_the_presets_settings() -> None:
+    assert compose(["task=static"], check_output=False).model.density == {"form": "cosine", "edge": 2, "gain": True}
+    for words in (["model.density.form=gaussian"], ["model.density={form: gaussian}"]):
+        assert compose(["task=static", *words], check_output=False).model.density == {"form": "gaussian"}
+    own = compose(["task=static", "model.density.form=cosine", "model.density.edge=1"], check_output=False).model.density
+    assert own == {"form": "cosine", "edge": 1, "gain": True}
+
+
 def test_sums_keep_their_edge() -> None:
     t = scenes.tensors(2, 3)
     first, second = (Cosine(t["W1"], t["b1"], t["w2"], t["b2"], 30.0, edge) for edge in (1, 2))

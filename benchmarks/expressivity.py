@@ -204,7 +204,14 @@ def main() -> None:
     args = parser.parse_args()
     if not args.print:
         paces = measured_paces(args) if {"forms", "slope"} & set(args.parts) else {}
-        run_all(plan(args, paces), RESULTS, KEYS, args.jobs, lambda row: f"{row[SCENES[row['scene']].judged]:.2f} dB", {"paces": paces} if paces else {})
+        run_all(
+            plan(args, paces),
+            RESULTS,
+            KEYS,
+            args.jobs,
+            lambda row: f"{row[SCENES[row['scene']].judged]:.2f} dB",
+            {"paces": paces} if paces else {},
+        )
     trials = recorded(RESULTS)
     tables = {"expressivity": forms_table(trials), "expressivity-gaussian": gaussian_table(trials)}
     for name, text in tables.items():

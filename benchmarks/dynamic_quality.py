@@ -1,16 +1,17 @@
 """Quality of the dynamic task on a real sequence, and which way of varying in time is worth its parameters.
 
-    python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--rows 2000x60 5000x300] [--presets quick equations] [--seeds 3]
-        [--parts main variants control between equations] [--edges 0 2] [--neurons 8] [--gain] [--readme] [--docs]
+    python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--rows 5400x60 13500x300] [--presets quick equations hard] [--seeds 3]
+        [--parts main variants control between equations] [--edges 0 2] [--neurons 0 8] [--readme] [--docs]
 
 DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free fire animation, frames 1 to 40). Parts:
 
-    main       presets by primitives and seconds (--rows); presets other than quick get as many primitives as have its bytes
-    variants   ways of varying in time, 2,000 primitives, the same iterations; a table of parameters and quality
+    main       presets by primitives and seconds (--rows); presets other than quick get as many primitives as have its bytes; `hard` is the
+               paper's primitive, learned from images alone, with quick's windows and motion
+    variants   ways of varying in time, 2,000 primitives of the paper's, the same iterations; a table of parameters and quality; so are the next
     control    times shuffled among the training images: a model of time must lose by it
     between    every second frame is learned; the others are compared with the real ones, and steps between frames are measured
     equations  the form of preset quick, that of the paper's equations 10 to 13 and their union, for each of --edges and --neurons, all at
-               the bytes of --primitives of quick's with 8 neurons; the same iterations (with --seconds N instead: the same time). Without
+               the bytes of --primitives of quick's; the same iterations (with --seconds N instead: the same time). Without
                neurons equation 13 changes nothing, and the equations' colour alone varies
 
 Images are 96 x 96, 40 cameras (two held out), linear RGB over the exposure's peak, black background; means over seeds +- half the
@@ -59,7 +60,14 @@ FORMS = {
     "equations 10 to 13, degree 0": ("preset=equations", "model.sh_degree=0"),
     "union: phase, window, motion, colour in time": ("model.density.time=phase+window+motion", *COLOUR),
 }
-WHICH = {"quick": ": windows and motion", "equations": ": the paper's equations 10 to 13"}
+HARD = ("model.neurons=8", "model.density.edge=0", "model.density.gain=false", "train.supervision=images", "train.rates.log_scales=0.02")
+"""The paper's primitive from images alone."""
+PRESETS = {"quick": (), "equations": ("preset=equations",), "hard": HARD}
+WHICH = {
+    "quick": "preset `quick`: windows and motion, K = 0 with a soft edge, voxels and images",
+    "equations": "preset `equations`: the paper's equations 10 to 13",
+    "hard": "windows and motion, K = 8 with a hard edge, images alone",
+}
 KEYS = (
     "psnr", "psnr_mask", "psnr_pooled_mask", "psnr_black_image", "psnr_black_image_mask", "psnr_srgb", "ssim", "ssim_srgb",
     "sigma_correlation_early", "sigma_correlation_middle", "sigma_correlation_late",
@@ -144,13 +152,12 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--frames", default="1:40")
     parser.add_argument("--parts", nargs="*", default=["main", "variants", "control", "between"])
-    parser.add_argument("--rows", nargs="*", default=["2000x60", "5000x300"], help="PRIMITIVESxSECONDS")
-    parser.add_argument("--presets", nargs="*", default=["quick", "equations"], help="of main")
+    parser.add_argument("--rows", nargs="*", default=["5400x60", "13500x300"], help="PRIMITIVESxSECONDS")
+    parser.add_argument("--presets", nargs="*", default=list(PRESETS), choices=list(PRESETS), help="of main")
     parser.add_argument("--edges", nargs="*", type=int, default=[0, 2], help="of equations")
-    parser.add_argument("--neurons", nargs="*", type=int, default=[8], help="of equations")
+    parser.add_argument("--neurons", nargs="*", type=int, default=[0, 8], help="of equations")
     parser.add_argument("--forms", nargs="*", default=list(FORMS), help="of equations")
-    parser.add_argument("--gain", action="store_true", help="of equations: forms with a soft edge have a gain")
-    parser.add_argument("--primitives", type=int, default=2000, help="of equations")
+    parser.add_argument("--primitives", type=int, default=5400, help="of equations")
     parser.add_argument("--seconds", type=float, help="of equations")
     parser.add_argument("--variants", nargs="*", default=list(VARIANTS))
     parser.add_argument("--seeds", type=int, default=3)
@@ -165,7 +172,7 @@ def main() -> None:
             "scene=vdb", f"scene.vdb='{args.folder.resolve()}'", f"scene.frames='{args.frames}'", "scene.look=embergen_fire", f"scene.size={SIZE}",
             "train.eval_every=0",
         ]  # fmt: skip
-        short = ["model.primitives=2000", "train.max_seconds=null", f"train.iterations={args.iterations}"]
+        short = [*HARD, "model.primitives=2000", "train.max_seconds=null", f"train.iterations={args.iterations}"]
 
         def keep(part: str, entry: dict[str, Any]) -> None:
             recorded.setdefault(part, []).append(entry)
@@ -186,20 +193,22 @@ def main() -> None:
             own = [*data, f"seed={seed}"]
             if "main" in args.parts:
                 for (primitives, seconds), preset in itertools.product(rows, args.presets):
-                    count = as_many_bytes(primitives, f"preset={preset}")
+                    count = as_many_bytes(primitives, *PRESETS[preset])
                     budget = [f"model.primitives={count}", f"train.max_seconds={seconds}", "train.iterations=1000000"]
-                    _, m = fit([*own, f"preset={preset}", *budget])
+                    _, m = fit([*own, *PRESETS[preset], *budget])
                     named = {"preset": preset, "as_many_as": primitives}
                     keep("main", named | {k: m[k] for k in KEYS} | {"per_frame": [round(f["psnr_mask"], 3) for f in m["per_frame"]]})
             if "equations" in args.parts:
                 for form, edge, neurons in itertools.product(args.forms, args.edges, args.neurons):
                     words = [*FORMS[form], f"model.density.edge={edge}", f"model.neurons={neurons}"]
-                    words += ["model.density.gain=true"] if args.gain and edge else []
-                    budget = [f"train.max_seconds={args.seconds}", "train.iterations=1000000"] if args.seconds else short[1:]
+                    words += [f"model.density.gain={'true' if edge else 'false'}"]
+                    budget = ["train.max_seconds=null", f"train.iterations={args.iterations}"]
+                    if args.seconds:
+                        budget = [f"train.max_seconds={args.seconds}", "train.iterations=1000000"]
                     _, m = fit([*own, *budget, *words, f"model.primitives={as_many_bytes(args.primitives, *words)}"])
                     keep(
                         "equations",
-                        {"form": form, "edge": edge, "neurons": neurons, "gain": args.gain and edge > 0, **{k: m[k] for k in KEYS}},
+                        {"form": form, "edge": edge, "neurons": neurons, "gain": edge > 0, **{k: m[k] for k in KEYS}},
                     )
             if "variants" in args.parts:
                 for time in args.variants:
@@ -295,7 +304,7 @@ def short_table(recorded: dict[str, Any]) -> str:
         hardest = min(range(frames), key=lambda t: statistics.mean(r["per_frame"][t] for r in own))
         worst, preset = spread([r["per_frame"][hardest] for r in own], 1), preset_of(own[0])
         lines.append(
-            f"| preset `{preset}`{WHICH.get(preset, '')} | {own[0]['primitives']:,} | {own[0]['model_bytes'] / 1e6:.2f} MB "
+            f"| {WHICH[preset]} | {own[0]['primitives']:,} | {own[0]['model_bytes'] / 1e6:.2f} MB "
             f"| {_budget(own[0])[1]} s | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB "
             f"| {_spread(own, 'ssim', 4)} | frame {hardest + 1}: {worst} dB |"
         )

@@ -16,29 +16,35 @@ __all__ = ["PAPER", "SCENES", "Form", "Scene", "parameters"]
 
 @dataclass(frozen=True)
 class Form:
-    """K cosines under an edge; ``gaussian`` is the baseline with none. A soft edge has a gain."""
+    """K cosines under an edge; ``gaussian`` is the baseline with none. A soft edge has a gain.
+
+    ``source`` is what a volume is learned from, where it is not what its preset says.
+    """
 
     neurons: int
     edge: int
     gaussian: bool = False
+    source: str = ""
 
     @classmethod
     def named(cls, text: str) -> Form:
-        """'K:EDGE' or 'gaussian'."""
+        """'K:EDGE', 'K:EDGE@images' or 'gaussian'."""
         if text == "gaussian":
             return cls(0, 0, True)
-        neurons, edge = text.split(":")
-        return cls(int(neurons), int(edge))
+        form, _, source = text.partition("@")
+        neurons, edge = form.split(":")
+        return cls(int(neurons), int(edge), source=source)
 
     def __str__(self) -> str:
-        return "gaussian" if self.gaussian else f"{self.neurons}:{self.edge}"
+        return "gaussian" if self.gaussian else f"{self.neurons}:{self.edge}" + (f"@{self.source}" if self.source else "")
 
     @property
     def label(self) -> str:
         if self.gaussian:
             return "Gaussian"
         kind = "hard edge" if self.edge == 0 else f"soft edge p = {self.edge}, gain"
-        return f"K = {self.neurons}, {kind}" + (" (the paper's)" if self == PAPER else "")
+        paper = " (the paper's)" if (self.neurons, self.edge) == (PAPER.neurons, PAPER.edge) else ""
+        return f"K = {self.neurons}, {kind}{paper}" + (f", {self.source} alone" if self.source else "")
 
     @property
     def words(self) -> tuple[str, ...]:
@@ -46,7 +52,8 @@ class Form:
         if self.gaussian:
             return ("model.density.form=gaussian",)
         gain = "true" if self.edge else "false"
-        return (f"model.neurons={self.neurons}", f"model.density.edge={self.edge}", f"model.density.gain={gain}")
+        source = (f"train.supervision={self.source}",) if self.source else ()
+        return (f"model.neurons={self.neurons}", f"model.density.edge={self.edge}", f"model.density.gain={gain}", *source)
 
     def equal_bytes(self, primitives: int, task: str, words: Sequence[str] = ()) -> int:
         """As many of these as have the parameters of ``primitives`` of the paper's form, all else equal."""

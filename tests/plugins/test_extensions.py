@@ -73,7 +73,7 @@ def test_a_scene_cannot_replace_a_tasks_preset(site: Path) -> None:
     preset = site / "fake_extra/conf/preset/static/quick.yaml"
     preset.parent.mkdir(parents=True)
     preset.write_text("model: {primitives: 7}\n")
-    assert compose(["task=static", "scene=extra"], False).model.primitives == 2000
+    assert compose(["task=static", "scene=extra"], False).model.primitives == 2800
 
 
 def test_wrong_settings_of_an_added_scene(site: Path) -> None:

@@ -247,7 +247,7 @@ def test_a_scene_of_a_taken_name_has_its_own_file_and_the_tasks_presets(site: Pa
     preset.parent.mkdir(parents=True)
     preset.write_text("model: {primitives: 7}\n")
     config = compose(["task=static", "scene=fake-extra:solids"], False)
-    assert (config.scene_name, config.scene, config.model.primitives) == ("solids", {"wobble": 3.0}, 2000)
+    assert (config.scene_name, config.scene, config.model.primitives) == ("solids", {"wobble": 3.0}, 2800)
     assert config.made_by is not None and config.made_by.scene is not None and config.made_by.scene.origin == "fake-extra 0.3"
     own = compose(["task=static", "scene=neuprim:solids"], False)
     assert "wobble" not in own.scene and own.made_by is not None and own.made_by.scene is None

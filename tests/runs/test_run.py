@@ -98,8 +98,8 @@ def test_metrics(whole: Path, scene: Path) -> None:
     )
     assert set(asked.split()) <= metrics.keys()
     assert (metrics["task"], metrics["scene"], metrics["split"], metrics["checkpoint"]) == ("static", "blender", "test", "last")
-    assert metrics["primitives"] == 40 and metrics["parameters_per_primitive"] == 10 + 21 + 48
-    assert metrics["parameters"] == 40 * 79
+    assert metrics["primitives"] == 40 and metrics["parameters_per_primitive"] == 10 + 22 + 48
+    assert metrics["parameters"] == 40 * 80
     assert metrics["model_bytes"] == (whole / "model.safetensors").stat().st_size > 40 * 79 * 4
     assert metrics["iterations"] == STEPS and metrics["seed"] == 3 and metrics["background"] == [1.0, 1.0, 1.0]
     assert metrics["backend"] == "cpu" and metrics["data_source"] == "real" and metrics["downsampling"] == "none"

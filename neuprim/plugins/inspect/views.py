@@ -7,7 +7,6 @@ import torch
 
 from neuprim.core.extensions import Inspector
 from neuprim.core.model.edge import fade
-from neuprim.core.model.fields import Cosine
 from neuprim.core.task import API_VERSION
 from neuprim.plugins.inspect.field import FieldFrame
 from neuprim.plugins.inspect.layers import Ellipsoids, Isosurfaces, Layer, Lines, Mesh, Scale, Slices, Text, Volume
@@ -71,7 +70,7 @@ def _factor(frame: FieldFrame, position: int, unit: np.ndarray) -> np.ndarray:
     but does not vanish with the weight, whose rounding would draw the line on the surface. There, it is that of a point just below.
     """
     _, form = frame.model.lower_density(frame.conditions)
-    edge = form.edge if isinstance(form, Cosine) else 0
+    edge = form.edge
     inner = torch.from_numpy(unit)
     if edge:
         radius = inner.norm(dim=1, keepdim=True)

@@ -27,8 +27,8 @@ from typing import Any
 
 from shared.forms import PAPER, SCENES, Form
 from shared.machine import cpu_name
-from shared.tables import between_markers, spread
-from shared.trials import Trial, begin, paces_of, recorded, run_all
+from shared.tables import README, between_markers, spread
+from shared.trials import Trial, begin, paces_of, run_all
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "expressivity.json"
@@ -130,8 +130,9 @@ def plan(args: argparse.Namespace, paces: dict[str, float]) -> list[Trial]:
 # ---------------------------------------------------------------- the tables
 
 
-def forms_table(trials: list[dict[str, Any]]) -> str:
+def forms_table(found: dict[str, Any]) -> str:
     """One row per form, scene and size; the best in bold, and all whose mean lies within its half spread."""
+    trials = found["trials"]
     lines = [
         "| scene | bytes of | primitive | primitives | numbers each | steps | PSNR | worst view | SSIM | last doubling | error of σ |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
@@ -157,8 +158,31 @@ def forms_table(trials: list[dict[str, Any]]) -> str:
     lines.append(
         f"\nPreset `quick`, {' to '.join(str(n) for n in seeds)} seed(s), mean ± half the spread; *bytes of* so many of the paper's primitives; steps: as many as fit into "
         "the seconds of the paper's form, at paces measured in turns; *error of σ*: relative L2 over the files' voxels, early / middle / late; *last doubling*: what the second half of the budget brought, first seed. PSNR is of "
-        f"the whole image (solids, chair at 200×200 on white), inside the mask (fire, smoke_fire), clamped linear (lit_solids). {cpu_name()}, one thread."
+        f"the whole image (solids, chair at 200×200 on white), inside the mask (fire, smoke_fire), clamped linear (lit_solids). {found['cpu']}, one thread."
     )
+    return "\n".join(lines)
+
+
+SHORT = {
+    "solids": ("`solids` (generated)", ("8:0", "0:2", "2:2")),
+    "chair": ("NeRF-synthetic chair", ("8:0", "0:2", "2:2")),
+    "fire": ("EmberGen fire, inside the mask", ("8:0@images", "0:2", None)),
+}
+
+
+def short_table(trials: list[dict[str, Any]]) -> str:
+    """The paper's form beside soft ones without and with neurons, at each scene's largest size."""
+    lines = [
+        "| equal bytes, equal seconds | bytes of | the paper's: K = 8, hard edge | soft edge, K = 0 | soft edge, K = 2 |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for scene, (name, forms) in SHORT.items():
+        own = [r for r in trials if r["part"] == "forms" and r["scene"] == scene]
+        if own:
+            size = max(r["size"] for r in own)
+            cells = [[r[SCENES[scene].judged] for r in own if (r["form"], r["size"]) == (form, size)] for form in forms]
+            shown = " | ".join(f"{spread(values, 2)} dB" if values else "" for values in cells)
+            lines.append(f"| {name} | {size:,} | {shown} |")
     return "\n".join(lines)
 
 
@@ -214,6 +238,7 @@ def main() -> None:
     parser.add_argument("--models", type=Path, default=Path("outputs") / "expressivity", help="folder for the fitted models")
     parser.add_argument("--print", action="store_true", help="train nothing")
     parser.add_argument("--docs", action="store_true", help="write tables and picture into docs")
+    parser.add_argument("--readme", action="store_true", help="write a short table into README.md")
     args = parser.parse_args()
     if not args.print:
         paces = measured_paces(args) if {"forms", "slope"} & set(args.parts) else {}
@@ -223,14 +248,17 @@ def main() -> None:
             KEYS,
             args.jobs,
             lambda row: f"{row[SCENES[row['scene']].judged]:.2f} dB",
-            {"paces": paces} if paces else {},
+            {"cpu": cpu_name(), **({"paces": paces} if paces else {})},
         )
-    trials = recorded(RESULTS)
-    tables = {"expressivity": forms_table(trials), "expressivity-gaussian": gaussian_table(trials)}
+    found = json.loads(RESULTS.read_text())
+    trials = found["trials"]
+    tables = {"expressivity": forms_table(found), "expressivity-gaussian": gaussian_table(trials)}
     for name, text in tables.items():
         print(f"\n{text}")
         if args.docs:
             between_markers(DOCS, name, text)
+    if args.readme:
+        between_markers(README, "expressivity", short_table(trials))
     if args.docs:
         from expressivity_picture import draw_figure
 

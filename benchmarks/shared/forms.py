@@ -50,7 +50,8 @@ class Form:
     def words(self) -> tuple[str, ...]:
         """Of the model."""
         if self.gaussian:
-            return ("model.density.form=gaussian",)
+            # of the rates 0.02, 0.1 and 0.2 the best: 23.63, 25.18, 25.37 dB on solids with 150 primitives
+            return ("model.density.form=gaussian", "train.rates.log_amplitude=0.2")
         gain = "true" if self.edge else "false"
         source = (f"train.supervision={self.source}",) if self.source else ()
         return (f"model.neurons={self.neurons}", f"model.density.edge={self.edge}", f"model.density.gain={gain}", *source)

@@ -133,3 +133,23 @@ def even_model(generator: torch.Generator) -> Primitives:
     density, colour = CosineDensity(2), SphericalHarmonics(0)
     specs = (*GEOMETRY_SPECS, *density.parameters(), *colour.parameters())
     return Primitives(density, colour, {s.name: torch.rand((2000, *s.shape), generator=generator) for s in specs})
+
+
+def test_the_tables_of_the_forms_are_those_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
+    found = json.loads((RESULTS / "expressivity.json").read_text(encoding="utf-8"))
+    script = benchmark("expressivity")
+    assert between("docs/expressivity.md", "expressivity") == script.forms_table(found)
+    assert between("docs/expressivity.md", "expressivity-gaussian") == script.gaussian_table(found["trials"])
+    assert between("README.md", "expressivity") == script.short_table(found["trials"])
+    grid = json.loads((RESULTS / "screening.json").read_text(encoding="utf-8"))
+    assert between("docs/expressivity.md", "screening") == benchmark("screening").grid_table(grid["trials"])
+
+
+def test_forms_of_equal_bytes_are_counted_by_their_parameters(benchmark: Callable[[str], ModuleType]) -> None:
+    forms = benchmark("expressivity").Form
+    assert [forms.named(text).equal_bytes(2000, "static") for text in ("8:0", "2:2", "0:2", "gaussian")] == [2000, 2829, 3300, 3356]
+    assert forms.named("0:2@images").equal_bytes(2000, "dynamic") == 5391
+    with_source = forms.named("0:2@images")
+    assert (
+        "train.supervision=images" in with_source.words and str(with_source) == "0:2@images" and with_source.label.endswith("images alone")
+    )

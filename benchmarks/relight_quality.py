@@ -21,13 +21,13 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
-import time
 from pathlib import Path
 from typing import Any
 
 import torch
 from shared.machine import cpu_name
 from shared.tables import README, ROOT, between_markers, spread
+from shared.trials import paces_of
 
 from neuprim.config import compose
 from neuprim.core.compute.threads import core_count
@@ -54,7 +54,6 @@ KEYS = (
     "psnr_linear_clamped_new_view", "psnr_linear_clamped_new_light", "psnr_linear_clamped_new_both",
     "primitives", "parameters_per_primitive", "iterations", "train_seconds", "seed",
 )  # fmt: skip
-_ROUNDS, _STEPS, _GROWN = 6, 15, 150
 
 
 def prepared(words: list[str], dataset: Dataset | None) -> Fitted:
@@ -68,19 +67,8 @@ def prepared(words: list[str], dataset: Dataset | None) -> Fitted:
 
 
 def pace(variants: dict[str, list[str]], dataset: Dataset) -> dict[str, float]:
-    """Seconds a step of each, taking turns; medians over rounds, of models that have trained a little."""
-    trainers = {name: prepared(words, dataset).trainer for name, words in variants.items()}
-    for trainer in trainers.values():
-        for _ in range(_GROWN):
-            trainer.train_step()
-    took: dict[str, list[float]] = {name: [] for name in trainers}
-    for _ in range(_ROUNDS):
-        for name, trainer in trainers.items():
-            start = time.perf_counter()
-            for _ in range(_STEPS):
-                trainer.train_step()
-            took[name].append((time.perf_counter() - start) / _STEPS)
-    return {name: statistics.median(seconds) for name, seconds in took.items()}
+    """Seconds a step of each, see :func:`~shared.trials.paces_of`."""
+    return paces_of({name: prepared(words, dataset).trainer for name, words in variants.items()})
 
 
 def fit(words: list[str], dataset: Dataset) -> dict[str, Any]:

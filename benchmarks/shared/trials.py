@@ -16,8 +16,8 @@ import torch
 
 from neuprim.config import compose, task_of
 from neuprim.core.checkpoint import save_model
-from neuprim.core.data import Dataset, View, ViewSet
-from neuprim.core.data.dataset import Pixels
+from neuprim.core.data import Dataset
+from neuprim.core.data.views import SomeViews
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import Fitted, compile_kernels, complete, start
 from neuprim.runs.open import load_dataset
@@ -49,27 +49,11 @@ class Trial:
     keep: Path | None = None
 
 
-class Chosen(ViewSet):
-    """Some views of another set."""
-
-    def __init__(self, views: ViewSet, indices: Sequence[int]) -> None:
-        self.views, self.indices = views, list(indices)
-
-    def __len__(self) -> int:
-        return len(self.indices)
-
-    def view(self, index: int) -> View:
-        return self.views.view(self.indices[index])
-
-    def pixels(self, index: int) -> Pixels:
-        return self.views.pixels(self.indices[index])
-
-
 def held_out(dataset: Dataset, every: int) -> Dataset:
     """The same without its test views: every n-th training view takes their place."""
     count = range(len(dataset.train))
     test = [i for i in count if i % every == 0]
-    return replace(dataset, train=Chosen(dataset.train, [i for i in count if i % every]), test=Chosen(dataset.train, test))
+    return replace(dataset, train=SomeViews(dataset.train, [i for i in count if i % every]), test=SomeViews(dataset.train, test))
 
 
 def begin(trial: Trial) -> Fitted:
@@ -134,7 +118,7 @@ def run_all(
             row = future.result()
             path.parent.mkdir(parents=True, exist_ok=True)
             whole = json.loads(path.read_text()) if path.exists() else {}
-            whole |= {**beside, "trials": sorted([*recorded(path), row], key=lambda r: r["trial"])}
+            whole |= {**beside, "trials": sorted([*whole.get("trials", []), row], key=lambda r: r["trial"])}
             path.write_text(json.dumps(whole, indent=1) + "\n")
             print(f"{time.strftime('%H:%M')} {row['trial']}: {shown(row)}", flush=True)
 

@@ -40,6 +40,15 @@ def _inside(A, n, dx, dy, dz):  # type: ignore[no-untyped-def]
     return y0, y1, y2
 
 
+@inline
+def _field(rate, phase, amplitude, offset, n, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """f/m at an offset from the mean."""
+    f = offset[n]
+    for k in range(phase.shape[1]):
+        f += amplitude[n, k] * np.cos(phase[n, k] + rate[n, k, 0] * dx + rate[n, k, 1] * dy + rate[n, k, 2] * dz)
+    return f
+
+
 @kernel
 def add_values(start, stop, points, cells, reach, prims, edge, chunk, sums):  # type: ignore[no-untyped-def]
     """Adds sigma and source of primitives start:stop to part ``start // chunk`` of ``sums`` (parts, M, 1 + C).
@@ -51,7 +60,7 @@ def add_values(start, stop, points, cells, reach, prims, edge, chunk, sums):  # 
     starts, counts = cells[0], cells[3]
     means, A, rate, phase, amplitude, offset, colors = prims
     own = sums[start // chunk]
-    K, C = phase.shape[1], colors.shape[1]
+    C = colors.shape[1]
     for n in range(start, stop):
         x0, x1, y0, y1, z0, z1 = _met(cells, reach, means, n)
         if z0 > z1:
@@ -65,9 +74,7 @@ def add_values(start, stop, points, cells, reach, prims, edge, chunk, sums):  # 
                     inner = 1.0 - (a * a + b * b + c * c)
                     if inner <= 0.0:
                         continue
-                    f = offset[n]
-                    for k in range(K):
-                        f += amplitude[n, k] * np.cos(phase[n, k] + rate[n, k, 0] * dx + rate[n, k, 1] * dy + rate[n, k, 2] * dz)
+                    f = _field(rate, phase, amplitude, offset, n, dx, dy, dz)
                     if f <= 0.0:
                         continue
                     sigma = f if edge == 0 else f * inner if edge == 1 else f * inner * inner
@@ -100,9 +107,7 @@ def pull_values(start, stop, points, cells, reach, prims, edge, pulled, error, g
                     inner = 1.0 - (a * a + b * b + c * c)
                     if inner <= 0.0:
                         continue
-                    f = offset[n]
-                    for k in range(K):
-                        f += amplitude[n, k] * np.cos(phase[n, k] + rate[n, k, 0] * dx + rate[n, k, 1] * dy + rate[n, k, 2] * dz)
+                    f = _field(rate, phase, amplitude, offset, n, dx, dy, dz)
                     if f <= 0.0:
                         continue
                     fade = 1.0 if edge == 0 else inner if edge == 1 else inner * inner

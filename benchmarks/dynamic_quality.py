@@ -1,21 +1,22 @@
 """Quality of the dynamic task on a real sequence, and which way of varying in time is worth its parameters.
 
-    python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--rows 5400x60 13500x300] [--presets quick equations hard] [--seeds 3]
-        [--parts main variants control between equations] [--edges 0 2] [--neurons 0 8] [--readme] [--docs]
+    python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--rows 5400x2500 13500x6000] [--presets quick equations hard] [--seeds 3]
+        [--parts main variants control between equations] [--edges 0 2] [--neurons 0 8] [--jobs 2] [--readme] [--docs]
 
 DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free fire animation, frames 1 to 40). Parts:
 
-    main       presets by primitives and seconds (--rows); presets other than quick get as many primitives as have its bytes; `hard` is the
+    main       presets by primitives and steps (--rows); presets other than quick get as many primitives as have its bytes; `hard` is the
                paper's primitive, learned from images alone, with quick's windows and motion
     variants   ways of varying in time, 2,000 primitives of the paper's, the same iterations; a table of parameters and quality; so are the next
     control    times shuffled among the training images: a model of time must lose by it
     between    every second frame is learned; the others are compared with the real ones, and steps between frames are measured
     equations  the form of preset quick, that of the paper's equations 10 to 13 and their union, for each of --edges and --neurons, all at
-               the bytes of --primitives of quick's; the same iterations (with --seconds N instead: the same time). Without
+               the bytes of --primitives of quick's; the same iterations. Without
                neurons equation 13 changes nothing, and the equations' colour alone varies
 
 Images are 96 x 96, 40 cameras (two held out), linear RGB over the exposure's peak, black background; means over seeds +- half the
-spread, of the last checkpoint. Results go to benchmarks/results/dynamic_quality.json, part by part. --docs puts the recorded tables
+spread, of the last checkpoint. Results go to benchmarks/results/dynamic_quality.json, part by part; of main and equations only what is missing is
+run, --jobs at a time, one thread each. --docs puts the recorded tables
 between the markers of docs/dynamic.md, --readme a short one into README.md; without DIR nothing is run.
 """
 
@@ -33,6 +34,7 @@ from typing import Any
 import torch
 from shared.machine import cpu_name
 from shared.tables import README, ROOT, between_markers, spread
+from shared.trials import Trial, run_all
 
 from neuprim.config import compose
 from neuprim.core.compute.threads import core_count
@@ -62,6 +64,7 @@ FORMS = {
 }
 HARD = ("model.neurons=8", "model.density.edge=0", "model.density.gain=false", "train.supervision=images", "train.rates.log_scales=0.02")
 """The paper's primitive from images alone."""
+EVERY = "train.population.every=400"  # as the preset has it, however short
 PRESETS = {"quick": (), "equations": ("preset=equations",), "hard": HARD}
 WHICH = {
     "quick": "preset `quick`: windows and motion, K = 0 with a soft edge, voxels and images",
@@ -94,6 +97,37 @@ def numbers(*words: str) -> int:
 def as_many_bytes(primitives: int, *words: str) -> int:
     """How many primitives of a form have the bytes of ``primitives`` of the preset quick."""
     return max(round(primitives * numbers() / numbers(*words)), 1)
+
+
+def kept(metrics: dict[str, Any]) -> dict[str, Any]:
+    """Of a run's metrics, what is recorded of the parts ``main`` and ``equations``."""
+    return {k: metrics[k] for k in KEYS} | {"per_frame": [round(f["psnr_mask"], 3) for f in metrics["per_frame"]]}
+
+
+def main_trials(args: argparse.Namespace, data: list[str]) -> list[Trial]:
+    found = []
+    for seed, row, preset in itertools.product(range(args.seeds), args.rows, args.presets):
+        primitives, steps = (int(n) for n in row.split("x"))
+        words = [*data, *PRESETS[preset], f"model.primitives={as_many_bytes(primitives, *PRESETS[preset])}", EVERY]
+        facts = (("part", "main"), ("preset", preset), ("as_many_as", primitives))
+        found.append(Trial(f"main-{preset}-{primitives}-{steps}-{seed}", tuple(words), steps, seed, 0, facts))
+    return found
+
+
+def equation_trials(args: argparse.Namespace, data: list[str]) -> list[Trial]:
+    found = []
+    for seed, form, edge, neurons in itertools.product(range(args.seeds), args.forms, args.edges, args.neurons):
+        words = [
+            *FORMS[form],
+            f"model.density.edge={edge}",
+            f"model.neurons={neurons}",
+            f"model.density.gain={'true' if edge else 'false'}",
+        ]
+        words.append(f"model.primitives={as_many_bytes(args.primitives, *words)}")
+        facts = (("part", "equations"), ("form", form), ("edge", edge), ("neurons", neurons), ("gain", edge > 0))
+        name = f"equations-{form}-{edge}-{neurons}-{args.primitives}-{args.iterations}-{seed}"
+        found.append(Trial(name, (*data, *words), args.iterations, seed, 0, facts))
+    return found
 
 
 def shuffled_times(trainer: Trainer) -> None:
@@ -152,16 +186,16 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--frames", default="1:40")
     parser.add_argument("--parts", nargs="*", default=["main", "variants", "control", "between"])
-    parser.add_argument("--rows", nargs="*", default=["5400x60", "13500x300"], help="PRIMITIVESxSECONDS")
+    parser.add_argument("--rows", nargs="*", default=["5400x2500", "13500x6000"], help="PRIMITIVESxSTEPS, of main")
     parser.add_argument("--presets", nargs="*", default=list(PRESETS), choices=list(PRESETS), help="of main")
     parser.add_argument("--edges", nargs="*", type=int, default=[0, 2], help="of equations")
     parser.add_argument("--neurons", nargs="*", type=int, default=[0, 8], help="of equations")
     parser.add_argument("--forms", nargs="*", default=list(FORMS), help="of equations")
     parser.add_argument("--primitives", type=int, default=5400, help="of equations")
-    parser.add_argument("--seconds", type=float, help="of equations")
     parser.add_argument("--variants", nargs="*", default=list(VARIANTS))
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--iterations", type=int, default=2500, help="of every run but those of main")
+    parser.add_argument("--jobs", type=int, default=2, help="runs at a time of main and equations, one thread each")
     parser.add_argument("--readme", action="store_true")
     parser.add_argument("--docs", action="store_true")
     args = parser.parse_args()
@@ -181,35 +215,14 @@ def main() -> None:
 
         for part in {"control", "between"} & set(args.parts):
             recorded[part] = []
-        rows = [tuple(int(n) for n in row.split("x")) for row in args.rows]
-        if "main" in args.parts:
-            recorded["main"] = [e for e in recorded.get("main", []) if _budget(e) not in rows or preset_of(e) not in args.presets]
-        if "equations" in args.parts:
-            grid = set(itertools.product(args.forms, args.edges, args.neurons))
-            recorded["equations"] = [e for e in recorded.get("equations", []) if (e["form"], e["edge"], e["neurons"]) not in grid]
+        trials = main_trials(args, ["task=dynamic", *data]) if "main" in args.parts else []
+        trials += equation_trials(args, ["task=dynamic", *data]) if "equations" in args.parts else []
+        run_all(trials, RESULTS, kept, args.jobs, lambda row: f"{row['psnr_mask']:.2f} dB", {"cpu": cpu_name(), "cores": core_count()})
+        recorded |= json.loads(RESULTS.read_text())
         if "variants" in args.parts:
             recorded["variants"] = [e for e in recorded.get("variants", []) if e["time"] not in args.variants]
         for seed in range(args.seeds):
             own = [*data, f"seed={seed}"]
-            if "main" in args.parts:
-                for (primitives, seconds), preset in itertools.product(rows, args.presets):
-                    count = as_many_bytes(primitives, *PRESETS[preset])
-                    budget = [f"model.primitives={count}", f"train.max_seconds={seconds}", "train.iterations=1000000"]
-                    _, m = fit([*own, *PRESETS[preset], *budget])
-                    named = {"preset": preset, "as_many_as": primitives}
-                    keep("main", named | {k: m[k] for k in KEYS} | {"per_frame": [round(f["psnr_mask"], 3) for f in m["per_frame"]]})
-            if "equations" in args.parts:
-                for form, edge, neurons in itertools.product(args.forms, args.edges, args.neurons):
-                    words = [*FORMS[form], f"model.density.edge={edge}", f"model.neurons={neurons}"]
-                    words += [f"model.density.gain={'true' if edge else 'false'}"]
-                    budget = ["train.max_seconds=null", f"train.iterations={args.iterations}"]
-                    if args.seconds:
-                        budget = [f"train.max_seconds={args.seconds}", "train.iterations=1000000"]
-                    _, m = fit([*own, *budget, *words, f"model.primitives={as_many_bytes(args.primitives, *words)}"])
-                    keep(
-                        "equations",
-                        {"form": form, "edge": edge, "neurons": neurons, "gain": edge > 0, **{k: m[k] for k in KEYS}},
-                    )
             if "variants" in args.parts:
                 for time in args.variants:
                     _, m = fit([*own, *short, *VARIANTS[time]])
@@ -244,24 +257,24 @@ def _spread(runs: list[dict[str, Any]], key: str, digits: int = 2) -> str:
     return spread([r[key] for r in runs], digits) if runs else "–"
 
 
-def preset_of(run: dict[str, Any]) -> str:
-    return str(run.get("preset", "quick"))
+def _part(recorded: dict[str, Any], part: str) -> list[dict[str, Any]]:
+    return [r for r in recorded.get("trials", []) if r["part"] == part]
 
 
 def _budget(run: dict[str, Any]) -> tuple[int, int]:
-    """Primitives of the preset quick with as many bytes, and seconds."""
-    return run.get("as_many_as", run["primitives"]), round(run["train_seconds"])
+    """Primitives of the preset quick with as many bytes, and steps."""
+    return run["as_many_as"], run["iterations"]
 
 
 def _columns(runs: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
     """The runs of each budget and preset, quick first."""
-    keys = sorted({(_budget(r), preset_of(r) != "quick", preset_of(r)) for r in runs})
-    return [[r for r in runs if (_budget(r), preset_of(r)) == (budget, preset)] for budget, _, preset in keys]
+    keys = sorted({(_budget(r), r["preset"] != "quick", r["preset"]) for r in runs})
+    return [[r for r in runs if (_budget(r), r["preset"]) == (budget, preset)] for budget, _, preset in keys]
 
 
 def main_table(recorded: dict[str, Any]) -> str:
     """One column per budget and preset, one row per number, beside what a black image scores."""
-    runs = recorded.get("main", [])
+    runs = _part(recorded, "main")
     if not runs:
         return "not measured"
     columns = _columns(runs)
@@ -274,7 +287,7 @@ def main_table(recorded: dict[str, Any]) -> str:
         return lambda own: " / ".join(_spread(own, f"sigma_{key}_{third}", 3) for third in ("early", "middle", "late"))
 
     return "\n".join([
-        line("", lambda own: f"`{preset_of(own[0])}`, {own[0]['primitives']:,} primitives, {own[0]['train_seconds']:.0f} s", "black image"),
+        line("", lambda own: f"`{own[0]['preset']}`, {own[0]['primitives']:,} primitives, {own[0]['iterations']:,} steps", "black image"),
         "| --- |" + " --- |" * (len(columns) + 1),
         line("PSNR, whole image", lambda own: f"{_spread(own, 'psnr')} dB", f"{black:.1f} dB"),
         line("PSNR inside the union mask", lambda own: f"{_spread(own, 'psnr_mask')} dB", f"{inside:.1f} dB"),
@@ -285,13 +298,14 @@ def main_table(recorded: dict[str, Any]) -> str:
         line("relative L2 error of σ, early / middle / late frames", thirds("relative_l2")),
         line("model", lambda own: f"{own[0]['model_bytes'] / 1e6:.2f} MB, {own[0]['vdb_bytes'] / own[0]['model_bytes']:.0f} times less than the .vdb files"),
         line("primitives that never show", lambda own: f"{100 * statistics.mean(r['invisible_fraction'] for r in own):.1f} %"),
-        line("steps, seeds", lambda own: f"{round(statistics.mean(r['iterations'] for r in own)):,}, {len(own)}"),
+        line("seconds of training here, one thread, beside other work", lambda own: f"{statistics.mean(r['train_seconds'] for r in own):.0f}"),
+        line("seeds", lambda own: f"{len(own)}"),
     ])  # fmt: skip
 
 
 def short_table(recorded: dict[str, Any]) -> str:
     """Means over frames, and the hardest frame, beside what a black image scores."""
-    runs = recorded.get("main", [])
+    runs = _part(recorded, "main")
     if not runs:
         return "not measured"
     frames = len(runs[0]["per_frame"])
@@ -302,10 +316,10 @@ def short_table(recorded: dict[str, Any]) -> str:
     ]
     for own in _columns(runs):
         hardest = min(range(frames), key=lambda t: statistics.mean(r["per_frame"][t] for r in own))
-        worst, preset = spread([r["per_frame"][hardest] for r in own], 1), preset_of(own[0])
+        worst, preset = spread([r["per_frame"][hardest] for r in own], 1), own[0]["preset"]
         lines.append(
             f"| {WHICH[preset]} | {own[0]['primitives']:,} | {own[0]['model_bytes'] / 1e6:.2f} MB "
-            f"| {_budget(own[0])[1]} s | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB "
+            f"| {_budget(own[0])[1]:,} steps | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB "
             f"| {_spread(own, 'ssim', 4)} | frame {hardest + 1}: {worst} dB |"
         )
     return "\n".join(lines)
@@ -334,7 +348,7 @@ def variants_table(recorded: dict[str, Any]) -> str:
 
 def equations_table(recorded: dict[str, Any]) -> str:
     """The forms of quick, of the paper's equations and their union by edge and neurons, all at equal bytes; nothing where none was measured."""
-    runs = recorded.get("equations", [])
+    runs = _part(recorded, "equations")
     if not runs:
         return ""
     lines = [

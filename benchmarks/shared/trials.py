@@ -77,8 +77,12 @@ def begin(trial: Trial) -> Fitted:
     return start(config, dataset=dataset)
 
 
-def train(trial: Trial, keys: Sequence[str]) -> dict[str, Any]:
-    """One run; its numbers of ``keys`` where the metrics have them."""
+Wanted = Sequence[str] | Callable[[dict[str, Any]], dict[str, Any]]
+"""Of the metrics: names, of those that are there, or a function of a module that takes out what is to be kept."""
+
+
+def train(trial: Trial, wanted: Wanted) -> dict[str, Any]:
+    """One run and its numbers."""
     torch.set_num_threads(1)
     fitted = complete(begin(trial))
     metrics = fitted.metrics()
@@ -91,20 +95,20 @@ def train(trial: Trial, keys: Sequence[str]) -> dict[str, Any]:
         "seed": trial.seed,
         "iterations": trial.iterations,
         **dict(trial.facts),
-        **{k: metrics[k] for k in keys if k in metrics},
+        **(wanted(metrics) if callable(wanted) else {k: metrics[k] for k in wanted if k in metrics}),
     }
 
 
 def recorded(path: Path) -> list[dict[str, Any]]:
     """The trials of a file, none if there is no file."""
-    found: list[dict[str, Any]] = json.loads(path.read_text())["trials"] if path.exists() else []
+    found: list[dict[str, Any]] = json.loads(path.read_text()).get("trials", []) if path.exists() else []
     return found
 
 
 def run_all(
     trials: Sequence[Trial],
     path: Path,
-    keys: Sequence[str],
+    wanted: Wanted,
     jobs: int,
     shown: Callable[[dict[str, Any]], str],
     beside: Mapping[str, Any] = {},
@@ -113,7 +117,7 @@ def run_all(
     known = {row["trial"] for row in recorded(path)}
     waiting = [trial for trial in trials if trial.name not in known]
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        futures = {pool.submit(train, trial, keys): trial for trial in waiting}
+        futures = {pool.submit(train, trial, wanted): trial for trial in waiting}
         for future in as_completed(futures):
             row = future.result()
             path.parent.mkdir(parents=True, exist_ok=True)

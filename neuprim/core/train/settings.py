@@ -48,6 +48,8 @@ class PopulationSettings:
             split and prune by the density network's gradient norm, as the authors do).
         every: steps between two interventions.
         fraction: relocate: the largest share of primitives moved at once.
+        idle: relocate: only primitives whose weight in the images since the last intervention is below this share of the mean
+            primitive's move; null moves the least used ones, however much they do.
         grow_threshold, prune_threshold: gradient: on the mean norm of the density gradient.
         clone_scale, prune_scale: gradient: in units of the scene's extent.
         max_primitives: growth cap.
@@ -58,6 +60,7 @@ class PopulationSettings:
     start: Share = 0.02
     stop: Share = 0.6
     fraction: Annotated[float, Range(0, 1)] = 0.05
+    idle: NotNegative | None = None
     grow_threshold: NotNegative = 1e-5
     prune_threshold: NotNegative = 1e-6
     clone_scale: NotNegative = 0.01

@@ -17,7 +17,8 @@ __all__ = ["Relocate"]
 class Relocate(Population):
     """Constant count: primitives with the least total weight move to where weight x error is largest.
 
-    The busiest primitive splits in two by the exact rule, one child in its own row and one in the idle row.
+    The busiest primitive splits in two by the exact rule, one child in its own row and one in the idle row. A split costs more than it
+    brings once the idle ones are used up (children cover each other and not all of their parent): ``idle`` says who may move.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:
@@ -44,6 +45,8 @@ class Relocate(Population):
         busy[busiest] = True
         idle = torch.argsort(weight, stable=True)
         idle = idle[~busy[idle]][:budget]
+        if self.settings.idle is not None:
+            idle = idle[weight[idle] < self.settings.idle * weight.mean()]
         moves = min(len(idle), len(busiest))
         if moves == 0:
             return None

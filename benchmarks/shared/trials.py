@@ -24,7 +24,7 @@ from neuprim.runs.open import load_dataset
 
 __all__ = ["Trial", "begin", "held_out", "paces_of", "recorded", "run_all"]
 
-_GROWN, _ROUNDS, _STEPS = 150, 6, 15
+_GROWN, _ROUNDS, _STEPS = 150, 6, 16
 
 
 @dataclass(frozen=True)

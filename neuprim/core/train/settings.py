@@ -86,6 +86,7 @@ class TrainSettings:
         supervision: what is learned from: "images", "voxels" (points of the files that the images were made of, where the data set has
             them), "both", or "auto": both where the data set has voxels, else images.
         voxels_per_step: points of one frame that a step looks at.
+        voxels_every: both: steps from one look at points to the next; each sees an image.
         voxel_weight: both: weight of the points' loss beside the images'.
         voxel_colour: weight of the source radiance at the points beside their extinction; 0 leaves colours to the images.
         loss: name of a loss that a package provides (``neuprim tasks`` lists them), or null for the task's own.
@@ -105,6 +106,7 @@ class TrainSettings:
     warmup_steps: Annotated[int, Range(at_least=0)] = 0
     supervision: Literal["auto", "images", "voxels", "both"] = "images"
     voxels_per_step: Annotated[int, Range(1, 1_000_000)] = 8192
+    voxels_every: Annotated[int, Range(at_least=1)] = 1
     voxel_weight: NotNegative = 0.1
     voxel_colour: NotNegative = 0.1
     loss: Annotated[str, text("the name of a loss")] | None = None

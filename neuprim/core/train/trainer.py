@@ -190,7 +190,7 @@ class Trainer:
             value.grad = None
 
         seen = None if self.settings.supervision == "voxels" else self._look(progress)
-        known = self._look_inside() if self.settings.supervision != "images" else None
+        known = self._look_inside() if self._points_due() else None
         if seen is None:
             assert known is not None
             loss, parts = known.loss, known.parts
@@ -237,6 +237,11 @@ class Trainer:
             mse = torch.dot(flat, flat).item() / counted
         psnr = -10 * math.log10(max(mse, 1e-20)) if math.isfinite(mse) else math.nan
         return _ImageStep(loss, parts, psnr, view.name, truth, tally)
+
+    def _points_due(self) -> bool:
+        """Whether this step looks at points, too; the last one before each multiple of ``voxels_every`` does, which is what logs show."""
+        source = self.settings.supervision
+        return source == "voxels" or (source == "both" and (self.step + 1) % self.settings.voxels_every == 0)
 
     def _look_inside(self) -> PointStep:
         """Draw points of known extinction and compare."""

@@ -65,8 +65,8 @@ def points_inside(params: dict[str, Tensor], rows: Tensor, each: int = 8) -> tup
     return many, g.means[many] + (g.rotations[many] @ (g.scales[many] * u)[:, :, None])[..., 0]
 
 
-def relocate(m: Primitives, weight: Tensor, error: Tensor, fraction: float = 0.25):  # type: ignore[no-untyped-def]
-    population = Relocate(PopulationSettings(fraction=fraction))
+def relocate(m: Primitives, weight: Tensor, error: Tensor, fraction: float = 0.25, idle: float | None = None):  # type: ignore[no-untyped-def]
+    population = Relocate(PopulationSettings(fraction=fraction, idle=idle))
     population.observe(m, stats(weight, error))
     return population.intervene(m, 1.0)
 
@@ -128,6 +128,18 @@ def test_relocation_keeps_the_count_and_its_limit() -> None:
         change = relocate(m, torch.rand(COUNT), torch.rand(COUNT), fraction)
         assert (0 if change is None else len(change.fresh.nonzero()) // 2) == moves
         assert change is None or len(change.origin) == COUNT
+
+
+def test_relocation_can_be_left_to_the_idle() -> None:
+    m = model()
+    weight, error = torch.ones(COUNT), torch.arange(1.0, COUNT + 1)
+    weight[[2, 6]], weight[9] = torch.tensor([0.0, 0.02]), 0.2  # the mean is 0.86
+    change = relocate(m, weight, error, 0.25, 0.05)
+    assert change is not None and change.text == "moved 2"
+    assert sorted(change.origin[[2, 6]].tolist()) == [18, 19] and change.origin[9] == 9
+    assert relocate(m, weight, error, 0.05, 0.05).text == "moved 1", "the share still bounds it"
+    assert relocate(m, torch.ones(COUNT), error, 0.25, 0.05) is None, "all are at work"
+    assert relocate(m, torch.zeros(COUNT), error, 0.25, 0.05) is None, "a stretch of views without anything says nothing of anyone"
 
 
 def test_relocation_sums_over_views_and_starts_anew() -> None:

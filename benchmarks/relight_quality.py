@@ -1,6 +1,6 @@
 """Quality of the relighting task on `lit_solids`: ways of colouring at equal training time, where shadows come from, and losses.
 
-    python benchmarks/relight_quality.py [--seconds 300] [--seeds 3] [--parts forms losses] [--variants ...] [--once ...] [--continue] [--tune] [--readme] [--docs]
+    python benchmarks/relight_quality.py [--steps 2600] [--seeds 3] [--parts forms losses] [--variants ...] [--once ...] [--continue] [--tune] [--readme] [--docs]
 
 Parts:
 
@@ -8,8 +8,8 @@ Parts:
                printed, and equation 14 or its multiplicative form with a light visibility per primitive or per pixel
     losses     the default form under every loss
 
-Equal seconds are counted in steps: all variants take turns on this machine first, and each then trains for as many steps as fit into
---seconds at its own pace, so that other work on the machine disturbs none of the comparisons. Images are 128 x 128, 500 for training,
+Equal seconds are counted in steps: all variants take turns with the default on this machine first, and each then trains for as many steps as
+it makes while the default makes --steps, so that neither other work on the machine nor its speed disturbs the comparisons. Images are 128 x 128, 500 for training,
 100 held out (new lights, new views, both), linear light over the exposure, clamped to 0..1, black background; means over seeds +- half
 the spread, of the last checkpoint. --tune tests on every eighth training view instead. Results go to
 benchmarks/results/relight_quality.json. --docs puts the table between the markers of docs/relighting.md, --readme a short one into
@@ -47,6 +47,15 @@ FORMS = {
     "multiplicative, visibility per primitive": ("model.colour.form=multiplicative", "model.colour.visibility=primitive"),
 }
 LOSSES = {loss: (f"train.loss={loss}",) for loss in ("l1", "compressed", "relative")}
+BASELINES = {
+    "black": "black image",
+    "no_cast_shadows": "perfect shading without cast shadows",
+    "nearest_light_of_25": "nearest light of 25, same camera",
+}
+
+
+DEFAULT = "equation 14, visibility per primitive"
+HEADLINES = {"equation 14": "equation 14, as in the paper", DEFAULT: "with visibility of the light (default)"}
 SIZE = 128
 CLASSES = ("lit", "cast_shadow", "attached_shadow", "highlight")
 KEYS = (
@@ -78,7 +87,7 @@ def fit(words: list[str], dataset: Dataset) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=300.0)
+    parser.add_argument("--steps", type=int, default=2600, help="of the default form; the others train as long")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--parts", nargs="*", default=["forms", "losses"], help="none: print what is recorded")
     parser.add_argument("--variants", nargs="*", default=list(FORMS))
@@ -100,10 +109,11 @@ def main() -> None:
     if wanted:
         dataset = prepared(common, None).dataset
         everything = {(part, name): words for part, own in wanted.items() for name, words in own.items()}
-        known = {f"{part}: {e['name']}": e["ms_a_step"] / 1e3 for part in wanted for e in recorded.get(part, [])} if args.go_on else {}
-        names = {f"{part}: {name}": words for (part, name), words in everything.items()}
-        paces = {**pace({name: words for name, words in names.items() if name not in known}, dataset), **known}
-        recorded |= {"cpu": cpu_name(), "cores": core_count(), "seconds": args.seconds, "baselines": baselines(dataset)}
+        known = {f"{part}: {e['name']}": e["pace"] for part in wanted for e in recorded.get(part, []) if "pace" in e} if args.go_on else {}
+        missing = {f"{part}: {name}": words for (part, name), words in everything.items() if f"{part}: {name}" not in known}
+        took = pace({"": [*FORMS[DEFAULT], *common], **missing}, dataset) if missing else {}
+        paces = {**{name: took[name] / took[""] for name in missing}, **known}
+        recorded |= {"cpu": cpu_name(), "cores": core_count(), "steps": args.steps, "baselines": baselines(dataset)}
         for part, own in wanted.items():
             recorded[part] = [e for e in recorded.get(part, []) if args.go_on or e["name"] not in own]
         for seed in range(args.seeds):
@@ -112,8 +122,8 @@ def main() -> None:
                 if there or (seed and (name in args.once or part in args.once)):
                     continue
                 each = paces[f"{part}: {name}"]
-                found = fit([*words, f"train.iterations={round(args.seconds / each)}", f"seed={seed}"], dataset)
-                recorded[part].append({"name": name, "ms_a_step": 1e3 * each, **found})
+                found = fit([*words, f"train.iterations={round(args.steps / each)}", f"seed={seed}"], dataset)
+                recorded[part].append({"name": name, "pace": each, **found})
                 print(part, json.dumps({k: round(v, 3) if isinstance(v, float) else v for k, v in recorded[part][-1].items()}), flush=True)
                 if not args.tune:
                     RESULTS.write_text(json.dumps(recorded, indent=1) + "\n")  # after every run: a long benchmark may be cut short
@@ -125,23 +135,11 @@ def main() -> None:
         between_markers(README, "relight-quality", short_table(recorded))
 
 
-BASELINES = {
-    "black": "black image",
-    "no_cast_shadows": "perfect shading without cast shadows",
-    "nearest_light_of_25": "nearest light of 25, same camera",
-}
-
-
-DEFAULT = "equation 14, visibility per primitive"
-HEADLINES = {"equation 14": "equation 14, as in the paper", DEFAULT: "with visibility of the light (default)"}
-
-
 def short_table(recorded: dict[str, Any]) -> str:
     """The default, the paper's form and a baseline; of the classes of pixels the shadows and the one that the default draws worst."""
     own = {name: [e for e in recorded["forms"] if e["name"] == name] for name in HEADLINES}
     hardest = min(CLASSES, key=lambda c: statistics.mean(e[f"psnr_pooled_{c}"] for e in own[DEFAULT]))
     classes = [("cast shadows", "cast_shadow"), (f"hardest: {hardest.replace('_', ' ')}s", hardest)]
-    seconds = f"{recorded['seconds']:.0f} s"
     baseline = recorded["baselines"]["nearest_light_of_25"]
     without = " | ".join(f"{baseline[f'psnr_pooled_{c}']:.1f} dB" for _, c in classes)
     lines = [
@@ -153,7 +151,7 @@ def short_table(recorded: dict[str, Any]) -> str:
         runs = own[name]
         pooled = " | ".join(f"{spread([e[f'psnr_pooled_{c}'] for e in runs], 1)} dB" for _, c in classes)
         lines.append(
-            f"| {shown} | {runs[0]['primitives']:,} | {seconds} | {spread([e['psnr_linear_clamped'] for e in runs], 2)} dB "
+            f"| {shown} | {runs[0]['primitives']:,} | {runs[0]['iterations']:,} steps | {spread([e['psnr_linear_clamped'] for e in runs], 2)} dB "
             f"| {spread([e['ssim_display'] for e in runs], 3)} | {pooled} |"
         )
     return "\n".join(lines)
@@ -162,7 +160,7 @@ def short_table(recorded: dict[str, Any]) -> str:
 def quality_table(recorded: dict[str, Any]) -> str:
     """One row per baseline, form and loss."""
     lines = [
-        f"| `lit_solids`, {recorded['seconds']:.0f} s of training | numbers per primitive | PSNR | lit | cast shadow | attached shadow | highlight | PSNR display | steps |",
+        "| `lit_solids`, equally long training | numbers per primitive | PSNR | lit | cast shadow | attached shadow | highlight | PSNR display | steps |",
         "| --- |" + " --- |" * 8,
     ]
     for key, name in BASELINES.items():
@@ -182,9 +180,9 @@ def quality_table(recorded: dict[str, Any]) -> str:
                 f"| {cell('psnr_display', 2)} | {own[0]['iterations']:,} |"
             )
     seeds = len({e["seed"] for e in recorded.get("forms", recorded.get("losses", []))})
-    primitives = next((e["primitives"] for e in recorded.get("forms", [])), 0)
+    counts = sorted({e["primitives"] for e in recorded.get("forms", [])})
     lines.append(
-        f"\n{primitives:,} primitives; rows with ± are means over {seeds} seeds, others one run; {recorded['cores']} cores of {recorded['cpu']}."
+        f"\n{' or '.join(f'{n:,}' for n in counts)} primitives of equal bytes; rows with ± are means over {seeds} seeds, others one run; {recorded['cores']} cores of {recorded['cpu']}."
     )
     return "\n".join(lines)
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import itertools
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
-__all__ = ["core_count", "parallel_for"]
+__all__ = ["core_count", "limited", "parallel_for"]
 
+_limit: ContextVar[int] = ContextVar("threads", default=0)
 _pools: dict[int, ThreadPoolExecutor] = {}
 _lock = threading.Lock()
 
@@ -23,6 +26,17 @@ def core_count() -> int:
         return os.cpu_count() or 1
 
 
+@contextmanager
+def limited(threads: int) -> Iterator[None]:
+    """Inside, "all cores" means ``threads`` of them, 0 for all: for code that is called without being told how many it may use, such as
+    a loss or a colour."""
+    token = _limit.set(threads)
+    try:
+        yield
+    finally:
+        _limit.reset(token)
+
+
 def _pool(threads: int) -> ThreadPoolExecutor:
     with _lock:
         if threads not in _pools:
@@ -31,8 +45,11 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def parallel_for(function: Callable[..., Any], count: int, chunk: int, threads: int, *args: Any) -> list[Any]:
-    """Call ``function(start, stop, *args)`` for chunks of ``range(count)``, drawn dynamically; returns the results in chunk order."""
-    threads = threads or core_count()
+    """Call ``function(start, stop, *args)`` for chunks of ``range(count)``, drawn dynamically; returns the results in chunk order.
+
+    ``threads`` 0 is all cores, or as many as :func:`limited` says.
+    """
+    threads = threads or _limit.get() or core_count()
     chunks = -(-count // chunk) if count else 0
     if threads == 1 or chunks <= 1:
         return [function(c * chunk, min(count, (c + 1) * chunk), *args) for c in range(chunks)]

@@ -91,8 +91,8 @@ class Cosine(Shaped):
         b1 = torch.cat([f.b1 * scale for f, scale in parts], 1)
         return Cosine(W1, b1, torch.cat([self.w2, other.w2], 1), self.b2 + other.b2.reshape(self.b2.shape), omega0, self.edge)
 
-    def rows(self, index: Tensor) -> Cosine:
-        """Those of some primitives, (M,) int64, without gradient."""
+    def rows(self, index: Tensor | slice) -> Cosine:
+        """Those of some primitives, (M,) int64 or first:end, without gradient."""
         W1, b1, w2, b2 = (x.detach()[index] for x in (self.W1, self.b1, self.w2, self.b2))
         return Cosine(W1, b1, w2, b2, self.omega0, self.edge)
 
@@ -123,8 +123,10 @@ class Opaque(Shaped):
     def fault(self, sizes: Sizes) -> str | None:
         return labelled("line_integral", function_fault(self.line_integral))
 
-    def rows(self, index: Tensor) -> Opaque:
-        """That of some primitives, (M,) int64."""
+    def rows(self, index: Tensor | slice) -> Opaque:
+        """That of some primitives, (M,) int64 or first:end."""
+        if isinstance(index, slice):
+            return Opaque(lambda prim, *ray: self.line_integral(prim + (index.start or 0), *ray))
         return Opaque(lambda prim, *ray: self.line_integral(index[prim], *ray))
 
     def optical_depth(self, pairs: Pairs) -> Tensor:

@@ -128,4 +128,4 @@ class RenderOutput:
 def mean_depth(weighted: Tensor, alpha: Tensor) -> Tensor:
     """(H, W) sum of w z over sum of w; 0 where nothing is hit. The weights of a ray telescope: their sum is its alpha."""
     hit = alpha > 0
-    return torch.where(hit, weighted / torch.where(hit, alpha, torch.ones_like(alpha)), torch.zeros_like(weighted))
+    return torch.where(hit, weighted / torch.where(hit, alpha, 1.0), 0.0)

@@ -7,6 +7,7 @@ take a first step 3.2 times its rate (method: "splitting exactly"), so bias corr
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -34,18 +35,17 @@ def adam_step_reference(value: Tensor, grad: Tensor, m: Tensor, v: Tensor, rate:
 
 
 @exact_kernel
-def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, correction, root):  # type: ignore[no-untyped-def]
-    """The same on flat float32 arrays of ``width`` numbers per row; correction = 1 / c1 and root = sqrt(1 / c2) per row.
+def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, age, breaks, correction, root):  # type: ignore[no-untyped-def]
+    """The same on flat float32 arrays of ``width`` numbers per row; of each age, correction = 1 / c1 and root = sqrt(1 / c2).
 
-    Rows of one age stand together nearly everywhere, so they are taken in runs: long loops that vectorise.
+    Rows of one age stand together nearly everywhere, so they are taken in runs, which end at ``breaks``: long loops that vectorise.
     """
     b1, b2, one_b1, one_b2, eps = np.float32(BETA1), np.float32(beta2), np.float32(1 - BETA1), np.float32(1 - beta2), np.float32(EPS)
-    i = start
+    i, run = start, np.searchsorted(breaks, start, "right")
     while i < stop:
-        j = i + 1
-        while j < stop and correction[j] == correction[i] and root[j] == root[i]:
-            j += 1
-        a, r = np.float32(rate * correction[i]), np.float32(root[i])
+        j = min(stop, breaks[run]) if run < breaks.shape[0] else stop
+        run += 1
+        a, r = np.float32(rate * correction[age[i]]), np.float32(root[age[i]])
         x, g, mi, vi = value[i * width : j * width], grad[i * width : j * width], m[i * width : j * width], v[i * width : j * width]
         for k in range(x.shape[0]):
             mk = b1 * mi[k] + one_b1 * g[k]
@@ -57,22 +57,33 @@ def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, correction, r
 
 
 @exact_kernel
-def _all_finite(x):  # type: ignore[no-untyped-def]
-    """Whether no element is NaN or infinite: x - x is 0 exactly then."""
-    bad = np.float32(0)
-    for k in range(x.shape[0]):
-        bad += x[k] - x[k]
-    return bad == np.float32(0)
+def _largest_bits(x):  # type: ignore[no-untyped-def]
+    """The largest of float32 numbers' bits without their signs: those of infinity or more where one is not finite."""
+    bits = x.view(np.uint32)
+    largest = np.uint32(0)
+    for k in range(bits.shape[0]):  # of whole numbers the largest is found in any order: a loop that vectorises, which a sum is not
+        largest = max(largest, bits[k] & np.uint32(0x7FFFFFFF))
+    return largest
+
+
+_INFINITY = 0x7F800000
 
 
 def _check_gradient(name: str, grad: Tensor) -> None:
     if grad.device.type == "cpu" and grad.dtype == torch.float32:
-        fine = _all_finite(grad.contiguous().reshape(-1).numpy())
+        fine = _largest_bits(grad.contiguous().reshape(-1).numpy()) < _INFINITY
     else:
         fine = bool(torch.isfinite(grad).all())
     if not fine:
         row = int((~torch.isfinite(grad.reshape(grad.shape[0], -1)).all(dim=1)).nonzero()[0])
         raise NonFiniteError(f"gradient of {name} of primitive {row} is not finite: {grad[row].flatten()[:8].tolist()}")
+
+
+@lru_cache(maxsize=4)
+def _corrections(beta2: float, ages: int) -> tuple[np.ndarray, np.ndarray]:
+    """1 / c1 and sqrt(1 / c2) of the ages 0 to ``ages`` - 1; powers take longer than all else that a step does per row."""
+    age = np.arange(1.0, ages)
+    return np.append(0.0, 1 / (1 - BETA1**age)), np.append(0.0, np.sqrt(1 / (1 - beta2**age)))
 
 
 class RowAdam:
@@ -104,8 +115,9 @@ class RowAdam:
                 _check_gradient(spec.name, grad)
                 updates.append((spec, value, grad))
         self.age += 1
-        age = self.age.numpy().astype(np.float64)
-        correction, root = 1 / (1 - BETA1**age), np.sqrt(1 / (1 - self.beta2**age))
+        age = self.age.numpy()
+        breaks = np.flatnonzero(age[1:] != age[:-1]) + 1
+        correction, root = _corrections(self.beta2, 1 << int(age.max(initial=0)).bit_length())
         work = []  # (arguments of _adam_rows), small enough to share out
         for spec, value, grad in updates:
             m, v, rate = self.m[spec.name], self.v[spec.name], rates[spec.name]
@@ -113,7 +125,9 @@ class RowAdam:
                 flat = [x.reshape(-1).numpy() for x in (value, grad.contiguous(), m, v)]
                 rows = max(_CHUNK_NUMBERS // spec.size, 1)
                 starts = range(0, value.shape[0], rows)
-                work += [(r, min(r + rows, value.shape[0]), spec.size, *flat, rate, self.beta2, correction, root) for r in starts]
+                work += [
+                    (r, min(r + rows, value.shape[0]), spec.size, *flat, rate, self.beta2, age, breaks, correction, root) for r in starts
+                ]
             else:
                 adam_step_reference(value, grad, m, v, rate, self.age, self.beta2)
 

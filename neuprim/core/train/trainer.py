@@ -19,6 +19,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from neuprim.core.compute.threads import limited
 from neuprim.core.data import Dataset
 from neuprim.core.data.check import check_pixels, check_points
 from neuprim.core.data.initial import subset
@@ -177,11 +178,15 @@ class Trainer:
             yield self.train_step()
 
     def train_step(self) -> StepReport:
-        """One view, some points or both, one update.
+        """One view, some points or both, one update; on as many threads as the renderer has.
 
         Raises:
             NonFiniteError: a loss, gradient or parameter is NaN or infinite; nothing was updated by this step.
         """
+        with limited(self.renderer.threads):
+            return self._train_step()
+
+    def _train_step(self) -> StepReport:
         start = time.perf_counter()
         model, progress = self.model, self.progress
         model.density.set_progress(progress)
@@ -330,6 +335,8 @@ class Trainer:
                     )
             if optimizer.age.shape != (model.count,) or optimizer.age.dtype != torch.int64:
                 raise ValueError(f"ages are {optimizer.age.dtype} {tuple(optimizer.age.shape)}; expected int64 ({model.count},)")
+            if model.count and not 0 <= int(optimizer.age.min()) <= int(optimizer.age.max()) <= step:
+                raise ValueError(f"ages are {int(optimizer.age.min())} to {int(optimizer.age.max())} steps; expected 0 to {step}")
             order = tensors["order"]
             if order.dim() != 1 or order.dtype != torch.int64 or (len(order) and (int(order.min()) < 0 or int(order.max()) >= views)):
                 raise ValueError("the order of views is out of range")

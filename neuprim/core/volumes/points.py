@@ -23,6 +23,7 @@ from neuprim.core.model.fields import ColourField, Conditions, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Living, Primitives
 from neuprim.core.volumes.points_cpu import add_values, count_pairs, fill_pairs, pull_values
+from neuprim.core.volumes.points_prepare import merge_parts, prepare_axes, prepare_values, pull_parameters, sort_points
 
 __all__ = ["PointValues", "Shares", "cells_of", "pairs_of", "values_at"]
 
@@ -30,6 +31,7 @@ _SUMS = 8
 """Parts of the primitives whose sums are kept apart, so that the result does not depend on the number of threads."""
 
 _ROWS = 64  # primitives per unit of work where none shares its output
+_ROWS_PREPARED = 1024  # the same where they meet no points
 _POINTS_PER_CELL = 0.3  # of a grid that is full; points lie where matter is, in a small part of it
 _MOST_CELLS = 64  # along the longest side
 
@@ -84,18 +86,17 @@ def values_at(model: Primitives, conditions: Conditions, points: Tensor, colour:
     form = model.density.lower(living.own, living.geometry, conditions)
     shares = Shares(living.geometry.count)
     places = points.detach().double().contiguous().numpy()
-    tensors = _asked(living, places, colors, shares) if not isinstance(form, Cosine) else None
-    if tensors is None:
-        assert isinstance(form, Cosine)
-        axes = _Axes.of(living.geometry)
-        prepared = _prepared(axes, form)
-        shown = torch.zeros(living.geometry.count, 0, dtype=torch.float64) if colors is None else colors.double()
-        if not all(bool(torch.isfinite(x.detach().sum())) for x in (*prepared, shown)):
-            model.check_finite()
-            raise NonFiniteError("extinction at points: a product of finite parameters is not finite")
-        whole = _Values.apply(places, axes.reach, form.edge, shares, threads, *prepared, shown)
-        tensors = whole[:, 0], (None if colors is None else whole[:, 1:])
-    sigma, source = tensors
+    if isinstance(form, Cosine):
+        g, shown = living.geometry, torch.zeros(living.geometry.count, 0) if colors is None else colors
+        given = (g.means, g.log_scales, g.quats, form.W1, form.b1, form.w2, form.b2.reshape(-1), shown)
+        try:
+            whole = _Values.apply(places, form.omega0, form.edge, shares, threads, *given)
+        except NonFiniteError:
+            model.check_finite()  # names the parameter, if it is one
+            raise
+        sigma, source = whole[:, 0], (None if colors is None else whole[:, 1:])
+    else:
+        sigma, source = _asked(living, places, colors, shares)
     return PointValues(sigma, source, living.rows, shares)
 
 
@@ -107,34 +108,26 @@ def _flat_colours(field: ColourField, living: Living, conditions: Conditions) ->
 
 
 class _Axes(NamedTuple):
-    """Ellipsoids in float64, differentiable but for ``reach``.
+    """Ellipsoids in float64.
 
     Attributes:
-        means: (N, 3); m: (N,) longest semi-axes; whiten: (N, 3, 3), the A of y = A (x - mu).
+        means: (N, 3); whiten: (N, 3, 3), the A of y = A (x - mu); m: (N,) longest semi-axes.
         reach: (N, 3) half sides of the ellipsoids' boxes.
+        finite: whether all of these are.
     """
 
-    means: Tensor
-    m: Tensor
-    whiten: Tensor
+    means: np.ndarray
+    whiten: np.ndarray
+    m: np.ndarray
     reach: np.ndarray
+    finite: bool
 
     @classmethod
-    def of(cls, geometry: Geometry) -> _Axes:
-        rotations, scales = geometry.rotations.double(), geometry.log_scales.double().exp()
-        with torch.no_grad():
-            reach = (rotations * scales[:, None, :]).norm(dim=-1).numpy()
-        m = geometry.log_length_scale.double().exp()
-        return cls(geometry.means.double(), m, rotations.transpose(1, 2) / scales[:, :, None], np.ascontiguousarray(reach))
-
-
-def _prepared(axes: _Axes, form: Cosine) -> tuple[Tensor, ...]:
-    """float64 tensors that the kernels read: means (N, 3), A (N, 3, 3) with y = A (x - mu), and of each neuron rate (N, K, 3), phase and
-    amplitude (N, K), and offset (N,), so that f/m = offset + sum of amplitude cos(phase + rate . (x - mu)).
-    """
-    m, b2 = axes.m, form.b2.double().reshape(-1)
-    rate = form.omega0 * form.W1.double() / m[:, None, None]
-    return axes.means, axes.whiten, rate, form.omega0 * form.b1.double(), form.w2.double() / m[:, None], b2 / m
+    def of(cls, threads: int, *ellipsoids: np.ndarray) -> _Axes:
+        """Of means, log_scales and quats."""
+        count = len(ellipsoids[0])
+        made = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty(count), np.empty((count, 3))
+        return cls(*made, all(parallel_for(prepare_axes, count, _ROWS_PREPARED, threads, *ellipsoids, *made)))
 
 
 class Cells(NamedTuple):
@@ -143,6 +136,7 @@ class Cells(NamedTuple):
     Attributes:
         order: (M,) int64, the points cell by cell. starts: (X Y Z + 1,) int64, where each cell's begin.
         low: (3,) float64 corner; step: edge of a cell; counts: (3,) int64.
+        placed: (M, 3) the points in that order.
     """
 
     order: np.ndarray
@@ -150,50 +144,68 @@ class Cells(NamedTuple):
     low: np.ndarray
     step: float
     counts: np.ndarray
+    placed: np.ndarray
+
+    @property
+    def grid(self) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+        """As the kernels take it."""
+        return self.starts, self.low, self.step, self.counts
 
 
 def cells_of(points: np.ndarray) -> Cells:
     """A grid over (M, 3) points, fine enough that a cell holds few of them."""
     if len(points) == 0:
-        return Cells(np.zeros(0, np.int64), np.zeros(2, np.int64), np.zeros(3), 1.0, np.ones(3, np.int64))
+        return Cells(np.zeros(0, np.int64), np.zeros(2, np.int64), np.zeros(3), 1.0, np.ones(3, np.int64), np.zeros((0, 3)))
     low, high = points.min(0), points.max(0)
     across = min(_MOST_CELLS, max(1, round((len(points) / _POINTS_PER_CELL) ** (1 / 3))))
     step = float((high - low).max()) / across or 1.0
     counts = np.floor((high - low) / step).astype(np.int64) + 1
-    cell = np.floor((points - low) / step).astype(np.int64).clip(0, counts - 1)
-    flat = (cell[:, 0] * counts[1] + cell[:, 1]) * counts[2] + cell[:, 2]
-    starts = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=int(counts.prod())))])
-    return Cells(np.argsort(flat, kind="stable"), starts, low, step, counts)
+    starts, order, placed = np.zeros(int(counts.prod()) + 1, np.int64), np.empty(len(points), np.int64), np.empty((len(points), 3))
+    sort_points(points, low, step, counts, starts, order, placed)
+    return Cells(order, starts, low, step, counts, placed)
 
 
 class _Values(torch.autograd.Function):
-    """(M, 1 + C) float32 extinction and source."""
+    """(M, 1 + C) float32 extinction and source, of (means, log_scales, quats, W1, b1, w2, b2, colours), each a row per primitive."""
 
     @staticmethod
-    def forward(ctx: Any, places: np.ndarray, reach: np.ndarray, edge: int, shares: Shares, threads: int, *tensors: Tensor) -> Tensor:  # type: ignore[override]
-        rows = [np.ascontiguousarray(x.detach().numpy()) for x in tensors]
-        count, width = len(reach), 1 + rows[-1].shape[1]
+    def forward(ctx: Any, places: np.ndarray, omega0: float, edge: int, shares: Shares, threads: int, *tensors: Tensor) -> Tensor:  # type: ignore[override]
+        given = [np.ascontiguousarray(x.detach().numpy()) for x in tensors]
+        if len({x.dtype for x in given}) > 1:  # a mix would compile kernels of its own
+            given = [x.astype(np.float64, copy=False) for x in given]
+        count, K, width = len(given[0]), given[3].shape[1], 1 + given[7].shape[1]
+        axes = _Axes.of(threads, *given[:3])
+        neurons = np.empty((count, K, 3)), np.empty((count, K)), np.empty((count, K)), np.empty(count), np.empty((count, width - 1))
+        finite = parallel_for(prepare_values, count, _ROWS_PREPARED, threads, *given[3:], omega0, axes.m, *neurons)
+        if not (axes.finite and all(finite)):
+            raise NonFiniteError("extinction at points: a product of finite parameters is not finite")
         cells = cells_of(places)
         chunk = max(1, -(-count // _SUMS))
-        sums = np.zeros((max(1, -(-count // chunk)), len(places), width))
-        ctx.given = [np.ascontiguousarray(places[cells.order]), tuple(cells[1:]), reach, tuple(rows), edge]
-        parallel_for(add_values, count, chunk, threads, *ctx.given, chunk, sums)
+        parts = np.zeros((max(1, -(-count // chunk)), len(places), width))
+        prims = (axes.means, axes.whiten, *neurons)
+        parallel_for(add_values, count, chunk, threads, cells.placed, cells.grid, axes.reach, prims, edge, chunk, parts)
         found = np.empty((len(places), width), np.float32)
-        found[cells.order] = sums.sum(0)
-        ctx.order, ctx.shares, ctx.threads = cells.order, shares, threads
-        ctx.shapes = [x.shape for x in tensors]
+        parallel_for(merge_parts, len(places), _ROWS_PREPARED, threads, parts, cells.order, found)
+        ctx.given, ctx.prims, ctx.axes, ctx.cells, ctx.shares = given, prims, axes, cells, shares
+        ctx.settings, ctx.dtypes = (omega0, edge, threads), [x.dtype for x in tensors]
         return torch.from_numpy(found)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
-        pulled = np.ascontiguousarray(gradient.double().numpy()[ctx.order])
-        shares: Shares = ctx.shares
-        error = np.zeros(len(pulled)) if shares.error is None else shares.error.double().numpy()[ctx.order]
-        made = [np.zeros(shape) for shape in ctx.shapes]
-        sums = np.zeros((ctx.shapes[0][0], 2))
-        parallel_for(pull_values, len(sums), _ROWS, ctx.threads, *ctx.given, pulled, error, tuple(made), sums)
+        (omega0, edge, threads), cells, shares, count = ctx.settings, ctx.cells, ctx.shares, len(ctx.given[0])
+        pulled = gradient.numpy()[cells.order].astype(np.float64)
+        error = np.zeros(len(pulled)) if shares.error is None else shares.error.double().numpy()[cells.order]
+        made = tuple(np.zeros_like(x) for x in ctx.prims)
+        sums = np.zeros((count, 2))
+        parallel_for(
+            pull_values, count, _ROWS, threads, cells.placed, cells.grid, ctx.axes.reach, ctx.prims, edge, pulled, error, made, sums
+        )
         shares.weight, shares.error_weight = (torch.from_numpy(sums[:, i]).float() for i in range(2))
-        return (None,) * 5 + tuple(torch.from_numpy(x) for x in made)
+        own = tuple(np.empty(x.shape, x.dtype) for x in ctx.given[1:7])
+        rest = (omega0, ctx.axes.m, ctx.prims[1:6], made[1:6], own)
+        parallel_for(pull_parameters, count, _ROWS_PREPARED, threads, *ctx.given[1:3], *rest)
+        gradients = (made[0], *own, made[6])
+        return (None,) * 5 + tuple(torch.from_numpy(x).to(dtype) for x, dtype in zip(gradients, ctx.dtypes, strict=True))
 
 
 # ---------------------------------------------------------------- any other density
@@ -202,10 +214,8 @@ class _Values(torch.autograd.Function):
 def pairs_of(geometry: Geometry, points: np.ndarray) -> tuple[Tensor, Tensor]:
     """(P,) int64 rows of points and of primitives that contain them, primitive by primitive."""
     cells = cells_of(points)
-    with torch.no_grad():
-        axes = _Axes.of(geometry)
-    own = (np.ascontiguousarray(x.detach().numpy()) for x in (axes.means, axes.whiten))
-    given = (np.ascontiguousarray(points[cells.order]), tuple(cells[1:]), axes.reach, *own)
+    axes = _Axes.of(0, *(np.ascontiguousarray(x.detach().numpy()) for x in (geometry.means, geometry.log_scales, geometry.quats)))
+    given = (cells.placed, cells.grid, axes.reach, axes.means, axes.whiten)
     counts = np.zeros(geometry.count, np.int64)
     parallel_for(count_pairs, geometry.count, _ROWS, 0, *given, counts)
     starts = np.cumsum(counts) - counts

@@ -55,7 +55,8 @@ def add_values(start, stop, points, cells, reach, prims, edge, chunk, sums):  # 
 
     Args:
         points: (M, 3) float64, cell by cell. cells: starts, low, step and counts of :class:`~neuprim.core.volumes.points.Cells`.
-        reach: (N, 3) half sides of the primitives' boxes. prims: what ``_prepared`` there makes, and colours (N, C).
+        reach: (N, 3) half sides of the primitives' boxes. prims: means (N, 3), A (N, 3, 3), and what
+            :func:`~neuprim.core.volumes.points_prepare.prepare_values` fills: rate, phase, amplitude, offset and colours.
     """
     starts, counts = cells[0], cells[3]
     means, A, rate, phase, amplitude, offset, colors = prims

@@ -19,7 +19,6 @@ import torch
 from torch import Tensor
 
 from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity, amplified, cosine_density, split_cosine, split_scale
-from neuprim.core.model.edge import fade
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
@@ -31,7 +30,6 @@ PARTS = ("phase", "offset", "window", "motion")
 """What may vary in time."""
 
 OFFSET_TERMS = 4
-WINDOW_EDGE = 2  # the exponent of the window in time, which is to a life what an edge is to a support
 
 
 def time_of(conditions: Conditions) -> Tensor:
@@ -102,9 +100,11 @@ class TimeDensity(DensityField):
     def move(self, params: Params, geometry: Geometry, conditions: Conditions) -> Geometry:
         if "motion" not in self.parts:
             return geometry
-        since = self._since(params, conditions)
-        shift = (params["velocity"] + params["acceleration"] * since) * since
-        return Geometry(geometry.means + shift, geometry.log_scales, geometry.quats)
+        from neuprim.tasks.dynamic.frame_cpu import fused_move  # numba, loaded when first needed
+
+        center = params["window_center"] if "window" in self.parts else torch.full((geometry.count, 1), 0.5, dtype=geometry.means.dtype)
+        means = fused_move(geometry.means, params["velocity"], params["acceleration"], center, time_of(conditions))
+        return Geometry(means, geometry.log_scales, geometry.quats)
 
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Cosine:
         xi = time_of(conditions)
@@ -118,18 +118,13 @@ class TimeDensity(DensityField):
             own["b2"] = b2 + (params["offset_cos"] @ angle.cos().to(b2) + params["offset_sin"] @ angle.sin().to(b2))[:, None]
         w2, b2 = amplified(own["w2"], own["b2"], own.get("log_gain"))
         if "window" in self.parts:
-            u = (xi.to(b2) - params["window_center"]) / params["log_window"].exp()
-            weight = fade(u.square(), WINDOW_EDGE)
-            w2, b2 = w2 * weight, b2 * weight
+            from neuprim.tasks.dynamic.frame_cpu import fused_window  # numba, loaded when first needed
+
+            w2, b2 = fused_window(w2, b2, params["window_center"], params["log_window"], xi)
         return Cosine(params["W1"], b1, w2, b2, self.static.omega0, self.static.edge)
 
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
         return cosine_density(self.lower(params, geometry, conditions), self.move(params, geometry, conditions), prim, x)
-
-    def _since(self, params: Params, conditions: Conditions) -> Tensor:
-        """(N, 1) time since the middle of each primitive's life."""
-        xi = time_of(conditions).to(params["velocity"])
-        return xi - params["window_center"] if "window" in self.parts else (xi - 0.5).reshape(1, 1)
 
     # ------------------------------------------------------------ population
 

@@ -16,11 +16,12 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
+from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.fields import Constant, LoweredDensity, Shade
 from neuprim.core.model.geometry import Geometry
@@ -42,6 +43,7 @@ and after that it fades. A compromise: surfaces made of ellipsoids are bumpy, an
 larger one shadows begin further from what casts them. With both equal a point on a depth image itself keeps all of its light."""
 
 _FAR = 1e3  # scene radii
+_CHUNK = 1024  # points per unit of work
 
 
 def light_visibility(
@@ -72,35 +74,33 @@ def light_visibility(
         depths = means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
         edges = torch.linspace(float(depths.min()), float(depths.max()), LAYERS + 1, dtype=torch.float64)
         slabs = torch.bucketize(depths, edges[1:-1])
+        order = torch.argsort(slabs, stable=True)
+        geometry_by_slab, density_by_slab = geometry[order], density.rows(order)
+        ends = torch.bincount(slabs, minlength=LAYERS).cumsum(0).tolist()
+        black = torch.zeros(geometry.count, 1)
         layers = []
-        for k in range(LAYERS):
-            rows = (slabs == k).nonzero()[:, 0]
-            if len(rows) == 0:
+        for first, end in zip([0, *ends], ends, strict=False):
+            if first == end:
                 continue
-            part = Lowered(geometry[rows], density.rows(rows), Constant(torch.zeros(len(rows), 1)))
+            own_rows = slice(first, end)
+            part = Lowered(geometry_by_slab[own_rows], density_by_slab.rows(own_rows), Constant(black[own_rows]))
             try:
                 output = render_lowered(part, camera, own)
             except NonFiniteError:
-                refuse_non_finite(Lowered(geometry, density, Constant(torch.zeros(geometry.count, 1))))  # by its number in the frame
+                refuse_non_finite(Lowered(geometry, density, Constant(black)))  # by its number in the frame
                 raise
             assert output.depth is not None
-            alpha = output.alpha.double()
-            nearness = torch.where(alpha > 0, alpha / output.depth.double().clamp_min(near), 0.0)
-            layers.append(torch.stack([alpha, nearness]))
-        image = torch.stack(layers)
-        diameter = 2.0 * radius
+            layers.append((output.alpha, output.depth))
+        opacities, distances = (torch.stack(images).numpy() for images in zip(*layers, strict=True))
+        view, diameter = camera.viewmat[:3].contiguous().numpy(), 2.0 * radius
 
     def visibility(points: Tensor) -> Tensor:
-        with torch.no_grad():
-            x, y, z = (points.detach().double() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).unbind(-1)
-            front = z > near
-            spread = focal / (0.5 * SIZE) / z.clamp_min(near)
-            where = torch.stack([x * spread, y * spread], -1).clamp(-2.0, 2.0)
-            found = F.grid_sample(image.flatten(0, 1)[None], where[None, None], align_corners=False)[0, :, 0].unflatten(0, (-1, 2))
-            alpha, nearness = found[:, 0], found[:, 1]
-            behind = z - alpha / nearness.clamp_min(1e-12)
-            u = (0.5 + 0.5 * (behind - bias * diameter) / (softness * diameter)).clamp(0, 1)
-            arrives = (1 - alpha * u * u * (3 - 2 * u)).prod(0)
-            return torch.where(front, arrives, 1.0).float()
+        from neuprim.tasks.relight.visibility_cpu import arriving_light  # numba, loaded when first needed
+
+        x = points.detach().double().contiguous().numpy()
+        found = np.empty(len(x), np.float32)
+        limits = (bias * diameter, softness * diameter)
+        parallel_for(arriving_light, len(x), _CHUNK, settings.threads, x, view, near, focal, opacities, distances, *limits, found)
+        return torch.from_numpy(found)
 
     return visibility

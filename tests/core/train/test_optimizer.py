@@ -6,8 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from neuprim.core.compute.threads import limited
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.schema import ParameterSpec
+from neuprim.core.train import optimizer as optimizer_module
 from neuprim.core.train.optimizer import RowAdam, adam_step_reference
 
 SPECS = tuple(
@@ -182,3 +184,54 @@ def test_state_goes_on_exactly() -> None:
         second.step(q, RATES)
     assert all(torch.equal(p[n], q[n]) for n in p)
     assert all(torch.equal(first.state()[k], v) for k, v in second.state().items())
+
+
+def test_it_does_not_depend_on_the_number_of_threads() -> None:
+    """More rows than one unit of work, of many ages."""
+    states = []
+    for threads in (1, 2, 5):
+        p = params(30_000, 2)
+        optimizer = RowAdam(SPECS, p, 0.99)
+        optimizer.age = torch.arange(30_000) % 97 // 3
+        with limited(threads):
+            for step in range(3):
+                set_grads(p, step)
+                optimizer.step(p, RATES)
+        states.append([*(x.detach() for x in p.values()), *optimizer.state().values()])
+    assert all(torch.equal(a, b) for state in states[1:] for a, b in zip(states[0], state, strict=True))
+
+
+@pytest.mark.parametrize("beta2", [0.0, 0.9, 0.99, 0.99999])
+def test_corrections_are_those_of_every_age(beta2: float) -> None:
+    """From the first step to ages beyond the budget of any run, rows side by side."""
+    ages = torch.tensor([0, 0, 1, 2, 3, 3, 1000, 65_534, 65_535, 65_536, 1_000_000, 7])
+    p = params(len(ages), 3)
+    exact = {n: v.detach().double() for n, v in p.items()}
+    optimizer = RowAdam(SPECS, p, beta2)
+    optimizer.age = ages.clone()
+    m, v = ({n: torch.zeros_like(x) for n, x in exact.items()} for _ in range(2))
+    set_grads(p, 4)
+    optimizer.step(p, RATES)
+    for n in ("means", "W1", "b2"):
+        grad = p[n].grad
+        assert grad is not None
+        before = exact[n].clone()
+        adam_step_reference(exact[n], grad.double(), m[n], v[n], RATES[n], ages + 1, beta2)
+        step = (exact[n] - before).abs()
+        assert ((p[n].detach() - exact[n]).abs() <= 1e-5 * step + 1e-6 * before.abs() + 1e-30).all()
+
+
+def test_powers_are_taken_once_for_all_rows_of_an_age(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step of a thousand more rows asks for the same table, and only a longer run for another."""
+    made: list[int] = []
+    kept = optimizer_module._corrections
+    kept.cache_clear()
+    monkeypatch.setattr(optimizer_module, "_corrections", lambda beta2, ages: made.append(ages) or kept(beta2, ages))
+    for count in (3, 1003):
+        p = params(count)
+        optimizer = RowAdam(SPECS, p)
+        optimizer.age += 5
+        for step in range(3):
+            set_grads(p, step)
+            optimizer.step(p, RATES)
+    assert made == [8, 8, 16, 8, 8, 16] and kept.cache_info().misses == 2

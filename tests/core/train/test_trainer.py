@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core import checkpoint
+from neuprim.core.compute import threads
 from neuprim.core.data import Dataset
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NonFiniteError
 from neuprim.core.metrics import psnr
@@ -120,6 +121,20 @@ def test_rates(plain: Dataset) -> None:
     assert trainer.rates()["W1"] == pytest.approx(specs["W1"].lr * 0.1)
     trainer.step = 100
     assert trainer.rates()["b2"] == pytest.approx(0.5 * 0.01)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_step_works_on_as_many_threads_as_the_renderer_has(plain: Dataset, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its loss and its optimiser too, whatever the machine has."""
+    trainer, other, asked = tiny.trainer(plain, 40), tiny.trainer(plain, 40), set()
+    monkeypatch.setattr(threads, "core_count", lambda: 5)
+    monkeypatch.setattr(threads, "_pool", lambda n, made=threads._pool: asked.add(n) or made(n))  # type: ignore[func-returns-value]
+    trainer.renderer = replace(trainer.renderer, threads=count)
+    trainer.train_step()
+    assert asked == (set() if count == 1 else {3})
+    other.train_step()
+    assert asked - {3} == {5}
+    same(trainer, other)
 
 
 def test_budget_of_seconds(plain: Dataset) -> None:
@@ -277,6 +292,10 @@ def damaged(kind: str, tensors: dict[str, Tensor], header: dict[str, Any]) -> No
         tensors["adam.v.w2"] = tensors["adam.v.w2"].double()
     elif kind == "age shape":
         tensors["adam.age"] = torch.zeros(3, dtype=torch.int64)
+    elif kind == "age beyond the steps":
+        tensors["adam.age"][2] = 2**50
+    elif kind == "age negative":
+        tensors["adam.age"][2] = -1
     elif kind == "order range":
         tensors["order"] = torch.tensor([0, 6])
     elif kind == "no generator":
@@ -289,8 +308,8 @@ def damaged(kind: str, tensors: dict[str, Tensor], header: dict[str, Any]) -> No
 
 DAMAGES = [
     "no step", "step of text", "step negative", "elapsed nan", "other data", "other names", "missing parameter", "parameter shape",
-    "parameter type", "parameter nan", "rows differ", "scalar means", "missing moment", "moment shape", "moment type", "age shape", "order range",
-    "no generator", "short generator", "population shape",
+    "parameter type", "parameter nan", "rows differ", "scalar means", "missing moment", "moment shape", "moment type", "age shape", "age negative",
+    "age beyond the steps", "order range", "no generator", "short generator", "population shape",
 ]  # fmt: skip
 
 

@@ -173,6 +173,27 @@ def test_it_does_not_depend_on_the_number_of_threads() -> None:
         assert all(torch.equal(value, grads[name]) for name, value in made[0].items())
 
 
+def test_parameters_in_float32_lose_nothing_on_the_way() -> None:
+    """Turned needles, whose axes are a thousand apart: what is found of float32 parameters is right to the last rounding."""
+    model = static(2, 2)
+    generator = torch.Generator().manual_seed(6)
+    with torch.no_grad():
+        model.params["log_scales"][:] = torch.tensor([-0.5, -7.4, -7.4]) + 0.1 * torch.randn(40, 3, generator=generator)
+        model.params["b2"] += 3
+        axes = model.geometry.rotations * model.geometry.scales[:, None, :]
+        inside = 0.5 * torch.rand(20, 40, 3, generator=generator, dtype=torch.float64) - 0.25
+    narrow = Primitives(model.density, model.colour, {n: v.detach().float().requires_grad_() for n, v in model.params.items()})
+    exact = wide(Primitives(model.density, model.colour, {n: v.detach() for n, v in narrow.params.items()}))
+    x = (exact.params["means"].detach() + torch.einsum("nij,pnj->pni", axes, inside)).reshape(-1, 3)
+    found, (sigma, source) = values_at(narrow, {}, x), oracle(exact, {}, x)
+    assert found.source is not None and found.sigma.dtype == torch.float32
+    assert torch.allclose(found.sigma.double(), sigma, rtol=1e-6, atol=1e-6 * float(sigma.detach().max()))
+    fast, slow = gradients(narrow, found.sigma.double(), found.source.double()), gradients(exact, sigma, source)
+    for name, wanted in slow.items():
+        assert fast[name].dtype == torch.float32
+        assert torch.allclose(fast[name].double(), wanted, rtol=1e-5, atol=2e-6 * float(wanted.abs().max())), name
+
+
 def test_pairs_are_all_and_once() -> None:
     model, x = static(0, 0), cloud()
     point, prim = pairs_of(model.geometry, x.numpy())
@@ -192,6 +213,9 @@ def test_cells_hold_every_point() -> None:
     )
     away = x[cells.order] - corner
     assert (away >= -1e-12).all() and (away <= cells.step * (1 + 1e-12)).all()
+    assert (cells.placed == x[cells.order]).all()
+    inner = np.repeat(np.arange(cells.counts.prod()), np.diff(cells.starts))
+    assert (np.diff(cells.order)[np.diff(inner) == 0] > 0).all(), "in a cell they keep their order"
 
 
 def test_what_is_not_finite_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

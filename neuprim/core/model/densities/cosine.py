@@ -109,8 +109,9 @@ def amplified(w2: Tensor, b2: Tensor, log_gain: Tensor | None) -> tuple[Tensor, 
     """(w2, b2) (N, K) and (N, 1) times the gain exp(log_gain), (N, 1) or (N,), so that no renderer needs to know of it."""
     if log_gain is None:
         return w2, b2
-    g = log_gain.reshape(-1, 1).clamp(-GAIN_LIMIT, GAIN_LIMIT).exp()
-    return w2 * g, b2.reshape(-1, 1) * g
+    from neuprim.core.model.densities.gain_cpu import fused_gain  # numba, loaded when first needed
+
+    return fused_gain(w2, b2.reshape(-1, 1), log_gain.reshape(-1, 1), GAIN_LIMIT)
 
 
 _FAINT, _SOLID = 0.02, 0.98

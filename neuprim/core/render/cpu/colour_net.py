@@ -13,8 +13,9 @@ import numpy as np
 
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.threads import parallel_for
+from neuprim.core.model.rotation import rotation, rotation_backward
 from neuprim.core.render.cpu import layout as L
-from neuprim.core.render.cpu.prepare import FLOAT64_TURNS, rotation, rotation_backward
+from neuprim.core.render.cpu.prepare import FLOAT64_TURNS
 
 __all__ = ["Net", "net_backward", "net_rows", "prepare_net"]
 

@@ -1,0 +1,79 @@
+"""What a frame's time does to primitives that live and move, with its gradient, fused per primitive."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.model.densities.gain_cpu import scale_backward
+
+__all__ = ["fused_move", "fused_window"]
+
+
+class _Window(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        tau = log_window.exp()
+        u = (xi.to(b2) - center) / tau
+        inner = (1 - u.square()).clamp_min(0)
+        weight = inner.square()
+        ctx.save_for_backward(w2, b2, tau, u, inner, weight)
+        return w2 * weight, b2 * weight
+
+    @staticmethod
+    def backward(ctx: Any, p_w2: Tensor, p_b2: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+        w2, b2, tau, u, inner, weight = ctx.saved_tensors
+        g_w2, g_b2, pulled = (torch.empty(x.shape, dtype=x.dtype) for x in (w2, b2, weight))
+        given = (x.detach().contiguous().numpy() for x in (w2, b2, weight, p_w2, p_b2))
+        scale_backward(*given, g_w2.numpy(), g_b2.numpy(), pulled.numpy())
+        g_u = pulled.mul_(inner).mul_(u).mul_(-4.0)
+        return g_w2, g_b2, -g_u / tau, -g_u * u, None
+
+
+def fused_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor) -> tuple[Tensor, Tensor]:
+    """(w2, b2) (N, K) and (N, 1) times (1 - u^2)^2, u = (xi - center)/exp(log_window), 0 beyond |u| = 1.
+
+    ``center`` and ``log_window`` are (N, 1), all of one dtype on the CPU; no gradient for the time ``xi`` ().
+    """
+    result: tuple[Tensor, Tensor] = _Window.apply(w2, b2, center, log_window, xi)
+    return result
+
+
+@exact_kernel
+def _move_backward(velocity, acceleration, since, pulled, g_velocity, g_acceleration, g_center):  # type: ignore[no-untyped-def]
+    for n in range(since.shape[0]):
+        total = 0.0
+        for j in range(3):
+            g_velocity[n, j] = pulled[n, j] * since[n, 0]
+            g_acceleration[n, j] = g_velocity[n, j] * since[n, 0]
+            total += np.float64(pulled[n, j]) * (velocity[n, j] + 2.0 * acceleration[n, j] * since[n, 0])
+        g_center[n, 0] = -total
+
+
+class _Move(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, velocity: Tensor, acceleration: Tensor, center: Tensor, xi: Tensor) -> Tensor:  # type: ignore[override]
+        since = xi.to(velocity) - center
+        ctx.save_for_backward(velocity, acceleration, since)
+        return means + (velocity + acceleration * since) * since
+
+    @staticmethod
+    def backward(ctx: Any, pulled: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+        velocity, acceleration, since = ctx.saved_tensors
+        made = [torch.empty(x.shape, dtype=x.dtype) for x in (velocity, acceleration, since)]
+        given = (x.detach().contiguous().numpy() for x in (velocity, acceleration, since, pulled))
+        _move_backward(*given, *(x.numpy() for x in made))
+        return pulled, *made, None
+
+
+def fused_move(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Tensor, xi: Tensor) -> Tensor:
+    """(N, 3) means + velocity (xi - center) + acceleration (xi - center)^2.
+
+    ``velocity`` and ``acceleration`` are (N, 3), ``center`` (N, 1), all of one dtype on the CPU; no gradient for the time ``xi`` ().
+    """
+    moved: Tensor = _Move.apply(means, velocity, acceleration, center, xi)
+    return moved

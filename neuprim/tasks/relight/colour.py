@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
@@ -97,15 +96,7 @@ class LightNetwork(ColourField):
         return Shading(pixels=visible) if self.visibility == "pixel" else Shading(primitives=visible(geometry.means))
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> RayNet:
-        """Fused where only parameters want a gradient, and they are float32 on the CPU."""
         means = geometry.means
-        around = (camera.position, conditions["light"], conditions["light_intensity"])
-        tensors = (means, *(params[name] for name in _FUSED))
-        if all(x.dtype == torch.float32 and x.is_cpu for x in tensors) and not any(x.requires_grad for x in around):
-            from neuprim.tasks.relight.colour_cpu import fused_network  # numba, loaded when first needed
-
-            strength = around[2].double().expand(self.channels) / self.typical
-            return RayNet(*fused_network(*around[:2], strength, self.falloff, self.form == "multiplicative", self.boost, *tensors))
         view = unit(means - camera.position.to(means))
         to_light = conditions["light"].to(means) - means
         strength = conditions["light_intensity"].to(means).expand(self.channels) / self.typical
@@ -128,8 +119,6 @@ class LightNetwork(ColourField):
         phase = params["net_phase"].double() + (net_x * shift[:, None]).sum(-1)
         return {**params, "net_x": (net_x * r[:, None, None]).to(params["net_x"]), "net_phase": phase.to(params["net_phase"])}
 
-
-_FUSED = ("c_dc", "net_x", "net_view", "net_light", "net_phase", "net_out")
 
 _DARKEST = 1e-3
 """Initial colours start at least this far above zero: at zero and below, max(0, .) passes no gradient and black stays black."""

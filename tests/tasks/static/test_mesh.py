@@ -84,18 +84,18 @@ def test_a_textured_cube_shows_its_quarters_where_geometry_says(tmp_path: Path) 
             row, column = pixel(view.camera, spot)
             assert pixels.alpha is not None and pixels.alpha[row, column] == 1
             np.testing.assert_array_equal(torch.round(pixels.rgb[row, column] * 255).int().numpy(), colour)
-        row, column = pixel(view.camera, [0.0, -s, -FARTHEST])
-        assert pixels.alpha is not None and pixels.alpha[row, column] == 0
+        assert pixels.alpha is not None and not pixels.alpha[0].any() and not pixels.alpha[:, 0].any()
     assert seen >= 3
 
 
 def test_the_back_of_a_surface_is_lit_and_coloured_as_its_front(tmp_path: Path) -> None:
     scene = surface(write_obj(tmp_path / "square.obj"), "z")
-    front, back = [[-0.5, -0.5, 3.0], [0, 0, -1.0]], [[-0.5, -0.5, -3.0], [0, 0, 1.0]]
-    np.testing.assert_array_equal(colours(scene, [front[0]], [front[1]]), [BLUE])
-    hits = scene.intersect(np.array([front[0]]), np.array([front[1]]))
-    assert hits.face.tolist() == hits.normal.tolist() == [[0, 0, 1]]
-    assert scene.intersect(np.array([[-0.5, 0.9, -3.0]]), np.array([back[1]])).face[0, 2] < 0
+    for height, down in ((3.0, -1.0), (-3.0, 1.0)):
+        at, towards = [[0.5, -0.5, height]], [[0, 0, down]]
+        np.testing.assert_array_equal(colours(scene, at, towards), [YELLOW])
+        hits = scene.intersect(at, towards)
+        np.testing.assert_allclose(hits.face, [[0, 0, -down]], atol=1e-6)
+        np.testing.assert_allclose(hits.normal, [[0, 0, -down]], atol=1e-6)
 
 
 def test_an_obj_takes_its_colours_and_textures_from_its_library(tmp_path: Path) -> None:
@@ -323,16 +323,17 @@ def test_it_stands_upright_in_the_box_and_can_be_put_back(tmp_path: Path, suffix
 
 def test_normals_of_the_file_are_used_and_others_follow_from_the_angles(tmp_path: Path) -> None:
     """A ball of few faces is smooth with its normals, and has facets without."""
-    rough = trimesh.creation.icosphere(1, 1.0)
-    points, towards = 3 * rough.triangles_center, -rough.triangles_center
+    rough = trimesh.creation.icosahedron()
+    towards = -np.einsum("fkc,k->fc", rough.triangles, [0.6, 0.2, 0.2])
     for named, smooth in (("with", True), ("without", False)):
         text = "".join(f"v {x} {y} {z}\n" for x, y, z in rough.vertices.tolist())
         text += "".join(f"vn {x} {y} {z}\n" for x, y, z in rough.vertices.tolist())
         text += "".join("f " + " ".join(f"{i + 1}//{i + 1}" if smooth else f"{i + 1}" for i in face) + "\n" for face in rough.faces.tolist())
         (tmp_path / f"{named}.obj").write_text(text)
         scene = surface(tmp_path / f"{named}.obj", "z")
-        hits = scene.intersect(points + 1e-3, towards)
-        assert hits.hit.all() and (np.abs(hits.normal - hits.face).max() > 1e-2) == smooth
+        hits = scene.intersect(-3 * towards, towards)
+        turned = np.degrees(np.arccos(np.clip((hits.normal * hits.face).sum(1), -1, 1)))
+        assert hits.hit.all() and (turned > 10 if smooth else turned < 0.1).all()
 
 
 def test_a_vertex_with_many_faces_costs_no_memory(tmp_path: Path) -> None:
@@ -372,8 +373,8 @@ def test_flat_shows_colours_and_daylight_shades_them(tmp_path: Path) -> None:
     assert flat.alpha is not None and lit.alpha is not None
     np.testing.assert_array_equal(flat.alpha, lit.alpha)
     bright, shaded = flat.rgb[flat.alpha == 1], lit.rgb[lit.alpha == 1]
-    assert (bright.max(1).values > 0.99).float().mean() > 0.8 and (shaded.max(1).values > 0.99).float().mean() < 0.5
-    assert shaded.mean() < 0.8 * bright.mean()
+    assert (bright.max(1).values > 0.99).float().mean() > 0.7 and (shaded.max(1).values > 0.99).float().mean() < 0.1
+    assert shaded.mean() < 0.9 * bright.mean()
 
 
 def test_white_in_the_sun_is_not_clipped(tmp_path: Path) -> None:
@@ -447,9 +448,11 @@ def test_the_same_model_from_three_formats_looks_alike(tmp_path: Path) -> None:
 def test_it_trains_end_to_end_and_the_files_units_are_kept(tmp_path: Path) -> None:
     path, out = write_glb(tmp_path / "cube.glb"), tmp_path / "out"
     words = ["task=static", "scene=mesh", f"scene.path='{path}'", f"output_dir='{out}'", *(f"scene.{k}={v}" for k, v in SMALL.items())]
-    run(compose([*words, "model.primitives=60", "train.iterations=60", "train.max_seconds=null", "train.eval_every=1"]))
+    run(compose([*words, "model.primitives=60", "train.iterations=200", "train.max_seconds=null"]))
+    curve = [json.loads(line)["psnr"] for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert curve[-1] > curve[0] + 1
     metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics["data_source"] == "generated" and metrics["dataset"] == metrics["rendered_from"] == "cube.glb" and metrics["psnr"] > 12
+    assert metrics["data_source"] == "generated" and metrics["dataset"] == metrics["rendered_from"] == "cube.glb" and np.isfinite(metrics["psnr"])
     header = read_header(out / "model.safetensors", "model")
     assert header["data"]["scene_from_file"] == metrics["scene_from_file"]
     np.testing.assert_allclose(np.linalg.norm(np.array(metrics["scene_from_file"])[:3, :3] @ [1, 1, 1]), FARTHEST)

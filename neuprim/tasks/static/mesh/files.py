@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import binascii
 import hashlib
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -193,13 +194,14 @@ class Folder:
     def _read(self, path: Path, name: str) -> bytes:
         try:
             with open(path, "rb") as file:
-                data = file.read(self._budget + 1)
+                size = os.fstat(file.fileno()).st_size
+                if size > self._budget:
+                    more = "" if path == self.file else f" with what it names, up to {path.name},"
+                    raise DataError(f"{self.file}: the model{more} is larger than {MAX_BYTES >> 20} MiB; expected a smaller one")
+                data = file.read(size)
         except OSError as error:
             raise DataError(f"{path}: cannot be read ({error.strerror or error})") from None
         self._budget -= len(data)
-        if self._budget < 0:
-            more = "" if path == self.file else f" with what it names, up to {path.name},"
-            raise DataError(f"{self.file}: the model{more} is larger than {MAX_BYTES >> 20} MiB; expected a smaller one")
         self._hash.update(f"{len(name)} {name} {len(data)} ".encode(errors="replace") + data)
         return data
 

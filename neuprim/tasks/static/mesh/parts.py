@@ -111,6 +111,8 @@ def _part(model: Model, matrix: NDArray[np.float64], mesh: trimesh.Trimesh) -> I
     vertices, faces = mesh.vertices.view(np.ndarray), mesh.faces.view(np.ndarray)
     if not len(faces):
         return
+    if vertices.shape[1] != 3 or faces.shape[1] != 3:
+        raise DataError(f"{model.path}: vertices of {vertices.shape[1]} numbers, faces of {faces.shape[1]}; expected 3 of each")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise DataError(f"{model.path}: a face has the vertex {faces.max() if faces.min() >= 0 else faces.min()} of {len(vertices)}")
     with np.errstate(all="ignore"):

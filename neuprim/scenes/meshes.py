@@ -137,5 +137,7 @@ def corner_normals(mesh: trimesh.Trimesh, crease: float = CREASE_DEGREES) -> NDA
         blend = sparse.csr_matrix((angles[pairs.col] * smooth, (pairs.row, other)), shape=(pairs.shape[0], len(faces)))
         normals[begin : begin + CORNERS_AT_ONCE] = blend @ flat
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.where(length > 0, normals / np.where(length > 0, length, 1.0), np.repeat(flat, 3, axis=0))  # of needles, which have no angle
+    normals = np.where(
+        length > 0, normals / np.where(length > 0, length, 1.0), np.repeat(flat, 3, axis=0)
+    )  # of needles, which have no angle
     return normals.reshape(-1, 3, 3)

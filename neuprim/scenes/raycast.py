@@ -81,7 +81,9 @@ class Scene:
             np.int32
         )
         self._face_normals = np.concatenate([mesh.face_normals.view(np.ndarray) for mesh in meshes]).astype(np.float32)
-        self._corner_normals = np.concatenate([corner_normals(s.mesh) if s.normals is None else s.normals for s in self.solids]).astype(np.float32)
+        self._corner_normals = np.concatenate([corner_normals(s.mesh) if s.normals is None else s.normals for s in self.solids]).astype(
+            np.float32
+        )
         self._owner = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
         self._gloss = np.array([solid.gloss for solid in self.solids], dtype=np.float32)
         self._specular = np.array([solid.specular for solid in self.solids], dtype=np.float32)

@@ -328,7 +328,9 @@ def test_normals_of_the_file_are_used_and_others_follow_from_the_angles(tmp_path
     for named, smooth in (("with", True), ("without", False)):
         text = "".join(f"v {x} {y} {z}\n" for x, y, z in rough.vertices.tolist())
         text += "".join(f"vn {x} {y} {z}\n" for x, y, z in rough.vertices.tolist())
-        text += "".join("f " + " ".join(f"{i + 1}//{i + 1}" if smooth else f"{i + 1}" for i in face) + "\n" for face in rough.faces.tolist())
+        text += "".join(
+            "f " + " ".join(f"{i + 1}//{i + 1}" if smooth else f"{i + 1}" for i in face) + "\n" for face in rough.faces.tolist()
+        )
         (tmp_path / f"{named}.obj").write_text(text)
         scene = surface(tmp_path / f"{named}.obj", "z")
         hits = scene.intersect(-3 * towards, towards)
@@ -452,7 +454,11 @@ def test_it_trains_end_to_end_and_the_files_units_are_kept(tmp_path: Path) -> No
     curve = [json.loads(line)["psnr"] for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert curve[-1] > curve[0] + 1
     metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics["data_source"] == "generated" and metrics["dataset"] == metrics["rendered_from"] == "cube.glb" and np.isfinite(metrics["psnr"])
+    assert (
+        metrics["data_source"] == "generated"
+        and metrics["dataset"] == metrics["rendered_from"] == "cube.glb"
+        and np.isfinite(metrics["psnr"])
+    )
     header = read_header(out / "model.safetensors", "model")
     assert header["data"]["scene_from_file"] == metrics["scene_from_file"]
     np.testing.assert_allclose(np.linalg.norm(np.array(metrics["scene_from_file"])[:3, :3] @ [1, 1, 1]), FARTHEST)

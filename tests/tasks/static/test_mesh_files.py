@@ -22,7 +22,8 @@ from PIL import Image
 from neuprim.core import notices
 from neuprim.core.errors import DataError
 from neuprim.core.notices import NeuprimWarning
-from neuprim.tasks.static.mesh import files, generate as generator, parts, textures
+from neuprim.tasks.static.mesh import files, parts, textures
+from neuprim.tasks.static.mesh import generate as generator
 from neuprim.tasks.static.mesh.generate import MeshSettings, generate
 from tests.models import cube, gltf, quarters, textured, write_glb, write_gltf, write_obj, write_ply
 
@@ -105,7 +106,9 @@ def test_a_file_that_may_not_be_read(tmp_path: Path) -> None:
 
 
 def test_a_cloud_of_points_is_no_mesh(tmp_path: Path) -> None:
-    assert "has 24 points and no faces; expected a mesh with triangles" in refusal(write_ply(tmp_path / "a.ply", cube()[0], np.zeros((0, 3))))
+    assert "has 24 points and no faces; expected a mesh with triangles" in refusal(
+        write_ply(tmp_path / "a.ply", cube()[0], np.zeros((0, 3)))
+    )
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
     assert "has 3 points and no faces" in refusal(tmp_path / "a.obj")
 
@@ -235,7 +238,9 @@ def test_textures_are_bounded_before_they_are_decoded(tmp_path: Path, monkeypatc
     header = struct.pack(">4sIIBBBBB", b"IHDR", 60_000, 60_000, 8, 2, 0, 0, 0)
     data = zlib.compress(bytes(100))
     chunk = struct.pack(">I4s", len(data), b"IDAT") + data + struct.pack(">I", zlib.crc32(b"IDAT" + data))
-    (tmp_path / "skin.png").write_bytes(b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header)) + chunk)
+    (tmp_path / "skin.png").write_bytes(
+        b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header)) + chunk
+    )
     assert "texture 'skin.png' claims more than 67108864 pixels" in refusal(path)
 
 

@@ -13,12 +13,26 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 from urllib.parse import unquote
 
 from neuprim.core.errors import DataError, nearest
 from neuprim.core.notices import warn_once
 
-__all__ = ["MAX_BYTES", "MAX_FACES", "MAX_PARTS", "MAX_TEXELS", "MAX_VERTICES", "SUFFIXES", "Folder", "Material", "Model", "check_counts", "model_file"]
+__all__ = [
+    "MAX_BYTES",
+    "MAX_FACES",
+    "MAX_PARTS",
+    "MAX_TEXELS",
+    "MAX_VERTICES",
+    "SUFFIXES",
+    "Folder",
+    "Material",
+    "Model",
+    "Up",
+    "check_counts",
+    "model_file",
+]
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 
@@ -35,6 +49,8 @@ MAX_PARTS = 20_000
 
 MAX_TEXELS = 128 * 2**20
 """Pixels of all textures together; one image has at most :data:`neuprim.core.io.images.MAX_PIXELS`."""
+
+Up = Literal["y", "z"]
 
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
 
@@ -80,7 +96,7 @@ class Model:
     parts: dict[str, bytes] = field(default_factory=dict)
     materials: dict[str, Material] = field(default_factory=dict)
     images: dict[str, bytes] = field(default_factory=dict)
-    upward: str = "z"
+    upward: Up = "z"
     linear: bool = False
     digest: str = ""
 

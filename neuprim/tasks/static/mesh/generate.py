@@ -22,7 +22,7 @@ from neuprim.core.task import SceneContext
 from neuprim.scenes.image_set import Progress
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.settings import settings_key
-from neuprim.tasks.static.mesh.files import Folder, Model, model_file
+from neuprim.tasks.static.mesh.files import Folder, Model, Up, model_file
 from neuprim.tasks.static.mesh.gltf import read_gltf
 from neuprim.tasks.static.mesh.obj import read_obj
 from neuprim.tasks.static.mesh.parts import read_parts
@@ -96,7 +96,7 @@ def generate(settings: MeshSettings, cache_dir: Path, progress: Progress = lambd
     path = model_file(settings.path)
     progress(f"mesh: reading {path.name}", 0.0)
     model = _READERS[path.suffix.lower()](Folder(path, settings.skip_missing))
-    upward = model.upward if settings.up == "auto" else settings.up
+    upward: Up = model.upward if settings.up == "auto" else settings.up
     key = settings_key(replace(settings, path=Path(f"{path.name} {model.digest}"), up=upward), GENERATOR_VERSION)
     spacing = 2 * math.tan(FIELD_OF_VIEW / 2) / (settings.size * settings.supersampling)
 
@@ -110,9 +110,7 @@ def generate(settings: MeshSettings, cache_dir: Path, progress: Progress = lambd
     return image_set("mesh", key, settings, build, seen, facts).generate(cache_dir, progress)
 
 
-def _colours(
-    scene: Scene, origins: NDArray[np.float64], directions: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _colours(scene: Scene, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """What N rays see without any light: (N, 3) linear RGB, zero where nothing is hit, and (N,) bool of hits."""
     hits = scene.intersect(origins, directions)
     image = np.zeros(directions.shape, dtype=np.float32)

@@ -81,7 +81,9 @@ class _Document:
         needed = set(document.get("extensionsRequired", [])) - _READ
         unread = sorted(name for name in needed if not name.startswith("KHR_materials_"))
         if unread:
-            raise DataError(f"{self.path}: needs the glTF extension {unread[0]}, which is not read; expected a plain export, not compressed")
+            raise DataError(
+                f"{self.path}: needs the glTF extension {unread[0]}, which is not read; expected a plain export, not compressed"
+            )
         self.buffers = [self._buffer(i, entry, binary) for i, entry in enumerate(document.get("buffers", []))]
         self.images: dict[str, bytes] = {}
         self.arrays: list[bytes] = []
@@ -183,14 +185,21 @@ class _Document:
             if mode not in _TRIANGLES:
                 raise ValueError(f"a primitive of mode {mode}")
             if "KHR_draco_mesh_compression" in primitive.get("extensions", {}):
-                raise DataError(f"{self.path}: needs the glTF extension KHR_draco_mesh_compression, which is not read; expected a plain export")
+                raise DataError(
+                    f"{self.path}: needs the glTF extension KHR_draco_mesh_compression, which is not read; expected a plain export"
+                )
             found.append(self._primitive(primitive, attributes, mode, materials, order))
             self.primitives += 1
             check_counts(self.folder, {"parts": (self.primitives, MAX_PARTS)})
         return found
 
     def _primitive(
-        self, primitive: Mapping[str, Any], attributes: Mapping[str, int], mode: int, materials: Mapping[str, Material], order: Mapping[str, int]
+        self,
+        primitive: Mapping[str, Any],
+        attributes: Mapping[str, int],
+        mode: int,
+        materials: Mapping[str, Material],
+        order: Mapping[str, int],
     ) -> dict[str, Any]:
         positions = self._array(attributes["POSITION"], ["VEC3"])
         flat = self._array(primitive["indices"], ["SCALAR"])[:, 0] if "indices" in primitive else np.arange(len(positions))
@@ -246,7 +255,7 @@ class _Document:
             level, depth = [child for node in level for child in below[node]], depth + 1
         nodes = []
         for i, node in enumerate(given):
-            plain = {k: [_finite(x) for x in node[k]] for k in ("matrix", "translation", "rotation", "scale") if k in node}
+            plain: dict[str, Any] = {k: [_finite(x) for x in node[k]] for k in ("matrix", "translation", "rotation", "scale") if k in node}
             if [len(plain[k]) for k in plain] != [{"matrix": 16, "rotation": 4}.get(k, 3) for k in plain]:
                 raise ValueError(f"nodes[{i}] has a transform of another length")
             plain |= {"name": f"node {i}", "children": below[i]}
@@ -268,8 +277,8 @@ class _Document:
         texture = self.document["textures"][_index(base["baseColorTexture"]["index"])]
         source = texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source")
         name = None if source is None else self._image(_index(source))
-        sampler = self.document["samplers"][_index(texture["sampler"])] if "sampler" in texture else {}
-        wrap = _WRAPS.get(sampler.get("wrapS"), "repeat"), _WRAPS.get(sampler.get("wrapT"), "repeat")
+        sampler: Mapping[str, int] = self.document["samplers"][_index(texture["sampler"])] if "sampler" in texture else {}
+        wrap = _WRAPS.get(sampler.get("wrapS", 0), "repeat"), _WRAPS.get(sampler.get("wrapT", 0), "repeat")
         moved = base["baseColorTexture"].get("extensions", {}).get("KHR_texture_transform")
         return Material(colour, name, wrap, None if moved is None else _moved(moved), cutoff)
 

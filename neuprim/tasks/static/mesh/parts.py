@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -74,26 +75,29 @@ def read_parts(model: Model) -> list[Part]:
     Raises:
         DataError: geometry that trimesh cannot read, no triangles, too many, vertices that are no finite numbers, or faces without them.
     """
+    level = trimesh.util.log.level
     try:
+        trimesh.util.log.setLevel(logging.CRITICAL + 1)  # it tells tracebacks of what it works around
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            scene = trimesh.load(
-                io.BytesIO(model.data), file_type=model.kind, resolver=_Parts(model.parts), force="scene", process=False, validate=False
-            )
+            data, parts = io.BytesIO(model.data), _Parts(model.parts)
+            scene: Any = trimesh.load(data, file_type=model.kind, resolver=parts, force="scene", process=False, validate=False)
     except MemoryError:
         raise
     except Exception as error:  # trimesh's readers raise whatever their arrays do
-        said = " ".join(str(error).split())[:120]
-        raise DataError(f"{model.path}: cannot be read as {model.kind.upper()} ({type(error).__name__}: {said}); expected a complete file") from None
+        said = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
+        raise DataError(f"{model.path}: cannot be read as {model.kind.upper()} ({said}); expected a complete file") from None
+    finally:
+        trimesh.util.log.setLevel(level)
     placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
     used = [(np.asarray(matrix, np.float64), scene.geometry[name]) for matrix, name in placed]
     meshes = [(matrix, mesh) for matrix, mesh in used if isinstance(mesh, trimesh.Trimesh)]
     _check(model, [mesh for _, mesh in used], [mesh for _, mesh in meshes])
-    parts = [part for matrix, mesh in meshes for part in _part(model, matrix, mesh)]
-    bare = sum(len(part.colour) for part in parts if part.bare)
+    found = [part for matrix, mesh in meshes for part in _part(model, matrix, mesh)]
+    bare = sum(len(part.colour) for part in found if part.bare)
     if bare:
-        warn_once(f"{model.path}: {bare} of {sum(len(part.colour) for part in parts)} faces have no colour; drawn grey")
-    return parts
+        warn_once(f"{model.path}: {bare} of {sum(len(part.colour) for part in found)} faces have no colour; drawn grey")
+    return found
 
 
 def _check(model: Model, everything: list[Any], meshes: list[trimesh.Trimesh]) -> None:
@@ -152,7 +156,7 @@ def _coordinates(model: Model, mesh: trimesh.Trimesh, material: Material) -> NDA
 
 def _own_colours(mesh: trimesh.Trimesh) -> NDArray[np.float32] | None:
     """(V, 3) of the vertices or (F, 3, 3) of the faces, 0..1; None where there are none."""
-    visual = mesh.visual
+    visual: Any = mesh.visual
     found = getattr(visual, "vertex_attributes", {}).get("color") if visual.kind == "texture" else None
     if found is None and visual.kind == "texture":
         found = mesh.vertex_attributes.get("color")
@@ -160,7 +164,7 @@ def _own_colours(mesh: trimesh.Trimesh) -> NDArray[np.float32] | None:
         found = visual.vertex_colors
     elif visual.kind == "face":
         found = visual.face_colors
-    if found is None or np.ndim(found) != 2 or len(found) not in (len(mesh.vertices), len(mesh.faces)):
+    if found is None or np.ndim(found) != 2 or len(found) != len(mesh.faces if visual.kind == "face" else mesh.vertices):
         return None
     values = np.asarray(found)[:, :3]
     scale = 1.0 if values.dtype.kind == "f" else 1.0 / np.iinfo(values.dtype).max

@@ -15,7 +15,7 @@ from neuprim.scenes.meshes import corner_normals
 from neuprim.scenes.raycast import LIFT, Engine, Hits, Scene
 from neuprim.scenes.reflectance import dot
 from neuprim.scenes.shapes import Solid, plain
-from neuprim.tasks.static.mesh.files import MAX_TEXELS, Model
+from neuprim.tasks.static.mesh.files import MAX_TEXELS, Model, Up
 from neuprim.tasks.static.mesh.parts import Part
 from neuprim.tasks.static.mesh.textures import Texture, decode
 
@@ -39,7 +39,7 @@ _MOST_AROUND = 64
 _Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
-def scene_from_file(parts: Sequence[Part], upward: str) -> NDArray[np.float64] | None:
+def scene_from_file(parts: Sequence[Part], upward: Up) -> NDArray[np.float64] | None:
     """(4, 4) that turns z up, centres the box and scales it into [-1, 1]^3, and into view; None for what has no size.
 
     Args:
@@ -75,7 +75,7 @@ class Surface(Scene):
         DataError: a model without size, or a texture that cannot be decoded.
     """
 
-    def __init__(self, model: Model, parts: Sequence[Part], upward: str, spacing: float, engine: Engine = "auto") -> None:
+    def __init__(self, model: Model, parts: Sequence[Part], upward: Up, spacing: float, engine: Engine = "auto") -> None:
         matrix = scene_from_file(parts, upward)
         if matrix is None:
             raise DataError(f"{model.path}: the mesh is a point, or too large for numbers; expected a size from 1e-150 to 1e150")

@@ -82,7 +82,7 @@ TASK = TaskSpec(
     config_package="neuprim.tasks.static.conf",
     scenes=(
         SceneSpec("solids", "built in: sharp edges, thin rods, a curved handle; generated in seconds", _solids),
-        SceneSpec("mesh", "your own model, ray-cast: .glb, .gltf, .obj, .ply or .stl (scene.path)", _mesh),
+        SceneSpec("mesh", "your own model, ray-cast: a .glb, .gltf, .obj, .ply or .stl: scene.path=FILE", _mesh),
         SceneSpec("blender", "NeRF-synthetic layout: transforms_train.json, RGBA images", _blender),
         SceneSpec("nerfstudio", "instant-ngp / nerfstudio transforms.json", _nerfstudio),
         SceneSpec("colmap", "COLMAP sparse/0 and images (needs neuprim[colmap])", _colmap),

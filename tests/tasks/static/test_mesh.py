@@ -462,7 +462,7 @@ def test_it_trains_end_to_end_and_the_files_units_are_kept(tmp_path: Path) -> No
     header = read_header(out / "model.safetensors", "model")
     assert header["data"]["scene_from_file"] == metrics["scene_from_file"]
     np.testing.assert_allclose(np.linalg.norm(np.array(metrics["scene_from_file"])[:3, :3] @ [1, 1, 1]), FARTHEST)
-    assert "cube.glb" in (out / "report.html").read_text()
+    assert "<strong>generated data</strong> <span>rendered from cube.glb, not photographs</span>" in (out / "report.html").read_text()
 
 
 # What it shares ------------------------------------------------------------------------------------------------------------------------

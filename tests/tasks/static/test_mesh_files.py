@@ -372,6 +372,13 @@ def test_damaged_documents(tmp_path: Path, changes: dict[str, Any], text: str) -
     assert text in refusal(write_gltf(tmp_path / "a.gltf", **changes))
 
 
+def test_textures_of_formats_for_graphics_cards(tmp_path: Path) -> None:
+    texture = {"extensions": {"KHR_texture_basisu": {"source": 0}}}
+    material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+    path = write_gltf(tmp_path / "a.gltf", textures=[texture], materials=[material])
+    assert "a texture has KHR_texture_basisu, which is not read" in refusal(path)
+
+
 def test_an_index_beyond_the_vertices(tmp_path: Path) -> None:
     path = write_gltf(tmp_path / "a.gltf")
     (tmp_path / "triangle.bin").write_bytes(gltf()[1][:36] + struct.pack("<4H", 0, 1, 3, 0))

@@ -26,7 +26,7 @@ _GLB, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _WRAPS = {33071: "clamp", 33648: "mirror"}
-_READ = {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"}
+_READ = {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp", "KHR_lights_punctual"}
 _POINTS_AND_LINES, _TRIANGLES, _FAN = (0, 1, 2, 3), (4, 5, 6), 6
 _MAX_DEPTH = 200
 _WHITE = (1.0, 1.0, 1.0)
@@ -276,7 +276,10 @@ class _Document:
             return Material(colour)
         texture = self.document["textures"][_index(base["baseColorTexture"]["index"])]
         source = texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source")
-        name = None if source is None else self._image(_index(source))
+        if source is None:
+            found = ", ".join(texture.get("extensions", {})) or "no image"
+            raise DataError(f"{self.path}: a texture has {found[:60]}, which is not read; expected PNG, JPEG or WebP")
+        name = self._image(_index(source))
         sampler: Mapping[str, int] = self.document["samplers"][_index(texture["sampler"])] if "sampler" in texture else {}
         wrap = _WRAPS.get(sampler.get("wrapS", 0), "repeat"), _WRAPS.get(sampler.get("wrapT", 0), "repeat")
         moved = base["baseColorTexture"].get("extensions", {}).get("KHR_texture_transform")

@@ -106,6 +106,15 @@ def test_an_obj_takes_its_colours_and_textures_from_its_library(tmp_path: Path) 
     np.testing.assert_array_equal(colours(scene, [[-0.6, 0.1, -3]], [[0, 0, 1.0]]), [(255, 128, 0)])
 
 
+def test_colours_of_an_objs_vertices_stand_in_the_place_of_its_materials(tmp_path: Path) -> None:
+    """As MeshLab writes them, beside a material of some grey."""
+    (tmp_path / "m.mtl").write_text("newmtl m\nKd 0.3 0.3 0.3\n")
+    corners = "v -1 -1 0 1 0 0\nv 1 -1 0 1 0 0\nv 1 1 0 0 0 1\nv -1 1 0 0 0 1\n"
+    (tmp_path / "m.obj").write_text(f"mtllib m.mtl\n{corners}usemtl m\nf 1 2 3\nf 1 3 4\n")
+    found = colours(surface(tmp_path / "m.obj", "z"), [[0.9, -0.899, 3], [-0.85, 0.9, 3]], [[0, 0, -1.0]] * 2)
+    assert found[0, 0] > 240 and found[0, 2] < 80 and found[1, 2] > 240 and found[1, 0] < 80
+
+
 @pytest.mark.parametrize(
     ("line", "name"),
     [

@@ -345,6 +345,26 @@ def test_images_of_formats_that_run_programs_are_not_opened(tmp_path: Path) -> N
     assert "cannot be decoded" in refusal(path, skip_missing=True)  # what is there is damaged, not missing
 
 
+def test_colours_that_are_no_numbers(tmp_path: Path) -> None:
+    path = write_obj(tmp_path / "a.obj")
+    for colour in ("nan 0 0", "1 inf 0", "red 0 0"):
+        path.with_suffix(".mtl").write_text(f"newmtl skin\nKd {colour}\n")
+        assert f"material 'skin' has the colour '{colour}'; expected three numbers" in refusal(path)
+
+
+def test_names_of_materials_in_other_encodings(tmp_path: Path) -> None:
+    path = write_obj(tmp_path / "a.obj")
+    for file in (path, path.with_suffix(".mtl")):
+        file.write_bytes(file.read_bytes().replace(b"back", "weiß".encode("latin-1")).replace(b"skin\n", "größe\n".encode("latin-1")))
+    assert notes(path) == []
+
+
+def test_texture_coordinates_beyond_all_measure(tmp_path: Path) -> None:
+    path = write_obj(tmp_path / "a.obj")
+    path.write_text(path.read_text().replace("vt 0 0", "vt 1e300 nan").replace("vt 1 1", "vt -1e20 inf"))
+    assert notes(path) == []
+
+
 # glTF ----------------------------------------------------------------------------------------------------------------------------------
 
 

@@ -31,7 +31,7 @@ def read_obj(folder: Folder) -> Model:
     Raises:
         DataError: too large, or with references that lead nowhere.
     """
-    data = folder.own()
+    data = folder.own().decode("utf-8", "replace").encode()  # names of materials are compared with the library's, decoded alike
     found = {"vertices": (data.count(b"\nv "), MAX_VERTICES), "faces": (data.count(b"\nf "), MAX_FACES)}
     check_counts(folder, {**found, "changes of material": (data.count(b"usemtl "), MAX_PARTS)})
     materials: dict[str, Material] = {}
@@ -84,7 +84,10 @@ def _number(word: str) -> bool:
 
 def _colour(words: list[str], folder: Folder, name: str) -> tuple[float, float, float]:
     try:
-        r, g, b = srgb_to_linear(torch.tensor([float(word) for word in words[:3]]).clamp(0, 1)).tolist()
+        values = torch.tensor([float(word) for word in words[:3]])
+        if not values.isfinite().all():
+            raise ValueError
     except ValueError:
         raise DataError(f"{folder.file}: material {name[:40]!r} has the colour {' '.join(words)[:40]!r}; expected three numbers") from None
+    r, g, b = srgb_to_linear(values.clamp(0, 1)).tolist()
     return r, g, b

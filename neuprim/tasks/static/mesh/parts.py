@@ -25,6 +25,9 @@ __all__ = ["GREY", "Part", "read_parts"]
 GREY = srgb("#b4b4b4")
 """Of what the file says no colour of."""
 
+_FARTHEST_UV = 1e6
+"""Of texture coordinates: single precision has no fraction left there. What is beyond, or no number, is taken for 0."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -151,7 +154,9 @@ def _coordinates(model: Model, mesh: trimesh.Trimesh, material: Material) -> NDA
     if uv is None or np.shape(uv) != (len(mesh.vertices), 2):
         warn_once(f"{model.path}: texture {material.texture[:80]!r} has no coordinates on a part of {len(faces)} faces; drawn without it")
         return None
-    return _moved(np.nan_to_num(np.asarray(uv, np.float32)[faces], nan=0.0, posinf=0.0, neginf=0.0), material)
+    with np.errstate(all="ignore"):
+        moved = _moved(np.asarray(uv, np.float32)[faces], material)
+    return np.where(np.abs(moved) < _FARTHEST_UV, moved, np.float32(0))
 
 
 def _own_colours(mesh: trimesh.Trimesh) -> NDArray[np.float32] | None:

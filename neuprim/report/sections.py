@@ -41,6 +41,9 @@ def heading(run: RunRecord) -> str:
         note = ("data source not recorded", "real, generated or simulated is not known")
     else:
         note = SOURCES.get(str(source), (str(source), "not photographs or captures"))
+        drawn = run.field("rendered_from")
+        if note is not None and drawn is not None:
+            note = note[0], f"rendered from {drawn}, not photographs"
     if note is not None:
         html += f'\n<p class="badge"><strong>{escape(note[0])}</strong> <span>{escape(note[1])}</span></p>'
     return html

@@ -38,6 +38,7 @@ class ImageSet(Generic[V]):
         frame: (split, view) -> its entry in the transforms file.
         files: view -> the names of its files, in the folder of its split.
         draw: (scene, view, paths) writes these files; called from several threads.
+        facts: scene -> what else a transforms file says before its frames.
     """
 
     name: str
@@ -48,7 +49,8 @@ class ImageSet(Generic[V]):
     build: Callable[[], Scene]
     frame: Callable[[str, V], Mapping[str, Any]]
     files: Callable[[V], Sequence[str]]
-    draw: Callable[[Scene, V, Sequence[Path]], None]
+    draw: Callable[[Any, V, Sequence[Path]], None]
+    facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {}
 
     def generate(self, cache_dir: Path, progress: Progress) -> Path:
         """Write the data set unless a complete one is there; returns its folder ``cache_dir/NAME-KEY``.
@@ -69,7 +71,7 @@ class ImageSet(Generic[V]):
             text += " (without embreex, which would be faster)"
         for split, views in self.splits.items():
             (folder / split).mkdir()
-            layout = {**self.lens, "frames": [self.frame(split, view) for view in views]}
+            layout = {**self.lens, **self.facts(scene), "frames": [self.frame(split, view) for view in views]}
             (folder / f"transforms_{split}.json").write_text(json.dumps(layout, indent=1), encoding="utf-8")
 
         def draw(job: tuple[Path, V]) -> None:

@@ -18,6 +18,9 @@ __all__ = ["arc_tube", "ball", "chamfered_box", "corner_normals", "lathe", "merg
 CREASE_DEGREES = 24.0
 """Faces that meet at more than this angle keep their own normals: chamfers and caps stay hard, facets of round parts blend."""
 
+CORNERS_AT_ONCE = 1 << 18
+"""Bounds the memory for pairs of corners."""
+
 
 def chamfered_box(size: ArrayLike, centre: ArrayLike, chamfer: float) -> trimesh.Trimesh:
     """An axis-aligned box of edge lengths ``size`` (3,) about ``centre`` (3,), every edge cut at 45 degrees by ``chamfer``."""
@@ -123,12 +126,18 @@ def corner_normals(mesh: trimesh.Trimesh, crease: float = CREASE_DEGREES) -> NDA
     Faces are weighted by their angle at the vertex, so the result does not depend on how a flat part was cut into triangles.
     """
     faces, flat = mesh.faces.view(np.ndarray), mesh.face_normals.view(np.ndarray)
-    corners = faces.size
+    corners, angles = faces.size, mesh.face_angles.view(np.ndarray).ravel()
     around = sparse.csr_matrix((np.ones(corners), (np.arange(corners), faces.ravel())), shape=(corners, len(mesh.vertices)))
-    pairs = (around @ around.T).tocoo()  # corners that share a vertex
-    own, other = pairs.row // 3, pairs.col // 3
-    smooth = (flat[own] * flat[other]).sum(1) > np.cos(np.radians(crease))
-    weight = mesh.face_angles.view(np.ndarray).ravel()[pairs.col] * smooth
-    blend = sparse.csr_matrix((weight, (pairs.row, other)), shape=(corners, len(faces)))
-    normals = blend @ flat
-    return (normals / np.linalg.norm(normals, axis=1, keepdims=True)).reshape(-1, 3, 3)
+    touching = around.T.tocsr()
+    normals = np.empty((corners, 3))
+    for begin in range(0, corners, CORNERS_AT_ONCE):
+        pairs = (around[begin : begin + CORNERS_AT_ONCE] @ touching).tocoo()  # corners that share a vertex
+        own, other = (begin + pairs.row) // 3, pairs.col // 3
+        smooth = (flat[own] * flat[other]).sum(1) > np.cos(np.radians(crease))
+        blend = sparse.csr_matrix((angles[pairs.col] * smooth, (pairs.row, other)), shape=(pairs.shape[0], len(faces)))
+        normals[begin : begin + CORNERS_AT_ONCE] = blend @ flat
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(
+        length > 0, normals / np.where(length > 0, length, 1.0), np.repeat(flat, 3, axis=0)
+    )  # of needles, which have no angle
+    return normals.reshape(-1, 3, 3)

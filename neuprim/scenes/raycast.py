@@ -40,6 +40,8 @@ class Hits:
         gloss: (M,) float32, 0..1.
         specular: (M,) float32 strength of the highlight.
         solid: (M,) index into the scene's solids.
+        triangle: (M,) index into the faces of all solids.
+        weight: (M, 3) float32 barycentric coordinates in that triangle.
     """
 
     hit: NDArray[np.bool_]
@@ -51,6 +53,8 @@ class Hits:
     gloss: NDArray[np.float32]
     specular: NDArray[np.float32]
     solid: NDArray[np.intp]
+    triangle: NDArray[np.integer]
+    weight: NDArray[np.float32]
 
     def lifted(self) -> NDArray[np.float32]:
         """(M, 3) the positions just off the surface, where a shadow ray starts without meeting its own triangle."""
@@ -77,7 +81,9 @@ class Scene:
             np.int32
         )
         self._face_normals = np.concatenate([mesh.face_normals.view(np.ndarray) for mesh in meshes]).astype(np.float32)
-        self._corner_normals = np.concatenate([corner_normals(mesh) for mesh in meshes]).astype(np.float32)
+        self._corner_normals = np.concatenate([corner_normals(s.mesh) if s.normals is None else s.normals for s in self.solids]).astype(
+            np.float32
+        )
         self._owner = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
         self._gloss = np.array([solid.gloss for solid in self.solids], dtype=np.float32)
         self._specular = np.array([solid.specular for solid in self.solids], dtype=np.float32)
@@ -90,7 +96,7 @@ class Scene:
             origins, directions: (N, 3) in scene units; directions need not have unit length.
         """
         o, d = _rays(origins, directions)
-        triangle, u, v, distance = self._search.first(o, d)
+        triangle, u, v, distance = self._first(o, d)
         hit = triangle >= 0
         rows = np.flatnonzero(hit)
         triangle, distance = triangle[rows], distance[rows]
@@ -103,7 +109,12 @@ class Scene:
         for index in np.unique(owner):
             mine = np.flatnonzero(owner == index)
             albedo[mine] = self.solids[index].albedo(position[mine])
-        return Hits(hit, position, distance, normal, self._face_normals[triangle], albedo, self._gloss[owner], self._specular[owner], owner)
+        face, gloss, specular = self._face_normals[triangle], self._gloss[owner], self._specular[owner]
+        return Hits(hit, position, distance, normal, face, albedo, gloss, specular, owner, triangle, weight)
+
+    def _first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """(N,) each: triangle or -1, the weights u and v of its second and third corner, distance in lengths of ``d`` (N, 3)."""
+        return self._search.first(o, d)
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
         """(N,) whether a surface lies within ``distance`` (in lengths of the direction) of the points (N, 3) along directions (N, 3).

@@ -20,5 +20,5 @@ Supersampling = Annotated[int, Range(1, 16)]
 
 def settings_key(settings: Any, version: int) -> str:
     """A short hash of every field of a settings dataclass and the generator's version."""
-    text = json.dumps({"version": version, **asdict(settings)}, sort_keys=True)
+    text = json.dumps({"version": version, **asdict(settings)}, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

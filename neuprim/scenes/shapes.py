@@ -35,6 +35,7 @@ class Solid:
         albedo: diffuse reflectance as a function of position.
         gloss: 0 (matt) to 1 (polished); see :mod:`neuprim.scenes.reflectance`.
         specular: strength of the highlight of a polished solid.
+        normals: (F, 3, 3) unit normals at the faces' corners; None: what the angles between faces suggest.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Solid:
     albedo: Albedo
     gloss: float
     specular: float = 0.12
+    normals: NDArray[np.float64] | None = None
 
 
 def srgb(code: str) -> NDArray[np.float32]:

@@ -356,7 +356,7 @@ def test_impossible_settings_in_a_file(toy: Path, old: str, new: str, text: str)
 
 
 @pytest.mark.parametrize("preset", ["quick", "paper"])
-@pytest.mark.parametrize("scene", ["solids", "blender", "nerfstudio", "colmap"])
+@pytest.mark.parametrize("scene", ["solids", "mesh", "blender", "nerfstudio", "colmap"])
 def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str, scene: str) -> None:
     monkeypatch.chdir(tmp_path)
     path = [] if scene == "solids" else ["scene.path=data"]
@@ -367,7 +367,7 @@ def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pr
     assert c.train.population.strategy == {"quick": "relocate", "paper": "gradient"}[preset]
 
 
-@pytest.mark.parametrize("scene", ["blender", "nerfstudio", "colmap"])
+@pytest.mark.parametrize("scene", ["mesh", "blender", "nerfstudio", "colmap"])
 def test_static_loaders_know_every_key_of_their_yaml(tmp_path: Path, scene: str) -> None:
     c = compose([f"scene={scene}", f"scene.path='{tmp_path / 'absent'}'", f"output_dir='{tmp_path / 'out'}'"])
     with pytest.raises(DataError, match="absent"):  # the folder is looked for after the settings are accepted

@@ -7,7 +7,7 @@ from typing import Any
 
 from neuprim.core.checked import choose
 from neuprim.core.data import Dataset
-from neuprim.core.errors import ConfigError
+from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import ColourField, DensityField
@@ -42,6 +42,16 @@ def _solids(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     return load(settings, context)
 
 
+def _mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    try:
+        import trimesh  # noqa: F401
+    except ImportError as error:
+        raise BackendUnavailable(f"scene=mesh needs the package trimesh ({error}): pip install trimesh") from error
+    from neuprim.tasks.static.mesh import load
+
+    return load(settings, context)
+
+
 def _blender(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     from neuprim.tasks.static.datasets.blender import load
 
@@ -60,6 +70,11 @@ def _colmap(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     return load(settings, context)
 
 
+def _facts(dataset: Dataset) -> Mapping[str, Any]:
+    """Of generated data, which file they show and where its points are."""
+    return dataset.extra if isinstance(dataset.extra, dict) else {}
+
+
 TASK = TaskSpec(
     api=API_VERSION,
     name="static",
@@ -67,6 +82,7 @@ TASK = TaskSpec(
     config_package="neuprim.tasks.static.conf",
     scenes=(
         SceneSpec("solids", "built in: sharp edges, thin rods, a curved handle; generated in seconds", _solids),
+        SceneSpec("mesh", "your own model, ray-cast: a .glb, .gltf, .obj, .ply or .stl: scene.path=FILE", _mesh),
         SceneSpec("blender", "NeRF-synthetic layout: transforms_train.json, RGBA images", _blender),
         SceneSpec("nerfstudio", "instant-ngp / nerfstudio transforms.json", _nerfstudio),
         SceneSpec("colmap", "COLMAP sparse/0 and images (needs neuprim[colmap])", _colmap),
@@ -74,6 +90,8 @@ TASK = TaskSpec(
     build=_build,
     loss=photometric,
     check=_check,
+    facts=_facts,
+    diagnose=lambda dataset, model: _facts(dataset),
     fields={"CosineDensity": CosineDensity, "GaussianDensity": GaussianDensity, "SphericalHarmonics": SphericalHarmonics},
     uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),
 )

@@ -9,7 +9,7 @@ The scene, its cameras and its light are fixed: equal settings give equal files 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -29,7 +29,10 @@ from neuprim.scenes.settings import ImageSize, Supersampling, settings_key
 from neuprim.scenes.shapes import build
 from neuprim.tasks.static.solids.shading import encode_srgb, radiance
 
-__all__ = ["GENERATOR_VERSION", "SolidsSettings", "camera_matrices", "generate", "load", "picture"]
+__all__ = ["FIELD_OF_VIEW", "GENERATOR_VERSION", "Seen", "SolidsSettings", "camera_matrices", "generate", "image_set", "load", "picture"]
+
+Seen = Callable[[Any, NDArray[np.float64], NDArray[np.float64]], tuple[NDArray[np.float32], NDArray[np.bool_]]]
+"""(scene, origins, directions) -> what :func:`~neuprim.tasks.static.solids.shading.radiance` returns."""
 
 GENERATOR_VERSION = 1
 """Part of the cache's key: to be raised with every change to shapes, light, cameras or file layout."""
@@ -86,22 +89,36 @@ def generate(settings: SolidsSettings, cache_dir: Path, progress: Progress = lam
     Raises:
         DataError: the cache directory cannot be written.
     """
+    return image_set("solids", settings.key(), settings, lambda: Scene(build())).generate(cache_dir, progress)
+
+
+def image_set(
+    name: str,
+    key: str,
+    settings: SolidsSettings,
+    build: Callable[[], Scene],
+    seen: Seen = radiance,
+    facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {},
+) -> ImageSet[_View]:
+    """Whatever ``build`` makes, seen by the cameras of the solids; arguments as of :class:`~neuprim.scenes.image_set.ImageSet`."""
     counts = {"train": settings.train_views, "test": settings.test_views}
 
     def draw(scene: Scene, view: _View, paths: Sequence[Path]) -> None:
-        Image.fromarray(picture(scene, camera_to_world(view.eye), settings.size, settings.supersampling)).save(paths[0])
+        image = picture(scene, camera_to_world(view.eye), settings.size, settings.supersampling, seen)
+        Image.fromarray(image).save(paths[0])
 
     return ImageSet(
-        name="solids",
-        key=settings.key(),
+        name=name,
+        key=key,
         size=settings.size,
         splits={split: [_View(f"r_{i}", eye) for i, eye in enumerate(_eyes(split, count))] for split, count in counts.items()},
         lens={"camera_angle_x": FIELD_OF_VIEW},
-        build=lambda: Scene(build()),
+        build=build,
         frame=lambda split, view: {"file_path": f"./{split}/{view.name}", "transform_matrix": camera_to_world(view.eye).tolist()},
         files=lambda view: [f"{view.name}.png"],
         draw=draw,
-    ).generate(cache_dir, progress)
+        facts=facts,
+    )
 
 
 def camera_matrices(split: str, count: int) -> list[NDArray[np.float64]]:
@@ -119,17 +136,17 @@ def _eyes(split: str, count: int) -> list[NDArray[np.float64]]:
     return [DISTANCE * direction(low + (high - low) * (i + 0.5) / count, phase + i * turn) for i in range(count)]
 
 
-def picture(scene: Scene, pose: NDArray[np.float64], size: int, supersampling: int) -> NDArray[np.uint8]:
+def picture(scene: Scene, pose: NDArray[np.float64], size: int, supersampling: int, seen: Seen = radiance) -> NDArray[np.uint8]:
     """(size, size, 4) RGBA in sRGB with straight alpha, as Blender stores it: rays are averaged premultiplied and linear, then encoded."""
     bands_of_rays = bands(pose, FIELD_OF_VIEW, size, supersampling)
-    mean = np.concatenate([pixel_means(_seen(scene, pose, d), size, supersampling) for d in bands_of_rays])
+    mean = np.concatenate([pixel_means(_rgba(scene, pose, d, seen), size, supersampling) for d in bands_of_rays])
     alpha = mean[..., 3:]
     straight = (mean[..., :3] / np.maximum(alpha, np.float32(1e-6))).astype(np.float32, copy=False)
     colour = encode_srgb(straight)
     return np.round(np.concatenate([colour, alpha], axis=-1) * 255).astype(np.uint8)
 
 
-def _seen(scene: Scene, pose: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float32]:
+def _rgba(scene: Scene, pose: NDArray[np.float64], directions: NDArray[np.float64], seen: Seen) -> NDArray[np.float32]:
     """(N, 4) premultiplied linear RGBA of N rays."""
-    rgb, hit = radiance(scene, pose[:3, 3], directions)
+    rgb, hit = seen(scene, pose[:3, 3], directions)
     return np.concatenate([rgb, hit[:, None].astype(np.float32)], axis=1)

@@ -1,0 +1,118 @@
+"""The scene ``mesh`` as a data set on disk: the layout, the cameras and the light of the built-in solids, with a model in their place.
+
+The transforms files also say which file was drawn (``rendered_from``) and where its points are in the scene (``scene_from_file``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neuprim.core.checked import checked, text
+from neuprim.core.data import Dataset
+from neuprim.core.data.records import read_json
+from neuprim.core.task import SceneContext
+from neuprim.scenes.image_set import Progress
+from neuprim.scenes.raycast import Scene
+from neuprim.scenes.settings import settings_key
+from neuprim.tasks.static.mesh.files import Folder, Model, Up, model_file
+from neuprim.tasks.static.mesh.gltf import read_gltf
+from neuprim.tasks.static.mesh.obj import read_obj
+from neuprim.tasks.static.mesh.parts import read_parts
+from neuprim.tasks.static.mesh.scans import read_ply, read_stl
+from neuprim.tasks.static.mesh.surface import Surface
+from neuprim.tasks.static.solids.generate import FIELD_OF_VIEW, Seen, SolidsSettings, image_set
+from neuprim.tasks.static.solids.shading import DAYLIGHT, Daylight, radiance
+
+__all__ = ["GENERATOR_VERSION", "LIGHT", "MeshSettings", "generate", "load"]
+
+GENERATOR_VERSION = 1
+"""Part of the cache's key: to be raised with every change to how models are read, placed, lit or looked at."""
+
+_READERS: dict[str, Callable[[Folder], Model]] = {
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+    ".obj": read_obj,
+    ".ply": read_ply,
+    ".stl": read_stl,
+}
+
+
+def _dimmed(colour: tuple[float, float, float]) -> tuple[float, float, float]:
+    r, g, b = (0.8 * value for value in colour)
+    return r, g, b
+
+
+LIGHT = Daylight(DAYLIGHT.direction, *(_dimmed(colour) for colour in (DAYLIGHT.sun, DAYLIGHT.sky, DAYLIGHT.ground)))
+"""The daylight of the solids, as bright as white in the sun can be shown."""
+
+
+@dataclass(frozen=True)
+class MeshSettings(SolidsSettings):
+    """What the user may set for ``scene=mesh`` beside what ``solids`` has.
+
+    Attributes:
+        path: the model, .glb, .gltf, .obj, .ply or .stl.
+        up: the axis of the file that points up; "auto" is y for glTF and OBJ, z for PLY and STL.
+        shading: "daylight", a sun with shadows and a soft sky; "flat", the colours themselves, unlit.
+        skip_missing: whether textures and material files that are missing or refused are left out; they are an error otherwise.
+    """
+
+    path: Annotated[Path, text("the model's file")] = field(kw_only=True)
+    up: Literal["auto", "y", "z"] = "auto"
+    shading: Literal["daylight", "flat"] = "daylight"
+    skip_missing: bool = False
+
+
+def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    """The data set of ``scene=mesh``, drawn on first use of the file's contents and read from ``context.cache_dir`` afterwards.
+
+    Raises:
+        ConfigError: unknown setting or impossible value.
+        DataError: the model is missing, damaged, too large or refers to files outside its folder; the cache cannot be written.
+    """
+    asked = checked(MeshSettings, settings, "scene")
+    folder = generate(asked, context.cache_dir, context.progress)
+    from neuprim.tasks.static.datasets import blender
+
+    known = read_json(folder / "transforms_train.json")
+    facts = {name: known.values[name] for name in ("rendered_from", "scene_from_file")}
+    return replace(blender.load({"path": str(folder)}, context), name=facts["rendered_from"], data_source="generated", extra=facts)
+
+
+def generate(settings: MeshSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None) -> Path:
+    """Write the data set unless a complete one is there; returns its folder ``cache_dir/mesh-KEY``.
+
+    Raises:
+        DataError: as :func:`load`.
+    """
+    path = model_file(settings.path)
+    progress(f"mesh: reading {path.name}", 0.0)
+    model = _READERS[path.suffix.lower()](Folder(path, settings.skip_missing))
+    upward: Up = model.upward if settings.up == "auto" else settings.up
+    key = settings_key(replace(settings, path=Path(f"{path.name} {model.digest}"), up=upward), GENERATOR_VERSION)
+    spacing = 2 * math.tan(FIELD_OF_VIEW / 2) / (settings.size * settings.supersampling)
+
+    def build() -> Scene:
+        return Surface(model, read_parts(model), upward, spacing)
+
+    def facts(scene: Surface) -> dict[str, Any]:
+        return {"rendered_from": path.name, "scene_from_file": scene.scene_from_file.tolist()}
+
+    seen: Seen = partial(radiance, light=LIGHT) if settings.shading == "daylight" else _colours
+    return image_set("mesh", key, settings, build, seen, facts).generate(cache_dir, progress)
+
+
+def _colours(scene: Scene, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """What N rays see without any light: (N, 3) linear RGB, zero where nothing is hit, and (N,) bool of hits."""
+    hits = scene.intersect(origins, directions)
+    image = np.zeros(directions.shape, dtype=np.float32)
+    image[hits.hit] = hits.albedo
+    return image, hits.hit

@@ -1,0 +1,206 @@
+"""A model as rays meet it: in the box of the scenes, drawn alike from both sides, with its textures and the holes in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from neuprim.core.errors import DataError
+from neuprim.core.notices import warn_once
+from neuprim.scenes.meshes import corner_normals
+from neuprim.scenes.raycast import LIFT, Engine, Hits, Scene
+from neuprim.scenes.reflectance import dot
+from neuprim.scenes.shapes import Solid, plain
+from neuprim.tasks.static.mesh.files import MAX_TEXELS, Model, Up
+from neuprim.tasks.static.mesh.parts import Part
+from neuprim.tasks.static.mesh.textures import Texture, decode
+
+__all__ = ["FARTHEST", "Surface", "scene_from_file"]
+
+FARTHEST = 1.3
+"""Of any vertex from the origin, in scene units: from where the cameras of ``solids`` are, that much is in view."""
+
+_DIGITS = 6
+"""After the point, of positions in scene units that count as one."""
+
+_LEAST_AREA = 1e-12
+"""Of a face, in square scene units: below that it has no normal in single precision."""
+
+_LAYERS = 64
+"""Of holes that a ray passes at most."""
+
+_MOST_AROUND = 64
+"""Faces around a vertex that are smoothed over; work and memory for a vertex grow with their square."""
+
+_Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+
+
+def scene_from_file(parts: Sequence[Part], upward: Up) -> NDArray[np.float64] | None:
+    """(4, 4) that turns z up, centres the box and scales it into [-1, 1]^3, and into view; None for what has no size.
+
+    Args:
+        upward: "y" or "z", the axis of the file that points up.
+    """
+    turn = _Z_FROM_Y if upward == "y" else np.eye(3)
+    lower = np.min([part.corners.min(axis=(0, 1)) for part in parts], axis=0)
+    upper = np.max([part.corners.max(axis=(0, 1)) for part in parts], axis=0)
+    middle = lower / 2 + upper / 2
+    half = float((upper / 2 - lower / 2).max())
+    if not 1e-150 < half < 1e150:
+        return None
+    radius = max(float(np.sqrt((((part.corners - middle) / half) ** 2).sum(-1).max())) for part in parts)
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn * (min(1.0, FARTHEST / radius) / half)
+    matrix[:3, 3] = -matrix[:3, :3] @ middle
+    return matrix
+
+
+class Surface(Scene):
+    """The parts of a model, ready for ray queries.
+
+    Args:
+        model: where the images are.
+        parts: see :func:`~neuprim.tasks.static.mesh.parts.read_parts`.
+        upward: "y" or "z".
+        spacing: of neighbouring rays at distance 1, for how much of a texture one stands.
+
+    Attributes:
+        scene_from_file: (4, 4), see :func:`scene_from_file`.
+
+    Raises:
+        DataError: a model without size, or a texture that cannot be decoded.
+    """
+
+    def __init__(self, model: Model, parts: Sequence[Part], upward: Up, spacing: float, engine: Engine = "auto") -> None:
+        matrix = scene_from_file(parts, upward)
+        if matrix is None:
+            raise DataError(f"{model.path}: the mesh is a point, or too large for numbers; expected a size from 1e-150 to 1e150")
+        self.scene_from_file = matrix
+        points = np.concatenate([(part.corners @ matrix[:3, :3].T + matrix[:3, 3]).reshape(-1, 3) for part in parts])
+        first, same = trimesh.grouping.unique_rows(points, digits=_DIGITS)
+        points, faces = points[first], same.reshape(-1, 3)  # vertices at which faces touch are one
+        corners = points[faces]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        double = np.linalg.norm(across, axis=1)
+        kept = double > 2 * _LEAST_AREA
+        if not kept.all():
+            found = f"{model.path}: {(~kept).sum()} of {len(kept)} faces have no area"
+            if not kept.any():
+                raise DataError(f"{found}; expected triangles")
+            warn_once(f"{found}; left out")
+        mesh = _mesh(points, faces[kept])
+        normals = _smooth(_file_normals(parts, matrix[:3, :3])[kept], across[kept], mesh)
+        super().__init__([Solid("mesh", mesh, plain("#ffffff"), 0.0, normals=normals)], engine)
+        self._colour = np.concatenate([part.colour for part in parts])[kept]
+        self._textures, owner = _textures(model, parts)
+        self._texture = np.repeat(owner, [len(part.colour) for part in parts])[kept]
+        self._uv = np.concatenate([np.zeros((len(p.colour), 3, 2), np.float32) if p.uv is None else p.uv for p in parts])[kept]
+        cutoffs = [np.nan if part.material.cutoff is None or part.uv is None else part.material.cutoff for part in parts]
+        self._cutoff = np.repeat(np.array(cutoffs, np.float32), [len(part.colour) for part in parts])[kept]
+        self._holes = bool((self._cutoff > 0).any())
+        # texels per scene unit: the square root of the area in the texture over that in space, of every face
+        sides = self._uv[:, 1:] - self._uv[:, :1]
+        inside = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
+        texels = np.array([texture.texels for texture in self._textures] + [0], np.float64)
+        self._blur = (spacing * np.sqrt(inside * texels[self._texture] / double[kept])).astype(np.float32)
+
+    def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
+        """As of any scene; normals are those of the side that is seen."""
+        hits = super().intersect(origins, directions)
+        towards = np.asarray(directions, dtype=np.float32)[hits.hit]
+        side = np.where(dot(hits.face, towards) > 0, np.float32(-1), np.float32(1))[:, None]
+        albedo = self._seen(hits.triangle, hits.weight, hits.distance)[:, :3]
+        return replace(hits, normal=side * hits.normal, face=side * hits.face, albedo=albedo)
+
+    def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
+        """As of any scene; holes let light through."""
+        if not self._holes:
+            return super().occluded(points, directions, distance)
+        d = np.ascontiguousarray(directions, dtype=np.float32)
+        o = np.ascontiguousarray(np.broadcast_to(np.asarray(points, dtype=np.float32), d.shape))
+        triangle, _, _, found = self._first(o, d)
+        return (triangle >= 0) & (found < np.broadcast_to(np.asarray(distance, dtype=np.float32), len(o)))
+
+    def _first(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        triangle, u, v, distance = (np.array(a) for a in super()._first(o, d))
+        if not self._holes:
+            return triangle, u, v, distance
+        passing = np.flatnonzero(triangle >= 0)
+        step = np.float32(LIFT) / np.sqrt(dot(d, d))
+        for _ in range(_LAYERS):
+            passing = passing[self._open(triangle[passing], u[passing], v[passing], distance[passing])]
+            if not len(passing):
+                return triangle, u, v, distance
+            start = distance[passing] + step[passing]
+            t, u[passing], v[passing], further = super()._first(o[passing] + start[:, None] * d[passing], d[passing])
+            triangle[passing], distance[passing] = t, start + further
+            passing = passing[t >= 0]
+        triangle[passing] = -1
+        return triangle, u, v, distance
+
+    def _open(self, triangle: NDArray, u: NDArray, v: NDArray, distance: NDArray) -> NDArray[np.bool_]:
+        """(M,) whether the texture has a hole there."""
+        weight = np.stack([1 - u - v, u, v], axis=1, dtype=np.float32)
+        cutoff = self._cutoff[triangle]
+        able = np.flatnonzero(cutoff > 0)
+        through = np.zeros(len(triangle), dtype=np.bool_)
+        through[able] = self._seen(triangle[able], weight[able], distance[able])[:, 3] < cutoff[able]
+        return through
+
+    def _seen(self, triangle: NDArray, weight: NDArray[np.float32], distance: NDArray) -> NDArray[np.float32]:
+        """(M, 4) linear RGB reflectance and the texture's alpha."""
+        found = np.ones((len(triangle), 4), dtype=np.float32)
+        found[:, :3] = np.einsum("nk,nkc->nc", weight, self._colour[triangle])
+        texture = self._texture[triangle]
+        for index in np.unique(texture[texture >= 0]):
+            mine = np.flatnonzero(texture == index)
+            uv = np.einsum("nk,nkc->nc", weight[mine], self._uv[triangle[mine]])
+            found[mine] *= self._textures[index].look_up(uv, self._blur[triangle[mine]] * distance[mine])
+        return found
+
+
+def _mesh(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trimesh:
+    """Faces with vertices of their own where more of them touch than are smoothed over."""
+    around = np.bincount(faces.ravel(), minlength=len(points))
+    crowded = around[faces] > _MOST_AROUND
+    alone = faces[crowded]
+    own = faces.copy()
+    own[crowded] = len(points) + np.arange(len(alone))
+    return trimesh.Trimesh(np.concatenate([points, points[alone]]), own, process=False)
+
+
+def _file_normals(parts: Sequence[Part], turn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(F, 3, 3) normals of the file on the scene's axes, of any length; zero where it has none."""
+    return np.concatenate([np.zeros_like(part.corners) if part.normals is None else part.normals @ turn.T for part in parts])
+
+
+def _smooth(given: NDArray[np.float64], across: NDArray[np.float64], mesh: trimesh.Trimesh) -> NDArray[np.float64]:
+    """(F, 3, 3) unit normals: the file's, turned to the side of their face; else those that the angles between faces suggest."""
+    with np.errstate(all="ignore"):
+        length = np.linalg.norm(given, axis=2, keepdims=True)
+        unit = given / length
+    unit *= np.where(np.einsum("fkc,fc->fk", unit, across) < 0, -1.0, 1.0)[:, :, None]
+    usable = np.isfinite(unit).all(axis=2) & (length[..., 0] > 0)
+    return unit if usable.all() else np.where(usable[..., None], unit, corner_normals(mesh))
+
+
+def _textures(model: Model, parts: Sequence[Part]) -> tuple[list[Texture], NDArray[np.intp]]:
+    """The textures of all parts, and which of them each part has, -1 for none."""
+    found: dict[tuple[str, tuple[str, str]], int] = {}
+    textures: list[Texture] = []
+    owner = np.full(len(parts), -1, dtype=np.intp)
+    for i, part in enumerate(parts):
+        name = part.material.texture
+        if part.uv is None or name is None:
+            continue
+        key = name, part.material.wrap
+        if key not in found:
+            left = MAX_TEXELS - sum(texture.texels for texture in textures)
+            found[key] = len(textures)
+            textures.append(Texture(decode(model.path, name, model.images[name], left), part.material.wrap))
+        owner[i] = found[key]
+    return textures, owner

@@ -1,0 +1,496 @@
+"""Models of users as scenes: what is seen of them is what their geometry, colours and textures say."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import warnings
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from neuprim.config import compose
+from neuprim.core.cameras import Camera
+from neuprim.core.checkpoint import read_header
+from neuprim.core.data import Dataset
+from neuprim.core.errors import BackendUnavailable
+from neuprim.core.task import SceneContext
+from neuprim.plugins.registry import load_task
+from neuprim.runs.run import run
+from neuprim.scenes.meshes import ball, corner_normals
+from neuprim.scenes.raycast import Scene
+from neuprim.scenes.shapes import Solid, plain
+from neuprim.tasks.static.mesh import generate as generator
+from neuprim.tasks.static.mesh.files import Folder
+from neuprim.tasks.static.mesh.generate import MeshSettings, generate, load
+from neuprim.tasks.static.mesh.gltf import read_gltf
+from neuprim.tasks.static.mesh.obj import read_obj
+from neuprim.tasks.static.mesh.parts import GREY, read_parts
+from neuprim.tasks.static.mesh.surface import FARTHEST, Surface
+from neuprim.tasks.static.mesh.textures import Texture, decode
+from neuprim.tasks.static.solids.generate import SolidsSettings
+from neuprim.tasks.static.solids.shading import encode_srgb
+from tests.models import BLUE, GREEN, RED, YELLOW, cube, gltf, quarters, textured, write_glb, write_obj, write_ply
+
+SMALL = {"size": 48, "train_views": 4, "test_views": 2, "supersampling": 2}
+
+
+def read(path: Path, cache: Path, **settings: object) -> Dataset:
+    return load({"path": path, **SMALL, **settings}, SceneContext(seed=0, cache_dir=cache))
+
+
+def surface(path: Path, upward: str | None = None) -> Surface:
+    """The model as rays meet it, sharp."""
+    model = generator._READERS[path.suffix](Folder(path))
+    return Surface(model, read_parts(model), upward or model.upward, 1e-6)
+
+
+def colours(scene: Surface, points: list[list[float]], directions: list[list[float]]) -> np.ndarray:
+    """(N, 3) display colours 0..255 of what rays meet; every ray must meet something."""
+    hits = scene.intersect(np.array(points, np.float32), np.array(directions, np.float32))
+    assert hits.hit.all()
+    return np.round(encode_srgb(hits.albedo) * 255).astype(int)
+
+
+def pixel(camera: Camera, point: list[float]) -> tuple[int, int]:
+    """Row and column of a point of the scene."""
+    p = camera.viewmat[:3, :3] @ torch.tensor(point, dtype=torch.float64) + camera.viewmat[:3, 3]
+    assert p[2] > 0
+    return int(camera.fy * p[1] / p[2] + camera.cy), int(camera.fx * p[0] / p[2] + camera.cx)
+
+
+# Colours -------------------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_textured_cube_shows_its_quarters_where_geometry_says(tmp_path: Path) -> None:
+    """glTF's y is the scene's z, its x stays, its z comes forward as -y: the +z side is the one at y = -s."""
+    dataset = read(write_glb(tmp_path / "cube.glb"), tmp_path, size=96, shading="flat", train_views=12)
+    s = FARTHEST / math.sqrt(3)
+    spots = {RED: [-s / 2, -s, s / 2], GREEN: [s / 2, -s, s / 2], BLUE: [-s / 2, -s, -s / 2], YELLOW: [s / 2, -s, -s / 2]}
+    seen = 0
+    for index in range(12):
+        view, pixels = dataset.train.view(index), dataset.train.pixels(index)
+        eye = view.camera.position
+        if eye[1] > -2:  # does not look at that side
+            continue
+        seen += 1
+        for colour, spot in spots.items():
+            row, column = pixel(view.camera, spot)
+            assert pixels.alpha is not None and pixels.alpha[row, column] == 1
+            np.testing.assert_array_equal(torch.round(pixels.rgb[row, column] * 255).int().numpy(), colour)
+        assert pixels.alpha is not None and not pixels.alpha[0].any() and not pixels.alpha[:, 0].any()
+    assert seen >= 3
+
+
+def test_the_back_of_a_surface_is_lit_and_coloured_as_its_front(tmp_path: Path) -> None:
+    scene = surface(write_obj(tmp_path / "square.obj"), "z")
+    for height, down in ((3.0, -1.0), (-3.0, 1.0)):
+        at, towards = [[0.5, -0.5, height]], [[0, 0, down]]
+        np.testing.assert_array_equal(colours(scene, at, towards), [YELLOW])
+        hits = scene.intersect(at, towards)
+        np.testing.assert_allclose(hits.face, [[0, 0, -down]], atol=1e-6)
+        np.testing.assert_allclose(hits.normal, [[0, 0, -down]], atol=1e-6)
+
+
+def test_an_obj_takes_its_colours_and_textures_from_its_library(tmp_path: Path) -> None:
+    scene = surface(write_obj(tmp_path / "square.obj"), "z")
+    down = [[0, 0, -1.0]] * 4
+    square = [[-0.5, 0.5, 3], [0.5, 0.5, 3], [-0.5, -0.5, 3], [0.5, -0.5, 3]]
+    np.testing.assert_array_equal(colours(scene, square, down), [RED, GREEN, BLUE, YELLOW])
+    np.testing.assert_array_equal(colours(scene, [[-0.6, 0.1, -3]], [[0, 0, 1.0]]), [(255, 128, 0)])
+
+
+def test_colours_of_an_objs_vertices_stand_in_the_place_of_its_materials(tmp_path: Path) -> None:
+    """As MeshLab writes them, beside a material of some grey."""
+    (tmp_path / "m.mtl").write_text("newmtl m\nKd 0.3 0.3 0.3\n")
+    corners = "v -1 -1 0 1 0 0\nv 1 -1 0 1 0 0\nv 1 1 0 0 0 1\nv -1 1 0 0 0 1\n"
+    (tmp_path / "m.obj").write_text(f"mtllib m.mtl\n{corners}usemtl m\nf 1 2 3\nf 1 3 4\n")
+    found = colours(surface(tmp_path / "m.obj", "z"), [[0.9, -0.899, 3], [-0.85, 0.9, 3]], [[0, 0, -1.0]] * 2)
+    assert found[0, 0] > 240 and found[0, 2] < 80 and found[1, 2] > 240 and found[1, 0] < 80
+
+
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        ("map_Kd two words.png", "two words.png"),
+        ("map_Kd -clamp on -o 0.5 0.5 a.png", "a.png"),
+        ("map_Kd -bm 2 -s 1 1 1 sub\\a b.png", "sub\\a b.png"),
+        ("map_Kd -o 1 12.png", "12.png"),
+    ],
+)
+def test_names_of_textures_in_libraries(tmp_path: Path, line: str, name: str) -> None:
+    (tmp_path / "sub").mkdir()
+    for file in ("two words.png", "a.png", "sub/a b.png", "12.png"):
+        quarters().save(tmp_path / file)
+    (tmp_path / "m.mtl").write_text(f"newmtl m\n{line}\n")
+    (tmp_path / "m.obj").write_text("mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
+    model = read_obj(Folder(tmp_path / "m.obj"))
+    assert list(model.images) == [name] and model.materials["m"].texture == name
+
+
+def test_a_ply_has_the_colours_of_its_vertices(tmp_path: Path) -> None:
+    vertices, faces, _ = cube()
+    shown = ((vertices + 1) * 100 + 30).astype(np.uint8)
+    scene = surface(write_ply(tmp_path / "cube.ply", vertices, faces, shown))
+    s = FARTHEST / math.sqrt(3)
+    for corner in vertices[:4]:  # of the side towards +x
+        found = colours(scene, [[3, *(corner[1:] * s * 0.999)]], [[-1.0, 0, 0]])
+        np.testing.assert_allclose(found[0], (corner + 1) * 100 + 30, atol=2)
+
+
+def test_a_ply_has_the_colours_of_its_faces(tmp_path: Path) -> None:
+    (tmp_path / "two.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face 2\n"
+        "property list uchar int vertex_indices\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+        "-1 -1 0\n1 -1 0\n1 1 0\n-1 1 0\n3 0 1 2 200 10 20\n3 0 2 3 30 40 250\n"
+    )
+    found = colours(surface(tmp_path / "two.ply"), [[0.5, -0.5, 3], [-0.5, 0.5, 3]], [[0, 0, -1.0]] * 2)
+    np.testing.assert_array_equal(found, [(200, 10, 20), (30, 40, 250)])
+
+
+def test_the_texture_that_a_ply_names(tmp_path: Path) -> None:
+    quarters().save(tmp_path / "skin.png")
+    (tmp_path / "square.ply").write_text(
+        "ply\nformat ascii 1.0\ncomment TextureFile skin.png\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        "property float s\nproperty float t\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
+        "-1 -1 0 0 0\n1 -1 0 1 0\n1 1 0 1 1\n-1 1 0 0 1\n3 0 1 2\n3 0 2 3\n"
+    )
+    found = colours(surface(tmp_path / "square.ply"), [[-0.5, 0.5, 3], [0.5, -0.5, 3]], [[0, 0, -1.0]] * 2)
+    np.testing.assert_array_equal(found, [RED, YELLOW])
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_an_stl_is_grey_and_says_so(tmp_path: Path, text: bool) -> None:
+    mesh = trimesh.Trimesh(*cube()[:2], process=False)
+    (tmp_path / "cube.stl").write_bytes(mesh.export(file_type="stl_ascii").encode() if text else mesh.export(file_type="stl"))
+    with pytest.warns(match="cube.stl: 12 of 12 faces have no colour; drawn grey"):
+        scene = surface(tmp_path / "cube.stl")
+    np.testing.assert_allclose(scene.intersect([[3.0, 0.1, 0]], [[-1.0, 0, 0]]).albedo, [GREY])
+
+
+def test_base_colours_are_linear_and_multiply_texture_and_vertices(tmp_path: Path) -> None:
+    """A factor as dark as an 8-bit linear value cannot hold."""
+    document, data = gltf()
+    document["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [0.0013, 0.25, 1.0, 1.0]}}]
+    primitive = document["meshes"][0]["primitives"][0]
+    primitive["material"] = 0
+    primitive["attributes"]["COLOR_0"] = 2
+    document["accessors"].append({"bufferView": 2, "componentType": 5123, "normalized": True, "count": 3, "type": "VEC3"})
+    document["bufferViews"].append({"buffer": 0, "byteOffset": len(data), "byteLength": 24, "byteStride": 8})
+    data += np.full((3, 4), 32768, "<u2").tobytes()
+    document["buffers"] = [{"uri": "triangle.bin", "byteLength": len(data)}]
+    (tmp_path / "triangle.bin").write_bytes(data)
+    (tmp_path / "t.gltf").write_text(json.dumps(document))
+    (part,) = read_parts(read_gltf(Folder(tmp_path / "t.gltf")))
+    np.testing.assert_allclose(part.colour, np.broadcast_to([0.00065, 0.125, 0.5], (1, 3, 3)), rtol=1e-4)
+
+
+def test_texture_coordinates_of_the_materials_own_set_are_moved_and_wrapped(tmp_path: Path) -> None:
+    """KHR_texture_transform: half a texture to the right, from quantized coordinates; clamped along u, mirrored along v."""
+    document, data = gltf()
+    uv = np.array([[0, 0], [0, 0], [255, 255]], np.uint8)
+    data += np.pad(uv, ((0, 0), (0, 2))).tobytes()
+    document["accessors"].append({"bufferView": 2, "componentType": 5121, "normalized": True, "count": 3, "type": "VEC2"})
+    document["bufferViews"].append({"buffer": 0, "byteOffset": 44, "byteLength": 12, "byteStride": 4})
+    document["buffers"] = [{"uri": "triangle.bin", "byteLength": len(data)}]
+    document["meshes"][0]["primitives"][0] = {"attributes": {"POSITION": 0, "TEXCOORD_1": 2}, "indices": 1, "material": 0}
+    moved = {"KHR_texture_transform": {"offset": [0.5, 0.0], "scale": [2.0, 1.0]}}
+    document["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1, "extensions": moved}}}]
+    document["textures"], document["images"] = [{"source": 0, "sampler": 0}], [{"uri": "the%20skin.png"}]
+    document["samplers"] = [{"wrapS": 33071, "wrapT": 33648}]
+    document["extensionsRequired"] = ["KHR_texture_transform", "KHR_mesh_quantization"]
+    quarters().save(tmp_path / "the skin.png")
+    (tmp_path / "triangle.bin").write_bytes(data)
+    (tmp_path / "t.gltf").write_text(json.dumps(document))
+    (part,) = read_parts(read_gltf(Folder(tmp_path / "t.gltf")))
+    assert part.material.wrap == ("clamp", "mirror") and part.uv is not None
+    np.testing.assert_allclose(part.uv[0], [[0.5, 1.0], [0.5, 1.0], [2.5, 0.0]], atol=1e-6)  # v upward: glTF's 0 is the upper edge
+
+
+def test_parts_stand_where_the_graph_puts_them(tmp_path: Path) -> None:
+    """Two uses of one part, one turned and mirrored below a node that scales."""
+    document, data = gltf()
+    quarter = math.sqrt(0.5)
+    document["nodes"] = [
+        {"mesh": 0},
+        {"scale": [2, 2, -2], "children": [2]},
+        {"mesh": 0, "rotation": [0, 0, quarter, quarter], "translation": [10, 0, 1]},
+    ]
+    document["scenes"] = [{"nodes": [0, 1]}]
+    (tmp_path / "triangle.bin").write_bytes(data)
+    (tmp_path / "t.gltf").write_text(json.dumps(document))
+    first, second = sorted(read_parts(read_gltf(Folder(tmp_path / "t.gltf"))), key=lambda part: float(part.corners.max()))
+    np.testing.assert_allclose(first.corners[0], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    np.testing.assert_allclose(second.corners[0], [[20, 0, -2], [20, 2, -2], [18, 0, -2]], atol=1e-12)
+
+
+@pytest.mark.parametrize(("mode", "indices", "count"), [(4, [0, 1, 2, 0, 2, 3], 2), (5, [0, 1, 3, 2], 2), (6, [0, 1, 2, 3], 2)])
+def test_triangles_strips_and_fans(tmp_path: Path, mode: int, indices: list[int], count: int) -> None:
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32).tobytes()
+    data = square + np.array(indices, "<u4").tobytes()
+    document, _ = gltf(buffers=[{"uri": "triangle.bin", "byteLength": len(data)}])
+    document["bufferViews"] = [{"buffer": 0, "byteLength": 48}, {"buffer": 0, "byteOffset": 48, "byteLength": len(data) - 48}]
+    document["accessors"][0]["count"] = 4
+    document["accessors"][1] |= {"count": len(indices), "componentType": 5125}
+    document["meshes"][0]["primitives"][0]["mode"] = mode
+    (tmp_path / "triangle.bin").write_bytes(data)
+    (tmp_path / "t.gltf").write_text(json.dumps(document))
+    (part,) = read_parts(read_gltf(Folder(tmp_path / "t.gltf")))
+    area = np.linalg.norm(np.cross(part.corners[:, 1] - part.corners[:, 0], part.corners[:, 2] - part.corners[:, 0]), axis=1) / 2
+    assert len(part.corners) == count and area.sum() == pytest.approx(1.0)
+
+
+# Holes ---------------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("mode", "alpha", "hole"), [("OPAQUE", 0, False), ("MASK", 100, True), ("MASK", 200, False), ("BLEND", 100, True)])
+def test_where_the_texture_is_clear_there_is_a_hole(tmp_path: Path, mode: str, alpha: int, hole: bool) -> None:
+    """Seen through the red quarter of the front there is the back, mirrored: its green quarter; and the light comes through."""
+    more = {"alphaCutoff": 0.6} if mode == "MASK" else {}
+    scene = surface(write_glb(tmp_path / "cube.glb", (textured(quarters(alpha=alpha), alphaMode=mode, **more), np.eye(4))))
+    s = FARTHEST / math.sqrt(3)
+    at, towards = np.array([[-s / 2, -3.0, s / 2]], np.float32), np.array([[0.0, 2.0, 0.0]], np.float32)
+    hits = scene.intersect(at, towards)
+    np.testing.assert_allclose(hits.distance, [(3 + s) / 2 if hole else (3 - s) / 2], atol=1e-5)
+    np.testing.assert_allclose(hits.position, [[-s / 2, s if hole else -s, s / 2]], atol=1e-5)
+    assert encode_srgb(hits.albedo).round(3).tolist() == ([[0, 1, 0]] if hole else [[1, 0, 0]])
+    assert scene.occluded(at, towards, 1.4).tolist() == [not hole] and scene.occluded(at, towards).all()
+
+
+# Textures ------------------------------------------------------------------------------------------------------------------------------
+
+
+def test_texels_are_mixed_in_linear_light_about_their_middles() -> None:
+    pixels = np.array([[[0, 0, 0, 255], [255, 255, 255, 255]]], np.uint8)
+    texture = Texture(pixels, ("clamp", "clamp"))
+    sharp = np.zeros(3, np.float32)
+    found = texture.look_up(np.array([[0.25, 0.5], [0.5, 0.5], [0.75, 0.5]], np.float32), sharp)
+    np.testing.assert_allclose(found[:, 0], [0, 0.5, 1], atol=1e-6)
+    np.testing.assert_allclose(texture.look_up(np.array([[0.0, 0.5]], np.float32), sharp[:1])[0, 0], 0)
+    np.testing.assert_allclose(Texture(pixels).look_up(np.array([[0.0, 0.5]], np.float32), sharp[:1])[0, 0], 0.5)  # wraps around
+
+
+@pytest.mark.parametrize(("wrap", "same"), [("repeat", 0.2), ("mirror", 0.8), ("clamp", 1.0)])
+def test_beyond_the_edge(wrap: str, same: float) -> None:
+    pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 4)).astype(np.uint8)
+    texture, sharp = Texture(pixels, (wrap, wrap)), np.zeros(1, np.float32)
+    beyond, inside = (texture.look_up(np.array([[u, u]], np.float32), sharp) for u in (1.2, same))
+    np.testing.assert_allclose(beyond, inside, atol=1e-5)
+
+
+def test_a_ray_that_covers_many_texels_sees_their_mean() -> None:
+    pixels = np.zeros((33, 64, 4), np.uint8)
+    pixels[:, ::2] = 255
+    texture = Texture(pixels)
+    uv = np.random.default_rng(1).random((50, 2)).astype(np.float32)
+    assert np.ptp(texture.look_up(uv, np.zeros(50, np.float32))[:, 0]) > 0.5
+    np.testing.assert_allclose(texture.look_up(uv, np.full(50, 16, np.float32)), 0.5, atol=1e-3)
+    assert texture.levels[-1].shape[:2] == (1, 1)
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "P", "1", "RGB", "RGBA", "I;16"])
+def test_images_of_every_depth_are_decoded(tmp_path: Path, mode: str) -> None:
+    grey = np.full((4, 4), 128, np.uint8)
+    image = Image.fromarray(grey.astype(np.uint16) * 257) if mode == "I;16" else Image.fromarray(grey).convert(mode)
+    image.save(tmp_path / "a.png")
+    pixels = decode(tmp_path, "a.png", (tmp_path / "a.png").read_bytes())
+    assert pixels.shape == (4, 4, 4) and pixels.dtype == np.uint8
+    if mode != "1":
+        np.testing.assert_array_equal(pixels[0, 0], [128, 128, 128, 255])
+
+
+# Shape and place -----------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("suffix", "up", "expected"), [(".glb", "auto", "y"), (".obj", "auto", "y"), (".ply", "auto", "z"), (".stl", "auto", "z"), (".ply", "y", "y"), (".glb", "z", "z")])  # fmt: skip
+def test_it_stands_upright_in_the_box_and_can_be_put_back(tmp_path: Path, suffix: str, up: str, expected: str) -> None:
+    """A thin pole of height 60 along ``expected``, far from the origin."""
+    size = [2.0, 2, 60] if expected == "z" else [2.0, 60, 2]
+    pole = trimesh.creation.box(size)
+    pole.apply_translation([100, 200, 300])
+    path = tmp_path / f"pole{suffix}"
+    data = pole.export(file_type=suffix[1:])
+    path.write_bytes(data.encode() if isinstance(data, str) else data)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # no colours
+        folder = generate(MeshSettings(path=path, up=up, **SMALL), tmp_path / "cache")
+    matrix = np.array(json.loads((folder / "transforms_test.json").read_text())["scene_from_file"])
+    corners = np.c_[pole.vertices, np.ones(8)] @ matrix.T
+    np.testing.assert_allclose(np.abs(corners[:, :3]), np.broadcast_to([1 / 30, 1 / 30, 1], (8, 3)), atol=1e-12)
+    assert np.linalg.det(matrix[:3, :3]) > 0
+    np.testing.assert_allclose((corners @ np.linalg.inv(matrix).T)[:, :3], pole.vertices)
+    image = np.asarray(Image.open(folder / "train" / "r_0.png"))
+    rows, columns = np.nonzero(image[..., 3])
+    assert np.ptp(rows) > 5 * np.ptp(columns)
+
+
+def test_normals_of_the_file_are_used_and_others_follow_from_the_angles(tmp_path: Path) -> None:
+    """A ball of few faces is smooth with its normals, and has facets without."""
+    rough = trimesh.creation.icosahedron()
+    towards = -np.einsum("fkc,k->fc", rough.triangles, [0.6, 0.2, 0.2])
+    for named, smooth in (("with", True), ("without", False)):
+        text = "".join(f"v {x} {y} {z}\n" for x, y, z in rough.vertices.tolist())
+        text += "".join(f"vn {x} {y} {z}\n" for x, y, z in rough.vertices.tolist())
+        text += "".join(
+            "f " + " ".join(f"{i + 1}//{i + 1}" if smooth else f"{i + 1}" for i in face) + "\n" for face in rough.faces.tolist()
+        )
+        (tmp_path / f"{named}.obj").write_text(text)
+        scene = surface(tmp_path / f"{named}.obj", "z")
+        hits = scene.intersect(-3 * towards, towards)
+        turned = np.degrees(np.arccos(np.clip((hits.normal * hits.face).sum(1), -1, 1)))
+        assert hits.hit.all() and (turned > 10 if smooth else turned < 0.1).all()
+
+
+def test_a_vertex_with_many_faces_costs_no_memory(tmp_path: Path) -> None:
+    """Smoothing takes pairs of faces around a vertex: 10,000 of them would be 10^8."""
+    angle = np.linspace(0, 2 * np.pi, 10_001)[:-1]
+    vertices = np.concatenate([[[0, 0, 0.5]], np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)])
+    rim = np.arange(10_000)
+    faces = np.stack([0 * rim, 1 + rim, 1 + (rim + 1) % 10_000], 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        scene = surface(write_ply(tmp_path / "fan.ply", vertices, faces))
+    hits = scene.intersect([[0.3, 0.2, 3.0]], [[0, 0, -1.0]])
+    assert hits.hit.all() and hits.normal[0, 2] == pytest.approx(2 / math.sqrt(5), abs=0.01)
+
+
+def test_normals_do_not_depend_on_how_many_are_made_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = ball([0, 0, 0], 1.0, fine=False)
+    whole = corner_normals(mesh)
+    monkeypatch.setattr("neuprim.scenes.meshes.CORNERS_AT_ONCE", 1000)
+    np.testing.assert_array_equal(corner_normals(mesh), whole)
+
+
+def test_faces_without_area_are_left_out_and_counted(tmp_path: Path) -> None:
+    vertices, faces, _ = cube()
+    faces = np.concatenate([faces, [[0, 0, 1], [0, 1, 0]]])
+    with pytest.warns(match="2 of 14 faces have no area; left out"):
+        scene = surface(write_ply(tmp_path / "cube.ply", vertices, faces, np.full((24, 3), 200, np.uint8)))
+    assert np.isfinite(scene._corner_normals).all() and len(scene._faces) == 12
+
+
+# The data set --------------------------------------------------------------------------------------------------------------------------
+
+
+def test_flat_shows_colours_and_daylight_shades_them(tmp_path: Path) -> None:
+    path = write_glb(tmp_path / "cube.glb")
+    flat, lit = (read(path, tmp_path, shading=shading).train.pixels(1) for shading in ("flat", "daylight"))
+    assert flat.alpha is not None and lit.alpha is not None
+    np.testing.assert_array_equal(flat.alpha, lit.alpha)
+    bright, shaded = flat.rgb[flat.alpha == 1], lit.rgb[lit.alpha == 1]
+    assert (bright.max(1).values > 0.99).float().mean() > 0.7 and (shaded.max(1).values > 0.99).float().mean() < 0.1
+    assert shaded.mean() < 0.9 * bright.mean()
+
+
+def test_white_in_the_sun_is_not_clipped(tmp_path: Path) -> None:
+    white = trimesh.Trimesh(*cube()[:2], process=False)
+    white.visual.vertex_colors = np.full((24, 4), 255, np.uint8)
+    dataset = read(write_glb(tmp_path / "white.glb", (white, np.eye(4))), tmp_path, train_views=10)
+    tops = [pixels.rgb[pixels.alpha == 1].max() for pixels in map(dataset.train.pixels, range(10)) if pixels.alpha is not None]
+    assert 0.9 < max(tops) < 1.0
+
+
+def test_it_is_called_after_its_file_and_marked_generated(tmp_path: Path) -> None:
+    dataset = read(write_glb(tmp_path / "my cube.glb"), tmp_path)
+    assert (dataset.name, dataset.data_source, dataset.color_space) == ("my cube.glb", "generated", "srgb")
+    assert (len(dataset.train), len(dataset.test)) == (4, 2) and dataset.up.tolist() == [0, 0, 1]
+    facts = load_task("static").facts(dataset)
+    assert facts["rendered_from"] == "my cube.glb" and np.shape(facts["scene_from_file"]) == (4, 4)
+
+
+def test_images_are_kept_by_contents_and_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, cache = write_obj(tmp_path / "square.obj"), tmp_path / "cache"
+    settings = MeshSettings(path=path, **SMALL)
+    first = generate(settings, cache)
+    monkeypatch.setattr(generator, "read_parts", None)  # a second time nothing is parsed
+    assert generate(settings, cache) == first
+    monkeypatch.undo()
+    (tmp_path / "copy").mkdir()
+    for file in (path, path.with_suffix(".mtl"), tmp_path / "skin.png"):
+        (tmp_path / "copy" / file.name).write_bytes(file.read_bytes())
+    assert generate(MeshSettings(path=tmp_path / "copy" / "square.obj", **SMALL), cache) == first  # wherever it lies
+    folders = {first}
+    for name, value in {"size": 40, "train_views": 3, "test_views": 1, "supersampling": 1, "up": "z", "shading": "flat"}.items():
+        folders.add(generate(MeshSettings(**{"path": path, **SMALL, name: value}), cache))
+    quarters(alpha=255).save(tmp_path / "skin.png")
+    folders.add(generate(settings, cache))
+    path.with_suffix(".mtl").write_text("newmtl skin\nKd 1 1 1\nnewmtl back\n")
+    folders.add(generate(settings, cache))
+    assert len(folders) == 9 == len(list(cache.iterdir()))
+
+
+def test_an_interruption_leaves_nothing_and_progress_is_told(tmp_path: Path) -> None:
+    path, said = write_glb(tmp_path / "cube.glb"), []
+
+    def stop(text: str, fraction: float) -> None:
+        said.append(text)
+        if fraction > 0.3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        generate(MeshSettings(path=path, **SMALL), tmp_path / "cache", stop)
+    assert list((tmp_path / "cache").iterdir()) == []
+    assert said[:2] == ["mesh: reading cube.glb", "mesh: building the scene"] and said[-1].startswith("mesh: drawing 48x48 images")
+
+
+def test_the_same_model_from_three_formats_looks_alike(tmp_path: Path) -> None:
+    mesh = textured()
+    glb = read(write_glb(tmp_path / "a.glb"), tmp_path)
+    for name, data in trimesh.Scene(mesh).export(file_type="gltf").items():
+        (tmp_path / name).write_bytes(data)
+    gltf_ = read(tmp_path / "model.gltf", tmp_path)
+    text, files = trimesh.exchange.obj.export_obj(mesh, include_texture=True, return_texture=True)
+    (tmp_path / "a.obj").write_text(text)
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    obj = read(tmp_path / "a.obj", tmp_path)
+    for other in (gltf_, obj):
+        for index in range(4):
+            difference = glb.train.pixels(index).rgb - other.train.pixels(index).rgb
+            assert difference.abs().mean() < 1e-3
+
+
+def test_it_trains_end_to_end_and_the_files_units_are_kept(tmp_path: Path) -> None:
+    path, out = write_glb(tmp_path / "cube.glb"), tmp_path / "out"
+    words = ["task=static", "scene=mesh", f"scene.path='{path}'", f"output_dir='{out}'", *(f"scene.{k}={v}" for k, v in SMALL.items())]
+    run(compose([*words, "model.primitives=60", "train.iterations=200", "train.max_seconds=null"]))
+    curve = [json.loads(line)["psnr"] for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert curve[-1] > curve[0] + 1
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert (
+        metrics["data_source"] == "generated"
+        and metrics["dataset"] == metrics["rendered_from"] == "cube.glb"
+        and np.isfinite(metrics["psnr"])
+    )
+    header = read_header(out / "model.safetensors", "model")
+    assert header["data"]["scene_from_file"] == metrics["scene_from_file"]
+    np.testing.assert_allclose(np.linalg.norm(np.array(metrics["scene_from_file"])[:3, :3] @ [1, 1, 1]), FARTHEST)
+    assert "<strong>generated data</strong> <span>rendered from cube.glb, not photographs</span>" in (out / "report.html").read_text()
+
+
+# What it shares ------------------------------------------------------------------------------------------------------------------------
+
+
+def test_the_yaml_has_every_setting_and_its_default(tmp_path: Path) -> None:
+    found = compose(["scene=mesh", f"scene.path='{tmp_path}/a.glb'", f"output_dir='{tmp_path}/out'"]).scene
+    assert dict(found) == {**asdict(MeshSettings(path=tmp_path / "a.glb")), "path": str(tmp_path / "a.glb")}
+    assert {name: found[name] for name in asdict(SolidsSettings())} == asdict(SolidsSettings())
+
+
+def test_without_trimesh_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    with pytest.raises(BackendUnavailable, match=r"scene=mesh needs the package trimesh .*pip install trimesh"):
+        load_task("static").scene("mesh").load({"path": str(tmp_path)}, SceneContext(0, tmp_path))
+
+
+def test_hits_know_their_triangle_and_where_in_it_they_are() -> None:
+    sphere = Scene([Solid("ball", ball([0, 0, 0], 0.5), plain("#ff8000"), 0.7)])
+    hits = sphere.intersect([[3.0, 0.1, 0.2]], [[-1.0, 0, 0]])
+    corners = sphere._vertices[sphere._faces[hits.triangle]]
+    np.testing.assert_allclose(np.einsum("nk,nkc->nc", hits.weight, corners), hits.position, atol=1e-5)

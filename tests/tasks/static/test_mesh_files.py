@@ -1,0 +1,463 @@
+"""Models of users as files: whatever is wrong with one is one clear line, and nothing outside its folder is read."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import random
+import struct
+import tracemalloc
+import warnings
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from neuprim.core import notices
+from neuprim.core.errors import DataError
+from neuprim.core.notices import NeuprimWarning
+from neuprim.tasks.static.mesh import files, parts, textures
+from neuprim.tasks.static.mesh import generate as generator
+from neuprim.tasks.static.mesh.generate import MeshSettings, generate
+from tests.models import cube, gltf, quarters, textured, write_glb, write_gltf, write_obj, write_ply
+
+SMALL: dict[str, Any] = {"size": 16, "train_views": 1, "test_views": 1, "supersampling": 1}
+
+
+@pytest.fixture(autouse=True)
+def every_note(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(notices, "_said", set())
+
+
+def refusal(path: Path, **settings: Any) -> str:
+    """The error's one line, which names the file."""
+    cache = path.parent / "cache"
+    before = sorted(cache.iterdir()) if cache.exists() else []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NeuprimWarning)
+        with pytest.raises(DataError) as caught:
+            generate(MeshSettings(path=path, **SMALL, **settings), cache)
+    text = str(caught.value)
+    assert "\n" not in text and path.name in text and len(text) < 500, text
+    assert (sorted(cache.iterdir()) if cache.exists() else []) == before
+    return text
+
+
+def notes(path: Path, **settings: Any) -> list[str]:
+    """What is said while the model is drawn."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        generate(MeshSettings(path=path, **SMALL, **settings), path.parent / "cache")
+    return [str(warning.message) for warning in caught if issubclass(warning.category, NeuprimWarning)]
+
+
+# The file itself -----------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+    assert "does not exist; expected a model's file (scene.path), .glb, .gltf, .obj, .ply or .stl" in refusal(tmp_path / "a.glb")
+    (tmp_path / "b.obj").mkdir()
+    assert "is no file" in refusal(tmp_path / "b.obj")
+
+
+@pytest.mark.parametrize("name", ["a.fbx", "a", "a.blend", "a.obj.zip"])
+def test_another_suffix_is_told_the_known_ones(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("x")
+    text = refusal(tmp_path / name)
+    assert "expected .glb, .gltf, .obj, .ply or .stl" in text and ("ends in" in text or "has no suffix" in text)
+
+
+def test_a_suffix_in_capitals_is_known(tmp_path: Path) -> None:
+    write_glb(tmp_path / "CUBE.GLB")
+    assert notes(tmp_path / "CUBE.GLB") == []
+
+
+@pytest.mark.parametrize("suffix", files.SUFFIXES)
+def test_an_empty_file_and_one_of_noise(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    path.touch()
+    assert "file is empty; expected a model" in refusal(path)
+    path.write_bytes(random.Random(0).randbytes(1000))
+    assert "expected" in refusal(path)
+
+
+def test_more_bytes_than_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_obj(tmp_path / "a.obj")
+    size = path.stat().st_size + path.with_suffix(".mtl").stat().st_size
+    monkeypatch.setattr(files.Folder.__init__, "__defaults__", (False, size))
+    assert "the model with what it names, up to skin.png, is larger than 512 MiB" in refusal(path)
+    monkeypatch.setattr(files.Folder.__init__, "__defaults__", (False, 10))
+    assert "the model is larger than 512 MiB" in refusal(path)
+
+
+@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="everybody may read everything")
+def test_a_file_that_may_not_be_read(tmp_path: Path) -> None:
+    write_glb(tmp_path / "a.glb").chmod(0)
+    assert "cannot be read (Permission denied)" in refusal(tmp_path / "a.glb")
+
+
+# Geometry ------------------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_cloud_of_points_is_no_mesh(tmp_path: Path) -> None:
+    assert "has 24 points and no faces; expected a mesh with triangles" in refusal(
+        write_ply(tmp_path / "a.ply", cube()[0], np.zeros((0, 3)))
+    )
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
+    assert "has 3 points and no faces" in refusal(tmp_path / "a.obj")
+
+
+def test_points_and_lines_beside_triangles_are_counted(tmp_path: Path) -> None:
+    document, _ = gltf()
+    primitive = document["meshes"][0]["primitives"][0]
+    path = write_gltf(tmp_path / "a.gltf", meshes=[{"primitives": [primitive, {**primitive, "mode": 0}, {**primitive, "mode": 3}]}])
+    assert f"{path}: 2 parts are points or lines; only triangles are drawn" in notes(path)
+    write_gltf(path, meshes=[{"primitives": [{**primitive, "mode": 1}]}])
+    assert "has no faces; expected a mesh with triangles" in refusal(path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_vertices_that_are_no_numbers(tmp_path: Path, value: float) -> None:
+    vertices, faces, _ = cube()
+    vertices[5, 1] = value
+    assert "vertex 5 is at [" in refusal(write_ply(tmp_path / "a.ply", vertices, faces))
+    unused = np.concatenate([cube()[0], [[value, 0, 0]]])
+    assert all("no colour" in note for note in notes(write_ply(tmp_path / "b.ply", unused, faces)))
+
+
+@pytest.mark.parametrize(("where", "text"), [(-1, "a face has the vertex -1 of 24"), (24, "a face has the vertex 24 of 24")])
+def test_faces_of_vertices_that_are_not_there(tmp_path: Path, where: int, text: str) -> None:
+    vertices, faces, _ = cube()
+    faces[3, 1] = where
+    assert text in refusal(write_ply(tmp_path / "a.ply", vertices, faces))
+
+
+def test_nothing_but_faces_without_area(tmp_path: Path) -> None:
+    line = np.array([[0, 0, 0], [1, 1, 1], [2, 2, 2]])
+    assert "1 of 1 faces have no area; expected triangles" in refusal(write_ply(tmp_path / "a.ply", line, np.array([[0, 1, 2]])))
+    assert "the mesh is a point" in refusal(write_ply(tmp_path / "b.ply", 0 * line, np.array([[0, 1, 2]])))
+
+
+def test_sizes_from_atoms_to_galaxies(tmp_path: Path) -> None:
+    for i, scale in enumerate((1e-30, 1e30)):
+        vertices, faces, _ = cube()
+        assert len(notes(write_ply(tmp_path / f"{i}.ply", scale * vertices, faces))) == 1  # no colours
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1e308 0 0\nv 0 -1e308 0\nf 1 2 3\n")
+    assert "too large for numbers" in refusal(tmp_path / "a.obj")
+
+
+# Limits --------------------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_header_that_says_a_billion_takes_no_memory(tmp_path: Path) -> None:
+    billion = 10**9
+    head = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nelement face {}\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "a.ply").write_text(head.format("ascii", billion, 1))
+    (tmp_path / "b.ply").write_text(head.format("binary_little_endian", 3, billion))
+    (tmp_path / "c.ply").write_text(head.format("binary_little_endian", 5 * 10**6, 10**6))  # within the limits, but not there
+    (tmp_path / "d.stl").write_bytes(bytes(80) + struct.pack("<I", billion) + bytes(500))
+    document, _ = gltf()
+    claims = [{**a, "count": billion} for a in document["accessors"]]
+    write_gltf(tmp_path / "e.gltf", accessors=claims)
+    bare = [{k: v for k, v in a.items() if k != "bufferView"} for a in claims]
+    write_gltf(tmp_path / "f.gltf", accessors=bare)
+    write_gltf(tmp_path / "g.gltf", buffers=[{"uri": "triangle.bin", "byteLength": billion}])
+    (tmp_path / "h.glb").write_bytes(struct.pack("<5I", 0x46546C67, 2, 2**32 - 1, 2**32 - 100, 0x4E4F534A) + b"{}  ")
+    expected = {
+        "a.ply": "1000000000 vertices; expected at most 6000000",
+        "b.ply": "1000000000 faces; expected at most 2000000",
+        "c.ply": "expected a complete file",
+        "d.stl": "1000000000 faces announced; expected 50000000084 bytes for them, found 584",
+        "e.gltf": "accessors[0] claims 1000000000 items, 36 bytes are there",
+        "f.gltf": "accessors[0] is sparse or compressed",
+        "g.gltf": "buffers[0] has 44 bytes, 1000000000 announced",
+        "h.glb": "24 bytes are there, 4294967295 announced",
+    }
+    tracemalloc.start()
+    for name, text in expected.items():
+        assert text in refusal(tmp_path / name)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50 * 2**20
+
+
+def test_empty_lines_are_no_vertices(tmp_path: Path) -> None:
+    write = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n" + "\n" * 5000
+    (tmp_path / "a.ply").write_text(write)
+    assert "5001 lines follow the header; expected 1" in refusal(tmp_path / "a.ply")
+
+
+def test_every_use_of_a_part_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_gltf(tmp_path / "a.gltf", nodes=[{"mesh": 0}] * 50, scenes=[{"nodes": list(range(50))}])
+    monkeypatch.setattr(parts, "MAX_FACES", 49)
+    assert "50 faces, each use of a part counting; expected at most 49" in refusal(path)
+
+
+@pytest.mark.parametrize(
+    ("limit", "text"),
+    [("MAX_VERTICES", "24 vertices; expected at most 11"), ("MAX_FACES", "12 faces; expected at most 11")],
+)
+@pytest.mark.parametrize("suffix", [".glb", ".ply", ".stl", ".obj"])
+def test_more_than_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, limit: str, text: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".ply":
+        write_ply(path, *cube()[:2])
+    else:
+        data = trimesh.Scene(trimesh.Trimesh(*cube()[:2], process=False)).export(file_type=suffix[1:])
+        path.write_bytes(data.encode() if isinstance(data, str) else data)
+    for module in ("gltf", "obj", "scans", "parts"):
+        monkeypatch.setattr(f"neuprim.tasks.static.mesh.{module}.{limit}", 11)
+    found = refusal(path)
+    assert text in found or (suffix == ".stl" and "36 vertices, each use of a part counting; expected at most 11" in found)
+
+
+def test_nodes_in_circles_and_nested_without_end(tmp_path: Path) -> None:
+    circle = write_gltf(tmp_path / "a.gltf", nodes=[{"children": [1]}, {"children": [0], "mesh": 0}])
+    assert "a node is its own ancestor or has two parents" in refusal(circle)
+    shared = write_gltf(tmp_path / "b.gltf", nodes=[{"children": [1, 2]}, {"children": [2]}, {"mesh": 0}])
+    assert "a node is its own ancestor or has two parents" in refusal(shared)
+    chain = [{"children": [i + 1]} for i in range(300)] + [{"mesh": 0}]
+    assert "nested deeper than 200" in refusal(write_gltf(tmp_path / "c.gltf", nodes=chain))
+    many = write_gltf(tmp_path / "d.gltf", nodes=[{}] * 20_001)
+    assert "20001 nodes; expected at most 20000" in refusal(many)
+    (tmp_path / "e.gltf").write_text('{"asset": ' + "[" * 100_000)
+    assert "damaged glTF" in refusal(tmp_path / "e.gltf")
+
+
+def test_textures_are_bounded_before_they_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_obj(tmp_path / "a.obj")
+    monkeypatch.setattr(textures, "MAX_PIXELS", 16 * 16 - 1)
+    assert "texture 'skin.png' has 16x16 pixels; at most 255 are accepted" in refusal(path)
+    monkeypatch.undo()
+    header = struct.pack(">4sIIBBBBB", b"IHDR", 60_000, 60_000, 8, 2, 0, 0, 0)
+    data = zlib.compress(bytes(100))
+    chunk = struct.pack(">I4s", len(data), b"IDAT") + data + struct.pack(">I", zlib.crc32(b"IDAT" + data))
+    (tmp_path / "skin.png").write_bytes(
+        b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header)) + chunk
+    )
+    assert "texture 'skin.png' claims more than 67108864 pixels" in refusal(path)
+
+
+def test_textures_are_bounded_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_obj(tmp_path / "a.obj")
+    quarters().save(tmp_path / "other.png")
+    path.with_suffix(".mtl").write_text("newmtl skin\nmap_Kd skin.png\nnewmtl back\nmap_Kd other.png\n")
+    path.write_text(path.read_text().replace("f 1 4 6 5", "f 1/1 4/2 6/3 5/4"))
+    monkeypatch.setattr("neuprim.tasks.static.mesh.surface.MAX_TEXELS", 300)
+    monkeypatch.setattr(textures, "MAX_TEXELS", 300)
+    assert "has 16x16 pixels; at most 300 of all textures are accepted" in refusal(path)
+
+
+# References ----------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def secret(tmp_path: Path) -> Path:
+    """A folder for a model, below one with an image that is not its own."""
+    quarters().save(tmp_path / "secret.png")
+    (tmp_path / "model" / "sub").mkdir(parents=True)
+    return tmp_path / "model"
+
+
+OUTSIDE = {
+    "../secret.png": "leads out of the model's folder, and is not read",
+    "sub/../../secret.png": "leads out of the model's folder, and is not read",
+    "..\\secret.png": "leads out of the model's folder, and is not read",
+    "{absolute}": "is an absolute path, which is not read",
+    "C:\\textures\\secret.png": "is an absolute path, which is not read",
+    "file:///etc/passwd": "is an absolute path, which is not read",
+    "http://example.org/secret.png": "is a place on the network, which is not read",
+    "link.png": "leads out of the model's folder, and is not read",
+    "sub": "not found; expected it in the model's folder",
+    "absent.png": "not found; expected it in the model's folder",
+    "a" * 5000: "is no name of a file",
+}
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+@pytest.mark.parametrize("suffix", [".obj", ".gltf", ".ply"])
+def test_textures_outside_the_folder_are_refused_by_name(secret: Path, name: str, suffix: str) -> None:
+    reference, expected = name.replace("{absolute}", str(secret.parent / "secret.png")), OUTSIDE[name]
+    try:
+        (secret / "link.png").symlink_to(secret.parent / "secret.png")
+    except OSError:
+        pytest.skip("no symbolic links here")
+    path = secret / f"a{suffix}"
+    if suffix == ".obj":
+        write_obj(path, reference)
+    elif suffix == ".gltf":
+        document, data = gltf(images=[{"uri": reference}], textures=[{"source": 0}])
+        document["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "baseColorFactor": [1, 0, 0, 1]}}]
+        document["meshes"][0]["primitives"][0]["material"] = 0
+        (secret / "triangle.bin").write_bytes(data)
+        path.write_text(json.dumps(document))
+    else:
+        write_ply(path, *cube()[:2])
+        path.write_bytes(path.read_bytes().replace(b"element vertex", f"comment TextureFile {reference}\nelement vertex".encode(), 1))
+    text = refusal(path)
+    assert expected in text and "scene.skip_missing=true draws without" in text
+    assert repr(reference[:20])[:-1] in text
+    assert any(expected in note and "drawn without it" in note for note in notes(path, skip_missing=True))
+
+
+def test_buffers_outside_the_folder_are_refused(secret: Path) -> None:
+    path = write_gltf(secret / "a.gltf")
+    (secret / "triangle.bin").rename(secret.parent / "triangle.bin")
+    assert "buffer 'triangle.bin' not found" in refusal(path)
+    write_gltf(path, buffers=[{"uri": "../triangle.bin", "byteLength": 44}])
+    text = refusal(path, skip_missing=True)
+    assert "buffer '../triangle.bin' leads out of the model's folder" in text
+
+
+def test_a_library_outside_the_folder_is_refused_but_one_beside_the_model_is_taken_for_it(secret: Path) -> None:
+    """Exporters write the path of another machine; what lies beside the model under that name is meant."""
+    path = write_obj(secret / "a.obj")
+    path.write_text(path.read_text().replace("mtllib a.mtl", "mtllib C:\\work\\a.mtl"))
+    assert notes(path) == []
+    path.with_suffix(".mtl").unlink()
+    assert "material file 'C:\\\\work\\\\a.mtl' is an absolute path" in refusal(path)
+
+
+def test_data_uris_are_read_and_damaged_ones_refused(tmp_path: Path) -> None:
+    data = gltf()[1]
+    uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+    path = write_gltf(tmp_path / "a.gltf", buffers=[{"uri": uri, "byteLength": len(data)}])
+    (tmp_path / "triangle.bin").unlink()
+    assert len(notes(path)) == 1  # no colours
+    for broken in ("data:application/octet-stream;base64,@@@@", "data:text/plain,hello"):
+        write_gltf(path, buffers=[{"uri": broken, "byteLength": 1}])
+        assert "embedded buffer is damaged" in refusal(path)
+
+
+def test_images_of_formats_that_run_programs_are_not_opened(tmp_path: Path) -> None:
+    """Pillow would hand PostScript to Ghostscript."""
+    path = write_obj(tmp_path / "a.obj")
+    Image.new("RGB", (8, 8)).save(tmp_path / "skin.eps")
+    (tmp_path / "skin.eps").rename(tmp_path / "skin.png")
+    assert "texture 'skin.png' cannot be decoded" in refusal(path)
+    (tmp_path / "skin.png").write_bytes(b"")
+    assert "cannot be decoded" in refusal(path, skip_missing=True)  # what is there is damaged, not missing
+
+
+def test_colours_that_are_no_numbers(tmp_path: Path) -> None:
+    path = write_obj(tmp_path / "a.obj")
+    for colour in ("nan 0 0", "1 inf 0", "red 0 0"):
+        path.with_suffix(".mtl").write_text(f"newmtl skin\nKd {colour}\n")
+        assert f"material 'skin' has the colour '{colour}'; expected three numbers" in refusal(path)
+
+
+def test_names_of_materials_in_other_encodings(tmp_path: Path) -> None:
+    path = write_obj(tmp_path / "a.obj")
+    for file in (path, path.with_suffix(".mtl")):
+        file.write_bytes(file.read_bytes().replace(b"back", "weiß".encode("latin-1")).replace(b"skin\n", "größe\n".encode("latin-1")))
+    assert notes(path) == []
+
+
+def test_texture_coordinates_beyond_all_measure(tmp_path: Path) -> None:
+    path = write_obj(tmp_path / "a.obj")
+    path.write_text(path.read_text().replace("vt 0 0", "vt 1e300 nan").replace("vt 1 1", "vt -1e20 inf"))
+    assert notes(path) == []
+
+
+# glTF ----------------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"asset": {"version": "1.0"}}, "version 1.0"),
+        ({"asset": {}}, "nothing called 'version'"),
+        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "needs the glTF extension KHR_draco_mesh_compression, which is not read"),
+        ({"extensionsRequired": ["EXT_meshopt_compression"]}, "EXT_meshopt_compression, which is not read; expected a plain export"),
+        ({"bufferViews": [{"buffer": 0, "byteLength": 100}]}, "bufferViews[0] ends at byte 100 of 44"),
+        ({"bufferViews": []}, "list index out of range"),
+        ({"nodes": [{"mesh": -1}]}, "an index is -1"),
+        ({"nodes": [{"mesh": 0, "matrix": [1, 2, 3]}]}, "nodes[0] has a transform of another length"),
+        ({"nodes": [{"mesh": 0, "scale": [1, 2, "x"]}]}, "could not convert"),
+        ({"nodes": [{"mesh": 0, "scale": [1, 2, 1e999]}]}, "a number is inf"),
+        ({"scenes": [{"nodes": [7]}]}, "list index out of range"),
+        ({"meshes": 5}, "not iterable"),
+        ({"meshes": [{"primitives": [{"attributes": {}}]}]}, "nothing called 'POSITION'"),
+        ({"meshes": [{"primitives": [{"attributes": {"POSITION": 1}}]}]}, "accessors[1] is SCALAR, not VEC3"),
+        ({"meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 9}]}]}, "a primitive of mode 9"),
+    ],
+)
+def test_damaged_documents(tmp_path: Path, changes: dict[str, Any], text: str) -> None:
+    assert text in refusal(write_gltf(tmp_path / "a.gltf", **changes))
+
+
+def test_textures_of_formats_for_graphics_cards(tmp_path: Path) -> None:
+    texture = {"extensions": {"KHR_texture_basisu": {"source": 0}}}
+    material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+    path = write_gltf(tmp_path / "a.gltf", textures=[texture], materials=[material])
+    assert "a texture has KHR_texture_basisu, which is not read" in refusal(path)
+
+
+def test_an_index_beyond_the_vertices(tmp_path: Path) -> None:
+    path = write_gltf(tmp_path / "a.gltf")
+    (tmp_path / "triangle.bin").write_bytes(gltf()[1][:36] + struct.pack("<4H", 0, 1, 3, 0))
+    assert "an index of 3, with 3 vertices" in refusal(path)
+
+
+def test_a_glb_that_is_cut_off(tmp_path: Path) -> None:
+    whole = write_glb(tmp_path / "a.glb").read_bytes()
+    for length in (3, 19, 30, len(whole) // 2, len(whole) - 1):
+        (tmp_path / "a.glb").write_bytes(whole[:length])
+        assert "damaged glTF" in refusal(tmp_path / "a.glb")
+    (tmp_path / "a.glb").write_bytes(b"glTX" + whole[4:])
+    assert "starts with b'glTX'" in refusal(tmp_path / "a.glb")
+
+
+# Whatever else -------------------------------------------------------------------------------------------------------------------------
+
+
+def _glb(path: Path) -> Path:
+    ball = trimesh.creation.icosphere(1)
+    ball.visual.vertex_colors = np.full((len(ball.vertices), 4), 99, np.uint8)
+    return write_glb(path, (textured(), np.eye(4)), (ball, np.eye(4)))
+
+
+def _ascii(path: Path) -> Path:
+    mesh = trimesh.Trimesh(*cube()[:2], process=False)
+    data = trimesh.exchange.ply.export_ply(mesh, encoding="ascii") if path.suffix == ".ply" else mesh.export(file_type="stl_ascii").encode()
+    path.write_bytes(data)
+    return path
+
+
+WRITERS: dict[str, Callable[[Path], Path]] = {
+    "a.glb": _glb,
+    "a.obj": write_obj,
+    "a.gltf": write_gltf,
+    "a.ply": lambda path: write_ply(path, *cube()[:2], np.full((24, 3), 9, np.uint8)),
+    "a.text.ply": _ascii,
+    "a.stl": _ascii,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("seed", range(3))
+def test_damage_of_any_kind_is_an_error_of_the_file_or_harmless(tmp_path: Path, name: str, seed: int) -> None:
+    path = WRITERS[name](tmp_path / name)
+    whole, generated = path.read_bytes(), random.Random(seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for _ in range(25):
+            data = bytearray(whole)
+            for _ in range(generated.choice((1, 3, 20))):
+                at = generated.randrange(len(data))
+                if generated.random() < 0.2:
+                    del data[at : at + generated.randrange(1, 40)]
+                else:
+                    data[at] = generated.choice((0, 255, 45, 57, 10, generated.randrange(256)))
+            path.write_bytes(bytes(data))
+            try:
+                model = generator._READERS[path.suffix](files.Folder(path, True))
+                generator.Surface(model, parts.read_parts(model), model.upward, 0.01).intersect([[3.0, 0.1, 0.2]], [[-1.0, 0, 0]])
+            except DataError as error:
+                assert "a." in str(error) and "\n" not in str(error)

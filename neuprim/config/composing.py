@@ -17,7 +17,7 @@ from neuprim.config.groups import check_groups, check_scene, presets, task_choic
 from neuprim.config.outputs import output_directory
 from neuprim.config.overrides import Assignment, expand_sweep, parse, sweep_names, swept_keys
 from neuprim.config.record import RunConfig, RunSettings
-from neuprim.config.resuming import not_installed
+from neuprim.config.resuming import not_installed, units_as_begun
 from neuprim.config.schema import REQUIRED, defaults, is_free, like, setting_names
 from neuprim.core.checked import checked, shown
 from neuprim.core.errors import ConfigError, nearest
@@ -101,6 +101,9 @@ def _composed(
     added = None if found.added_by is None else Maker.of(found.added_by, scene_name)
     directory = output_directory(settings.output_dir, f"{_in_path(task_word)}-{_in_path(scene_word)}", settings.resume, check_output)
     full["scene"] = scene
+    units = plain["train"]["rate_units"]
+    if settings.resume and settings.train.rate_units == units:
+        settings.train.rate_units = dict(units_as_begun(directory, preset, units))
     changed = {"preset": (own.preset, preset)} if preset != own.preset else {}
     return RunConfig(
         task=spec.name,

@@ -20,7 +20,7 @@ from neuprim.core.uses import OPTIONAL
 from neuprim.plugins.names import split
 from neuprim.plugins.provenance import MadeBy
 
-__all__ = ["RunConfig", "RunSettings"]
+__all__ = ["RunConfig", "RunSettings", "recorded"]
 
 MAX_BYTES = 1_000_000
 """A configuration has a few kilobytes; anything larger is another file."""
@@ -190,6 +190,14 @@ def _read(file: Path) -> Mapping[str, Any]:
     if not isinstance(data, Mapping):
         raise CheckpointError(f"{file}: not a run's configuration (expected a mapping, found {type(data).__name__})")
     return data
+
+
+def recorded(directory: Path) -> Mapping[str, Any] | None:
+    """What a run directory's ``config.yaml`` says, as it stands there; None where there is no such file or it is damaged."""
+    try:
+        return _read(directory / "config.yaml")
+    except CheckpointError:
+        return None
 
 
 def _has(data: Mapping[str, Any], name: str) -> bool:

@@ -121,6 +121,7 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
 
     evaluate = command("eval", _eval, "measure a run on its test views")
     evaluate.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    evaluate.add_argument("--lpips", type=Path, metavar="FILE", help="measure LPIPS with these weights of your own, a file or a folder")
 
     render = command(
         "render",
@@ -241,7 +242,7 @@ def _eval(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
     from neuprim.runs.measure import evaluate_run
 
-    _print_metrics(evaluate_run(run_dir))
+    _print_metrics(evaluate_run(run_dir, args.lpips))
     return 0
 
 

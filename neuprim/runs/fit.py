@@ -163,7 +163,8 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss
     model = initial_model(density, colour, dataset, config.model, config.seed)
     # A preset has rates for every density and colour of its task; the trainer refuses names that the model does not have.
     others = task.parameter_names() - model.params.keys()
-    rates, units = ({k: v for k, v in given.items() if k not in others} for given in (config.train.rates, config.train.rate_units))
+    rates = {k: v for k, v in config.train.rates.items() if k not in others}
+    units = {k: v for k, v in config.train.rate_units.items() if k not in others}
     settings = replace(config.train, rates=rates, rate_units=units)
     return Trainer(model, dataset, loss or make_loss(config, task), settings, config.renderer, config.seed)
 

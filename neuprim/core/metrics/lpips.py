@@ -27,12 +27,12 @@ class _Layer(NamedTuple):
     """A convolution with its rectifier.
 
     Attributes:
-        index: its number in torchvision's ``features``.
+        number: where it stands in torchvision's ``features``.
         pool: side of the maximum, in steps of 2, that is taken before it; 0 for none.
         tap: whether the distance looks at what comes out.
     """
 
-    index: int
+    number: int
     inputs: int
     outputs: int
     side: int
@@ -166,7 +166,7 @@ def _made(found: Mapping[str, Any], where: Path) -> Lpips:
                 parts[match[2] if pattern is _CONVOLUTION else "linear", int(match[1])] = value.detach().float()
     indices = {index for name, index in parts if name == "weight"}
     for network, layers in _NETWORKS.items():
-        if indices == {layer.index for layer in layers}:
+        if indices == {layer.number for layer in layers}:
             return _fitting(network, layers, parts, where)
     raise DataError(f"{where}: convolutions {sorted(indices) or 'none'}; expected those of AlexNet or VGG16, as features.N or net.sliceM.N")
 
@@ -180,7 +180,7 @@ def _fitting(network: str, layers: tuple[_Layer, ...], parts: Mapping[tuple[str,
             raise DataError(f"{where}: {label} of LPIPS ({network}): {state}; expected finite numbers of shape {shape}")
         return value
 
-    weights = tuple(part("weight", l.index, l.outputs, l.inputs, l.side, l.side) for l in layers)
-    biases = tuple(part("bias", l.index, l.outputs) for l in layers)
+    weights = tuple(part("weight", l.number, l.outputs, l.inputs, l.side, l.side) for l in layers)
+    biases = tuple(part("bias", l.number, l.outputs) for l in layers)
     taps = [l for l in layers if l.tap]
     return Lpips(network, weights, biases, tuple(part("linear", i, 1, l.outputs, 1, 1).flatten() for i, l in enumerate(taps)))

@@ -89,7 +89,7 @@ def _dispatch(words: list[str]) -> int:
     if not words[0].startswith("-") and words[0] not in commands:
         raise ConfigError(f"{words[0]}: no such command{nearest(words[0], commands)}")
     args, rest = parser.parse_known_args(words)
-    if args.command == "run":
+    if args.command in ("run", "bench"):
         args.overrides += [word for word in rest if not word.startswith("-")]  # argparse gives up on words after a flag
         rest = [word for word in rest if word.startswith("-")]
     if args.command in ("render", "inspect"):
@@ -191,6 +191,9 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
     new = command("new-task", _new_task, "write a small working package with a task of your own: see docs/plugins.md")
     new.add_argument("name", metavar="NAME", help="what users will type after task=: lower-case letters, digits and _")
     new.add_argument("--out", type=Path, metavar="DIR", help="a folder that does not exist yet (default: neuprim-NAME)")
+
+    bench = command("bench", _bench, "the paper's tables, and runs of their protocol on data that you have")
+    arguments.for_bench(bench)
 
     command("doctor", _doctor, "show versions, devices and which renderer backends work here")
     return parser, dict(sub.choices)
@@ -321,6 +324,12 @@ def _new_task(args: argparse.Namespace) -> int:
 
     print(*new_task(args.name, args.out), sep="\n")
     return 0
+
+
+def _bench(args: argparse.Namespace) -> int:
+    from neuprim.cli.bench import bench
+
+    return bench(args, _fit)
 
 
 def _doctor(args: argparse.Namespace) -> int:

@@ -184,7 +184,7 @@ def summary(
     lpips: Lpips | None = None,
 ) -> dict[str, Any]:
     """The content of ``metrics.json``. ``training`` holds iterations and train_seconds as the run recorded them."""
-    worst = min(views, key=lambda v: v.psnr)
+    worst, camera = min(views, key=lambda v: v.psnr), dataset.test.view(0).camera
     lowered = model.lower(dataset.test.view(0).camera, dataset.test.view(0).conditions, config.renderer)
     backend = choose(lowered, config.renderer)
     seconds = sorted(v.seconds for v in views)
@@ -212,6 +212,7 @@ def summary(
         "device": backend.device(),
         "checkpoint": "last",
         "downsampling": dataset.downsampling,
+        "image_size": [camera.width, camera.height],
         "background": [round(float(x), 6) for x in dataset.background],
         "color_space": dataset.color_space,
         "channels": list(channels.names),

@@ -101,6 +101,28 @@ def test_other_files_are_refused_in_one_line(tmp_path: Path, change, text: str) 
     assert str(caught.value).startswith(str(tmp_path / "weights.pth")) and text in str(caught.value) and "\n" not in str(caught.value)
 
 
+class _Hostile:
+    """Touches a file when it is unpickled."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Path.touch, (self.file,)
+
+
+def test_no_code_in_a_file_is_run(tmp_path: Path) -> None:
+    touched = tmp_path / "touched"
+    path = tmp_path / "weights.pth"
+    torch.save({**weights("alex"), "more": _Hostile(touched)}, path)
+    torch.load(path, weights_only=False)
+    assert touched.exists()
+    touched.unlink()
+    with pytest.raises(DataError, match="cannot be read as weights"):
+        Lpips.load(path)
+    assert not touched.exists()
+
+
 def test_absent_damaged_and_empty(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.pth").write_text("weights")

@@ -293,14 +293,16 @@ def test_every_module_says_what_it_is_for() -> None:
 
 
 def test_nothing_unpickles_or_evaluates() -> None:
-    """No file of a user's is ever executed."""
+    """No file of a user's is ever executed; torch's own unpickler may read one where it is told to take nothing but tensors."""
     wrong = []
     for f in FILES:
         for node in ast.walk(ast.parse(f.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("eval", "exec"):
                 wrong.append(f"{f.relative_to(ROOT)}:{node.lineno}")
+            tensors_alone = isinstance(node, ast.Call) and "weights_only=True" in [ast.unparse(k) for k in node.keywords]
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "torch.load" and not tensors_alone:
+                wrong.append(f"{f.relative_to(ROOT)}:{node.lineno}")
             if isinstance(node, ast.Call) and ast.unparse(node.func) in (
-                "torch.load",
                 "pickle.load",
                 "pickle.loads",
                 "yaml.load",

@@ -17,6 +17,7 @@ FIELDS = [(cls, name) for cls in CLASSES for name in hints_of(cls)]
 GROUPS = {
     "RunSettings": "",
     "RenderSettings": "renderer",
+    "MetricsSettings": "metrics",
     "ModelSettings": "model",
     "TrainSettings": "train",
     "PopulationSettings": "train.population",

@@ -34,7 +34,7 @@ commonest keys:
   output_dir=DIR resume=true           where to write; continue an interrupted run
   train.iterations=N train.max_seconds=S
   model.primitives=N model.neurons=K model.sh_degree=D
-  train.rates.NAME=R                   learning rate of one parameter
+  train.rates.NAME=R                   learning rate of one parameter; train.rate_units.NAME=absolute|extent
   renderer.backend=auto|NAME           `neuprim doctor` lists them
   renderer.sort=center|entry           renderer.samples=N (rays per pixel side) renderer.threads=N
   seed=N
@@ -89,7 +89,7 @@ def _dispatch(words: list[str]) -> int:
     if not words[0].startswith("-") and words[0] not in commands:
         raise ConfigError(f"{words[0]}: no such command{nearest(words[0], commands)}")
     args, rest = parser.parse_known_args(words)
-    if args.command == "run":
+    if args.command in ("run", "bench"):
         args.overrides += [word for word in rest if not word.startswith("-")]  # argparse gives up on words after a flag
         rest = [word for word in rest if word.startswith("-")]
     if args.command in ("render", "inspect"):
@@ -121,6 +121,7 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
 
     evaluate = command("eval", _eval, "measure a run on its test views")
     evaluate.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    evaluate.add_argument("--lpips", type=Path, metavar="FILE", help="measure LPIPS with these weights of your own, a file or a folder")
 
     render = command(
         "render",
@@ -191,6 +192,9 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
     new.add_argument("name", metavar="NAME", help="what users will type after task=: lower-case letters, digits and _")
     new.add_argument("--out", type=Path, metavar="DIR", help="a folder that does not exist yet (default: neuprim-NAME)")
 
+    bench = command("bench", _bench, "the paper's tables, and runs of their protocol on data that you have")
+    arguments.for_bench(bench)
+
     command("doctor", _doctor, "show versions, devices and which renderer backends work here")
     return parser, dict(sub.choices)
 
@@ -241,7 +245,7 @@ def _eval(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
     from neuprim.runs.measure import evaluate_run
 
-    _print_metrics(evaluate_run(run_dir))
+    _print_metrics(evaluate_run(run_dir, args.lpips))
     return 0
 
 
@@ -320,6 +324,12 @@ def _new_task(args: argparse.Namespace) -> int:
 
     print(*new_task(args.name, args.out), sep="\n")
     return 0
+
+
+def _bench(args: argparse.Namespace) -> int:
+    from neuprim.cli.bench import bench
+
+    return bench(args, _fit)
 
 
 def _doctor(args: argparse.Namespace) -> int:

@@ -1,12 +1,27 @@
-"""Values of command-line flags, from their text."""
+"""Values of command-line flags, from their text; and the flags of ``bench``, which are many."""
 
 from __future__ import annotations
 
 import argparse
 import math
 import re
+from pathlib import Path
 
-__all__ = ["count", "numbers", "rate", "row", "size"]
+__all__ = ["count", "for_bench", "numbers", "rate", "row", "size"]
+
+
+def for_bench(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of ``neuprim bench``."""
+    parser.add_argument("what", choices=["paper"], help="which tables")
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings over the protocol's, e.g. scene.downsample=4")
+    parser.add_argument("--tables", default="3-7", metavar="N", help="numbers of the paper's tables, e.g. 3-5 or 6,7 (default: 3-7)")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="a folder per scene; without it the tables are listed")
+    parser.add_argument("--scenes", metavar="NAME", help="some of them, e.g. chair,lego; chair=FOLDER where the folder has another name")
+    parser.add_argument("--rows", metavar="NAME", help="some of the rows: 200, 5k, nolimit, real")
+    parser.add_argument("--budget", default="full", metavar="TIME", help="training time of a run, e.g. 10m; full: 100,000 steps (default)")
+    parser.add_argument("--seeds", type=count, default=1, metavar="N", help="runs of each, with seeds from 0 (default: 1)")
+    parser.add_argument("--out", type=Path, default=Path("outputs/paper"), metavar="DIR", help="gets a run directory each")
+    parser.add_argument("--estimate", action="store_true", help="only say what would run, and for how long")
 
 
 def size(text: str) -> tuple[int, int]:

@@ -17,10 +17,11 @@ from neuprim.config.groups import check_groups, check_scene, presets, task_choic
 from neuprim.config.outputs import output_directory
 from neuprim.config.overrides import Assignment, expand_sweep, parse, sweep_names, swept_keys
 from neuprim.config.record import RunConfig, RunSettings
-from neuprim.config.resuming import not_installed
+from neuprim.config.resuming import not_installed, units_as_begun
 from neuprim.config.schema import REQUIRED, defaults, is_free, like, setting_names
 from neuprim.core.checked import checked, shown
 from neuprim.core.errors import ConfigError, nearest
+from neuprim.core.settings import MetricsSettings
 from neuprim.core.uses import build_settings
 from neuprim.plugins.blame import blamed
 from neuprim.plugins.names import split
@@ -101,6 +102,11 @@ def _composed(
     added = None if found.added_by is None else Maker.of(found.added_by, scene_name)
     directory = output_directory(settings.output_dir, f"{_in_path(task_word)}-{_in_path(scene_word)}", settings.resume, check_output)
     full["scene"] = scene
+    if settings.metrics.lpips is not None:
+        settings.metrics = MetricsSettings(str(Path(settings.metrics.lpips).expanduser().absolute()))
+    units = plain["train"]["rate_units"]
+    if settings.resume and settings.train.rate_units == units:
+        settings.train.rate_units = dict(units_as_begun(directory, preset, units))
     changed = {"preset": (own.preset, preset)} if preset != own.preset else {}
     return RunConfig(
         task=spec.name,
@@ -110,6 +116,7 @@ def _composed(
         model=settings.model,
         train=settings.train,
         renderer=settings.renderer,
+        metrics=settings.metrics,
         output_dir=directory,
         seed=settings.seed,
         resume=settings.resume,

@@ -116,7 +116,7 @@ def _dotted(where: str, value: Any) -> Iterator[str]:
 
 
 def check_names(spec: TaskSpec, settings: RunSettings) -> None:
-    """Refuse names under ``model.init`` and ``train.rates`` that no field of the task has, as far as the task lists its fields.
+    """Refuse names under ``model.init``, ``train.rates`` and ``train.rate_units`` that no field of the task has, as far as the task lists its fields.
 
     The model itself may have fewer; what it lacks is refused when it is made.
     """
@@ -126,9 +126,10 @@ def check_names(spec: TaskSpec, settings: RunSettings) -> None:
     init = {"scale", "points", *(name for cls in classes for name in cls.init_settings)}
     refuse_unknown(settings.model.init, init, "model.init")
     try:
-        rates = {s.name for s in (*GEOMETRY_SPECS, *(s for cls in classes for s in cls.every_parameter()))}
+        parameters = {s.name for s in (*GEOMETRY_SPECS, *(s for cls in classes for s in cls.every_parameter()))}
     except TypeError:  # a field that cannot be made without settings
         return
-    for key in settings.train.rates:
-        if key not in rates:
-            raise ConfigError(f"train.rates.{key}: no such parameter{nearest(key, rates)}")
+    for group, given in (("rates", settings.train.rates), ("rate_units", settings.train.rate_units)):
+        for key in given:
+            if key not in parameters:
+                raise ConfigError(f"train.{group}.{key}: no such parameter{nearest(key, parameters)}")

@@ -13,14 +13,14 @@ import yaml
 from neuprim.core.checked import Range, checked, refuse_unknown, verify
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.render import backends
-from neuprim.core.settings import RenderSettings
+from neuprim.core.settings import MetricsSettings, RenderSettings
 from neuprim.core.train import population
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.uses import OPTIONAL
 from neuprim.plugins.names import split
 from neuprim.plugins.provenance import MadeBy
 
-__all__ = ["RunConfig", "RunSettings"]
+__all__ = ["RunConfig", "RunSettings", "recorded"]
 
 MAX_BYTES = 1_000_000
 """A configuration has a few kilobytes; anything larger is another file."""
@@ -33,6 +33,7 @@ class RunSettings:
     model: ModelSettings = field(default_factory=ModelSettings)
     train: TrainSettings = field(default_factory=TrainSettings)
     renderer: RenderSettings = field(default_factory=RenderSettings)
+    metrics: MetricsSettings = field(default_factory=MetricsSettings)
     output_dir: str | None = None
     seed: Annotated[int, Range(0, 2**63 - 1, says="a whole number from 0 to 2^63 - 1")] = 0
     resume: bool = False
@@ -68,6 +69,7 @@ class RunConfig:
     train: TrainSettings
     renderer: RenderSettings
     output_dir: Path
+    metrics: MetricsSettings = field(default_factory=MetricsSettings)
     seed: int = 0
     resume: bool = False
     options: dict[str, Any] = field(default_factory=dict)
@@ -85,6 +87,7 @@ class RunConfig:
             "model": dataclasses.asdict(self.model),
             "train": dataclasses.asdict(self.train),
             "renderer": dataclasses.asdict(self.renderer),
+            "metrics": dataclasses.asdict(self.metrics),
             "output_dir": str(self.output_dir),
             "seed": self.seed,
             "resume": self.resume,
@@ -144,6 +147,7 @@ class RunConfig:
             model=common.model,
             train=common.train,
             renderer=common.renderer,
+            metrics=common.metrics,
             output_dir=Path(common.output_dir),
             seed=common.seed,
             resume=common.resume,
@@ -190,6 +194,14 @@ def _read(file: Path) -> Mapping[str, Any]:
     if not isinstance(data, Mapping):
         raise CheckpointError(f"{file}: not a run's configuration (expected a mapping, found {type(data).__name__})")
     return data
+
+
+def recorded(directory: Path) -> Mapping[str, Any] | None:
+    """What a run directory's ``config.yaml`` says, as it stands there; None where there is no such file or it is damaged."""
+    try:
+        return _read(directory / "config.yaml")
+    except CheckpointError:
+        return None
 
 
 def _has(data: Mapping[str, Any], name: str) -> bool:

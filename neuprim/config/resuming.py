@@ -1,21 +1,22 @@
-"""What a run that goes on says about itself, where the words for it name a plugin that is not installed."""
+"""What a run that goes on has from its directory: who made it, where that is not installed, and the units that its rates began in."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from neuprim.config.outputs import ROOT
 from neuprim.config.overrides import Assignment
-from neuprim.config.record import RunConfig
+from neuprim.config.record import RunConfig, recorded
 from neuprim.core.errors import ConfigError, NeuprimError
+from neuprim.core.notices import warn_once
 from neuprim.plugins.mechanism import Group, UnknownPlugin
 from neuprim.plugins.names import qualified, split
 from neuprim.plugins.provenance import Maker, missing
 from neuprim.plugins.registry import LOSSES, SCENES, TASKS
 
-__all__ = ["not_installed"]
+__all__ = ["not_installed", "units_as_begun"]
 
 
 def not_installed(assignments: Sequence[Assignment], task: str, scene: str | None) -> ConfigError | None:
@@ -49,6 +50,27 @@ def not_installed(assignments: Sequence[Assignment], task: str, scene: str | Non
         except UnknownPlugin:
             return ConfigError(f"{directory / 'config.yaml'}: {missing(group, maker, entry)}")
     return None
+
+
+def units_as_begun(directory: Path, preset: str, units: Mapping[str, Any]) -> Mapping[str, Any]:
+    """``train.rate_units`` of a run that goes on and for which none were typed.
+
+    A run that is older than these, or than those of its preset, had its rates in the parameters' own units: others would change its speed
+    half way.
+
+    Args:
+        directory: of the run; it may be new.
+        preset: as chosen now.
+        units: the preset's.
+    """
+    begun = recorded(directory)
+    if not units or begun is None or begun.get("preset") != preset or (begun.get("train") or {}).get("rate_units"):
+        return units
+    names = ", ".join(units)
+    warn_once(
+        f"{directory / 'config.yaml'}: without train.rate_units; rates of {names} go on in the unit that they began in, the parameter's own"
+    )
+    return {}
 
 
 def _latest(task: str) -> Path | None:

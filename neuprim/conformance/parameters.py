@@ -30,14 +30,17 @@ def check_members(t: Subject) -> None:
 
 
 def check_files(t: Subject) -> None:
-    """Every scene and preset has a YAML file that composes, and rates only for parameters that exist, so that no choice is a dead end."""
+    """Every scene and preset has a YAML file that composes, and rates and their units only for parameters that exist, so that no choice is a dead end."""
     check_groups(t.task)
     choice = task_choices(t.task)
     known = t.task.parameter_names() | {s.name for s in GEOMETRY_SPECS}
     for preset in presets(t.task):
         settings = preset_settings(t.task, preset, choice.scene)
-        for name in settings.train.rates:
-            t.require(name in known, f"preset {preset}: train.rates.{name}", "no such parameter", f"one of {', '.join(sorted(known))}")
+        for group, given in (("rates", settings.train.rates), ("rate_units", settings.train.rate_units)):
+            for name in given:
+                t.require(
+                    name in known, f"preset {preset}: train.{group}.{name}", "no such parameter", f"one of {', '.join(sorted(known))}"
+                )
         try:
             t.task.check(build_settings(t.task, settings.model, choice.options))
         except ConfigError as error:

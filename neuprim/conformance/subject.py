@@ -134,7 +134,8 @@ class Subject:
         model, train = self.fresh(seed), self.settings.train
         population = PopulationSettings(strategy=strategy, every=2, start=0.0, stop=1.0, fraction=0.2)
         rates = {name: rate for name, rate in train.rates.items() if name in model.params}
-        short = TrainSettings(iterations=iterations, rates=rates, ssim_weight=train.ssim_weight, population=population)
+        units = {name: unit for name, unit in train.rate_units.items() if name in model.params}
+        short = TrainSettings(iterations=iterations, rates=rates, rate_units=units, ssim_weight=train.ssim_weight, population=population)
         loss = self.task.loss(loss_settings(self.task, short, self.options))
         return Trainer(model, self.dataset, loss, short, self.settings.renderer, seed)
 

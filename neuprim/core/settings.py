@@ -1,4 +1,4 @@
-"""Every knob that trades speed for accuracy, in one place."""
+"""Every knob that trades speed for accuracy, in one place, and what is measured on request."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from neuprim.core.checked import Range, text, verify
 
-__all__ = ["RenderSettings", "SortOrder"]
+__all__ = ["MetricsSettings", "RenderSettings", "SortOrder"]
 
 SortOrder = Literal["center", "entry"]
 
@@ -46,3 +46,18 @@ class RenderSettings:
 
     def __post_init__(self) -> None:
         verify(self, "renderer")
+
+
+@dataclass(frozen=True)
+class MetricsSettings:
+    """What a run measures beside its usual numbers; part of its configuration as ``metrics``.
+
+    Attributes:
+        lpips: weights for LPIPS, a file or a folder that :meth:`neuprim.core.metrics.lpips.Lpips.load` reads; None does not measure it.
+            neuprim has no weights and downloads none.
+    """
+
+    lpips: Annotated[str, text("a file or folder with the weights of LPIPS")] | None = None
+
+    def __post_init__(self) -> None:
+        verify(self, "metrics")

@@ -19,7 +19,7 @@ __all__ = ["TaskFault", "clips_of", "diagnosed", "facts_of", "judged", "mask_of"
 
 Kind = TypeVar("Kind")
 
-_OURS = ("name", "psnr", "ssim", "seconds")  # of a view, in metrics.json
+_OURS = ("name", "psnr", "ssim", "ssim_3dgs", "lpips", "lpips_3dgs", "seconds")  # of a view, in metrics.json
 
 
 class TaskFault(NeuprimError):

@@ -100,7 +100,8 @@ def _final_tiles(run: RunRecord) -> list[Tile]:
     return [
         ("PSNR, mean", decimal(mean, 2), _unit("dB", mean), f"{count(views)} {split} view{'s' if views != 1 else ''}" if views else ""),
         ("PSNR, worst view", decimal(worst, 2), _unit("dB", worst), escape(name) if name else ""),
-        ("SSIM", decimal(similarity, 4), "", "" if similarity is None else "mean over views"),
+        ("SSIM", decimal(similarity, 4), "", "" if similarity is None else "mean over views" + _padded(metrics)),
+        *_lpips_tile(metrics),
         *_masked_tile(metrics),
         ("Primitives", count(metrics.get("primitives")), "", ""),
         ("Parameters", count(metrics.get("parameters")), "", "" if each is None else f"{count(each)} per primitive"),
@@ -108,6 +109,22 @@ def _final_tiles(run: RunRecord) -> list[Tile]:
         ("Training", duration(metrics.get("train_seconds")), "", "" if iterations is None else f"{count(iterations)} iterations"),
         ("Rendering", decimal(fps, 1 if fps is None or fps < 100 else 0), _unit("fps", fps), escape(backend) if backend else ""),
     ]
+
+
+def _padded(metrics: Mapping[str, object]) -> str:
+    """SSIM as other tools count it, for a note."""
+    value = from_json(metrics, "ssim_3dgs")
+    return "" if value is None else f"; as displayed, by 3DGS’s rule: {decimal(value, 4)}"
+
+
+def _lpips_tile(metrics: Mapping[str, object]) -> list[Tile]:
+    value, why = from_json(metrics, "lpips"), metrics.get("not_measured")
+    if value is not None:
+        rule = from_json(metrics, "lpips_3dgs")
+        more = "" if rule is None else f"; by 3DGS’s rule: {decimal(rule, 4)}"
+        return [("LPIPS", decimal(value, 4), "", f"{escape(metrics.get('lpips_network'))}, mean over views{more}")]
+    reason = why.get("lpips") if isinstance(why, Mapping) else None
+    return [] if reason is None else [("LPIPS", MISSING, "", f"not measured: {escape(reason)}")]
 
 
 def _masked_tile(metrics: Mapping[str, object]) -> list[Tile]:

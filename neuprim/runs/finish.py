@@ -49,7 +49,7 @@ def finish(fitted: Fitted, directory: Path) -> None:
             images.write_png(folder / f"{stem}_truth.png", channels.display(truth))
             images.write_png(folder / f"{stem}_error.png", torch.from_numpy(error_map(rendered, truth)))
 
-    views = measure(model, task, dataset, config.renderer, channels, keep)
+    views = measure(model, task, dataset, config.renderer, channels, keep, fitted.lpips)
     for clip in clips:
         if clip.source is None:
             continue  # drawn above
@@ -57,7 +57,7 @@ def finish(fitted: Fitted, directory: Path) -> None:
             truth = clip.source.pixels(i).over(dataset.background)
             film(clip, i, draw(model, clip.source.view(i), config.renderer, dataset.background), truth)
     size = (directory / "model.safetensors").stat().st_size
-    write_json(directory / "metrics.json", summary(config, model, task, dataset, channels, views, size, fitted.training))
+    write_json(directory / "metrics.json", summary(config, model, task, dataset, channels, views, size, fitted.training, fitted.lpips))
     views_around = orbit_of(task, dataset, _ORBIT_FRAMES)
     frames = [channels.display(draw(model, v, config.renderer, dataset.background)) for v in views_around]
     images.write_animation(folder / "orbit.webp", frames, fps=12.0)

@@ -13,6 +13,7 @@ from neuprim.config import RunConfig, made_now, suspects_of, task_of
 from neuprim.core.channels import Channels, channels_of
 from neuprim.core.data import Dataset
 from neuprim.core.data.check import check_dataset
+from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import Loss, TaskSpec
 from neuprim.core.train.trainer import StepReport, Trainer, initial_model
@@ -39,6 +40,7 @@ class Fitted:
     dataset: Dataset
     channels: Channels
     trainer: Trainer
+    lpips: Lpips | None = None
 
     @property
     def model(self) -> Primitives:
@@ -58,9 +60,9 @@ class Fitted:
     def metrics(self) -> dict[str, Any]:
         """The content of ``metrics.json``, measured on the test views; the model's size is that of its tensors."""
         self.unlock()
-        views = measure(self.model, self.task, self.dataset, self.config.renderer, self.channels)
+        views = measure(self.model, self.task, self.dataset, self.config.renderer, self.channels, lpips=self.lpips)
         size = 4 * sum(value.numel() for value in self.model.params.values())
-        return summary(self.config, self.model, self.task, self.dataset, self.channels, views, size, self.training)
+        return summary(self.config, self.model, self.task, self.dataset, self.channels, views, size, self.training, self.lpips)
 
 
 def fit(config: RunConfig, events: Events = silent, dataset: Dataset | None = None) -> Fitted:
@@ -96,6 +98,7 @@ def start(config: RunConfig, events: Events = silent, dataset: Dataset | None = 
     task = task_of(config)
     config = replace(config, made_by=made_now(config, task))
     loss = make_loss(config, task)  # options that it refuses must not cost the loading of the data
+    lpips = None if config.metrics.lpips is None else Lpips.load(config.metrics.lpips)
     if dataset is None:
         dataset = load_dataset(config, task, lambda text, fraction: events(Preparing(text, fraction)))
     if suspects is not None:
@@ -107,7 +110,7 @@ def start(config: RunConfig, events: Events = silent, dataset: Dataset | None = 
     if channels.partial:
         events(Note(f"shown: {channels.shown}; task {task.name!r} has no display that shows them all"))
     events(Preparing("starting points"))
-    return Fitted(config, task, dataset, channels, make_trainer(config, task, dataset, loss))
+    return Fitted(config, task, dataset, channels, make_trainer(config, task, dataset, loss), lpips)
 
 
 def steps(trainer: Trainer, events: Events = silent) -> Iterator[tuple[StepReport, float | None]]:
@@ -160,7 +163,9 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss
     model = initial_model(density, colour, dataset, config.model, config.seed)
     # A preset has rates for every density and colour of its task; the trainer refuses names that the model does not have.
     others = task.parameter_names() - model.params.keys()
-    settings = replace(config.train, rates={k: v for k, v in config.train.rates.items() if k not in others})
+    rates = {k: v for k, v in config.train.rates.items() if k not in others}
+    units = {k: v for k, v in config.train.rate_units.items() if k not in others}
+    settings = replace(config.train, rates=rates, rate_units=units)
     return Trainer(model, dataset, loss or make_loss(config, task), settings, config.renderer, config.seed)
 
 

@@ -3,7 +3,9 @@
 PSNR and SSIM compare float images in the data set's own colour space, unclamped and unquantised. A linear data set also gets
 both after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``), if its channels are red, green and blue; a task with a display
 of its own gets both of what that shows instead (``psnr_display``, ``ssim_display``). Where it marks a part of a view (the union of all that a
-camera ever sees of a volume), the error there counts on its own: a black background flatters.
+camera ever sees of a volume), the error there counts on its own: a black background flatters. For comparing with other people's tables
+``ssim_3dgs`` is the SSIM of what is displayed as the tools of 3D Gaussian splatting count it, and ``lpips`` and ``lpips_3dgs``, where the user has
+weights, are LPIPS as published and as these tools take it.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ from neuprim.core.channels import Channels, channels_of
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.check import check_dataset, check_pixels
 from neuprim.core.io import images
-from neuprim.core.metrics import means, psnr, ssim, to_json
+from neuprim.core.metrics import means, psnr, ssim, ssim_3dgs, to_json
+from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, choose, render
@@ -44,7 +47,7 @@ class ViewMetrics:
         psnr, ssim: in the data set's colour space.
         seconds: of the forward pass alone.
         more: further numbers by name: ``psnr_srgb``, ``ssim_srgb`` of linear images, or ``psnr_display``, ``ssim_display`` of what the
-            task's own display shows; ``psnr_mask`` and ``mse_mask`` inside the task's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without
+            task's own display shows; ``ssim_3dgs``, ``lpips``; ``psnr_mask`` and ``mse_mask`` inside the task's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without
             anything on it; what the task's :attr:`~neuprim.core.task.TaskSpec.judge` adds.
     """
 
@@ -93,10 +96,13 @@ def measure(
     settings: RenderSettings,
     channels: Channels,
     seen: Callable[[int, View, Tensor, Tensor], None] | None = None,
+    lpips: Lpips | None = None,
 ) -> list[ViewMetrics]:
     """Every view of the test split, composited over the data set's background.
 
-    ``seen(index, view, rendered, truth)`` is called for each, e.g. to keep pictures.
+    Args:
+        seen: called as ``seen(index, view, rendered, truth)`` for each, e.g. to keep pictures.
+        lpips: measured too, where there are weights for it.
     """
     views, background = dataset.test, dataset.background
     result = []
@@ -110,7 +116,8 @@ def measure(
         if pixels.mask is not None:
             rendered = torch.where(pixels.mask[..., None], rendered, truth)
         counted = mask_of(task, dataset, i)
-        more = _more(rendered, truth, dataset, channels, counted, pixels.mask) | judged(task, dataset, i, rendered, truth)
+        more = _more(rendered, truth, dataset, channels, counted, pixels.mask) | _as_others(rendered, truth, channels, lpips)
+        more |= judged(task, dataset, i, rendered, truth)
         result.append(ViewMetrics(view.name, psnr(rendered, truth, pixels.mask), ssim(rendered, truth), seconds, more))
         if seen is not None:
             seen(i, view, rendered, truth)
@@ -135,9 +142,24 @@ def _more(
     return more
 
 
-def evaluate_run(run_dir: Path) -> dict[str, Any]:
-    """The metrics of a run's last checkpoint, measured again from disk alone; the same numbers as the run's own."""
+def _as_others(rendered: Tensor, truth: Tensor, channels: Channels, lpips: Lpips | None) -> dict[str, float]:
+    """The numbers of other people's tables, of what is displayed."""
+    shown, wanted = (channels.display(x).clamp(0.0, 1.0) for x in (rendered, truth))
+    found = {"ssim_3dgs": ssim_3dgs(shown, wanted)}
+    if lpips is not None and min(shown.shape[:2]) >= lpips.least:
+        found |= {"lpips": lpips(shown, wanted), "lpips_3dgs": lpips.unmapped(shown, wanted)}
+    return found
+
+
+def evaluate_run(run_dir: Path, lpips: str | Path | None = None) -> dict[str, Any]:
+    """The metrics of a run's last checkpoint, measured again from disk alone; the same numbers as the run's own.
+
+    Args:
+        lpips: weights for LPIPS; without, those that the run names.
+    """
     config, task, model, header = load_run(run_dir)
+    weights = lpips or config.metrics.lpips
+    distance = None if weights is None else Lpips.load(weights)
     suspects = suspects_of(config)
     with suspects.watch(run_dir / LOGS):
         dataset = load_dataset(config, task, run_dir=run_dir)
@@ -146,8 +168,8 @@ def evaluate_run(run_dir: Path) -> dict[str, Any]:
         path = run_dir / "model.safetensors"
         training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
         channels = channels_of(task, dataset)
-        views = measure(model, task, dataset, config.renderer, channels)
-        return summary(config, model, task, dataset, channels, views, path.stat().st_size, training)
+        views = measure(model, task, dataset, config.renderer, channels, lpips=distance)
+        return summary(config, model, task, dataset, channels, views, path.stat().st_size, training, distance)
 
 
 def summary(
@@ -159,9 +181,10 @@ def summary(
     views: Sequence[ViewMetrics],
     model_bytes: int,
     training: Mapping[str, Any],
+    lpips: Lpips | None = None,
 ) -> dict[str, Any]:
     """The content of ``metrics.json``. ``training`` holds iterations and train_seconds as the run recorded them."""
-    worst = min(views, key=lambda v: v.psnr)
+    worst, camera = min(views, key=lambda v: v.psnr), dataset.test.view(0).camera
     lowered = model.lower(dataset.test.view(0).camera, dataset.test.view(0).conditions, config.renderer)
     backend = choose(lowered, config.renderer)
     seconds = sorted(v.seconds for v in views)
@@ -174,6 +197,7 @@ def summary(
         **to_json("psnr", float(np.mean([v.psnr for v in views]))),
         "ssim": float(np.mean([v.ssim for v in views])),
         **_means(views),
+        **_lpips(views, lpips),
         **to_json("psnr_worst", worst.psnr),
         "view_worst": worst.name,
         "per_view": [_entry(v) for v in views],
@@ -188,6 +212,7 @@ def summary(
         "device": backend.device(),
         "checkpoint": "last",
         "downsampling": dataset.downsampling,
+        "image_size": [camera.width, camera.height],
         "background": [round(float(x), 6) for x in dataset.background],
         "color_space": dataset.color_space,
         "channels": list(channels.names),
@@ -217,6 +242,15 @@ def _entry(view: ViewMetrics) -> dict[str, Any]:
 def _means(views: Sequence[ViewMetrics]) -> dict[str, Any]:
     """Means over views of the further numbers, and PSNRs of mean squared errors ("pooled"); see ``TaskSpec.judge``."""
     return means([v.more for v in views])
+
+
+def _lpips(views: Sequence[ViewMetrics], lpips: Lpips | None) -> dict[str, Any]:
+    """Which network measured LPIPS, or why none did: a missing number is not a zero."""
+    if lpips is None:
+        return {"lpips": None, "not_measured": {"lpips": "no weights were given (metrics.lpips=FILE, or neuprim eval --lpips FILE)"}}
+    if any("lpips" not in v.more for v in views):
+        return {"lpips": None, "lpips_3dgs": None, "not_measured": {"lpips": f"some view is lower or narrower than {lpips.least} pixels"}}
+    return {"lpips_network": lpips.network}
 
 
 def _per_frame(made: Sequence[Clip], views: Sequence[ViewMetrics]) -> dict[str, Any]:

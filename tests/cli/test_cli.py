@@ -31,7 +31,7 @@ def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         (config.output_dir / "config.yaml").write_text(config.to_yaml())
         return config.output_dir
 
-    def evaluate_run(run_dir: Path) -> dict[str, Any]:
+    def evaluate_run(run_dir: Path, lpips: Path | None = None) -> dict[str, Any]:
         made.append(run_dir)
         return {"psnr": 31.23456, "views": 20, "worst": {"name": "r_3", "psnr": 27.0}}
 

@@ -1,11 +1,14 @@
+import dataclasses
 import os
 from pathlib import Path
 
 import pytest
 
 from neuprim.config import RunConfig, compose, compose_all, expand_sweep
+from neuprim.core import notices
 from neuprim.core.checked import checked
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
+from neuprim.core.notices import NeuprimWarning
 from neuprim.core.task import SceneContext
 from neuprim.plugins.registry import load_task
 from tests.plugins.fakes import install, site, toy
@@ -46,6 +49,8 @@ def test_free_dictionaries_need_no_plus(toy: Path) -> None:
     assert c.model.init == {"mode": "paper", "deep": {"a": [1, 2]}}
     assert c.options == {"gain": 3}
     assert c.non_default["train.rates.w2"] == (None, 1e-3)
+    units = toys("train.rate_units.glow=extent")  # a parameter that only another package knows
+    assert units.train.rate_units == {"glow": "extent"} and units.non_default == {"train.rate_units.glow": (None, "extent")}
 
 
 def test_values_in_other_spellings(toy: Path) -> None:
@@ -355,7 +360,7 @@ def test_impossible_settings_in_a_file(toy: Path, old: str, new: str, text: str)
 # ---------------------------------------------------------------- the static task's files
 
 
-@pytest.mark.parametrize("preset", ["quick", "paper"])
+@pytest.mark.parametrize("preset", ["quick", "paper", "paper_real", "paper_200", "paper_5k"])
 @pytest.mark.parametrize("scene", ["solids", "mesh", "blender", "nerfstudio", "colmap"])
 def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str, scene: str) -> None:
     monkeypatch.chdir(tmp_path)
@@ -364,7 +369,56 @@ def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pr
     assert (c.task, c.scene_name, c.preset) == ("static", scene, preset)
     gain = {"log_gain"} if preset == "quick" else set()
     assert set(c.train.rates) == {"means", "log_scales", "quats", "W1", "b1", "w2", "b2", "sh_dc", "sh_rest"} | gain
-    assert c.train.population.strategy == {"quick": "relocate", "paper": "gradient"}[preset]
+    strategies = {"quick": "relocate", "paper": "gradient", "paper_real": "gradient", "paper_200": "fixed", "paper_5k": "fixed"}
+    assert c.train.population.strategy == strategies[preset]
+
+
+@pytest.mark.parametrize("task", ["static", "dynamic", "relight"])
+def test_papers_rates_are_absolute(task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Appendix A: means 1.6e-4, which the authors multiply by nothing; the most primitives are those of Stump (table 6)."""
+    monkeypatch.chdir(tmp_path)
+    train = compose([f"task={task}", "preset=paper"]).train
+    assert (train.rates["means"], train.rate_units) == (1.6e-4, {"means": "absolute"})
+    assert train.population.max_primitives == 330_000
+    assert compose([f"task={task}"]).train.rate_units == {}
+
+
+def test_papers_presets_of_static_scenes_differ_in_what_they_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Appendix A and B.1: another schedule on photographs; 200 and 5,000 primitives as budgets of the Blender scenes."""
+    monkeypatch.chdir(tmp_path)
+    plain, real, least, middle = (compose([f"preset={name}"]) for name in ("paper", "paper_real", "paper_200", "paper_5k"))
+    steps = plain.train.iterations
+    for c, schedule in ((plain, (200, 1_000, 20_000, 1e-5, 1e-6)), (real, (500, 1_000, 15_000, 1e-4, 2e-6))):
+        p = c.train.population
+        assert (p.every, p.start * steps, p.stop * steps, p.grow_threshold, p.prune_threshold) == pytest.approx(schedule)
+        assert (p.clone_scale, p.prune_scale) == (1e-2, 0.5)
+    assert (least.model.primitives, middle.model.primitives) == (200, 5000)
+    for c in (real, least, middle):
+        model = dataclasses.replace(c.model, primitives=plain.model.primitives)
+        train = dataclasses.replace(c.train, population=plain.train.population)
+        assert (model, train, c.renderer) == (plain.model, plain.train, plain.renderer)
+
+
+def test_a_run_older_than_units_of_rates_goes_on_in_those_it_began_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["task=static", "preset=paper", "output_dir=run"]
+    begun = compose(words).to_yaml()
+    units = "  rate_units:\n    means: absolute\n"
+    assert units in begun
+    Path("run").mkdir()
+    for _ in range(2):  # the second time its config.yaml says that there are none
+        Path("run/config.yaml").write_text(begun.replace(units, ""))
+        with pytest.warns(NeuprimWarning, match=r"run/config.yaml: without train.rate_units; rates of means go on"):
+            notices._said.clear()
+            resumed = compose([*words, "resume=true"])
+        assert resumed.train.rate_units == {} and resumed.non_default["train.rate_units.means"] == ("absolute", None)
+        begun = resumed.to_yaml()
+    assert compose([*words, "resume=true", "train.rate_units.quats=extent"]).train.rate_units == {"means": "absolute", "quats": "extent"}
+    assert compose([*words[::2], "resume=true"]).preset == "quick"
+    Path("run/config.yaml").write_text(compose(["preset=paper"]).to_yaml())
+    assert compose([*words, "resume=true"]).train.rate_units == {"means": "absolute"}
+    Path("run/config.yaml").unlink()
+    assert compose([*words, "resume=true"]).train.rate_units == {"means": "absolute"}
 
 
 @pytest.mark.parametrize("scene", ["mesh", "blender", "nerfstudio", "colmap"])

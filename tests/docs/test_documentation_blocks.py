@@ -191,6 +191,10 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
         settings = [word for word in rest if not word.startswith("-")]
         rest = [word for word in rest if word.startswith("-")]
         (compose_all if args.multirun else compose)(settings, False)
+    if args.command == "bench":
+        rest += args.overrides
+        compose(["scene=blender", "scene.path=DIR", *(word for word in rest if not word.startswith("-"))], False)
+        rest = [word for word in rest if word.startswith("-")]
     if args.command in ("render", "inspect", "export"):
         given, rest = split_words(rest, conditions)
         assert (

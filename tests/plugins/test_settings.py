@@ -234,6 +234,10 @@ def test_names_of_initial_values_and_rates_are_checked_before_data(task: str) ->
         compose([f"task={task}", "model.init.alhpa=0.3"], False)
     with pytest.raises(ConfigError, match=r"train.rates.mean: no such parameter; did you mean 'means'"):
         compose([f"task={task}", "train.rates.mean=0.3"], False)
+    with pytest.raises(ConfigError, match=r"train.rate_units.mean: no such parameter; did you mean 'means'"):
+        compose([f"task={task}", "train.rate_units.mean=absolute"], False)
+    with pytest.raises(ConfigError, match=r"train.rate_units.means=metre: expected "):
+        compose([f"task={task}", "train.rate_units.means=metre"], False)
 
 
 # ---------------------------------------------------------------- what functions get

@@ -31,6 +31,7 @@ from neuprim.runs.measure import evaluate_run, measure
 from neuprim.runs.open import read_metrics
 from neuprim.tasks.static import TASK
 from tests.core import tiny
+from tests.lpips_weights import weights, written
 from tests.short_runs import STEPS, fit, words
 from tests.systems import posix
 
@@ -109,6 +110,33 @@ def test_metrics(whole: Path, scene: Path) -> None:
     assert len(views) == 2
     assert metrics["psnr"] == pytest.approx(sum(v["psnr"] for v in views) / 2) and metrics["psnr"] > 12
     assert metrics["ssim"] == pytest.approx(sum(v["ssim"] for v in views) / 2)
+
+
+def test_what_nobody_gave_weights_for_is_not_measured(whole: Path, scene: Path, tmp_path: Path) -> None:
+    """A missing LPIPS says so, in metrics.json and in the report; with weights it is measured from disk, or where a run names them."""
+    metrics = read_metrics(whole)
+    assert metrics["lpips"] is None and metrics["not_measured"]["lpips"].startswith("no weights were given (metrics.lpips=FILE")
+    assert all("lpips" not in view for view in metrics["per_view"])
+    assert "not measured: no weights were given" in (whole / "report.html").read_text()
+    assert metrics["ssim_3dgs"] == pytest.approx(sum(v["ssim_3dgs"] for v in metrics["per_view"]) / 2) and 0.1 < metrics["ssim_3dgs"] < 1
+    assert metrics["ssim_3dgs"] != metrics["ssim"] and f"{metrics['ssim_3dgs']:,.4f}" in (whole / "report.html").read_text()
+
+    vgg = written(tmp_path, weights("vgg"))
+    found = evaluate_run(whole, vgg)
+    assert found["lpips_network"] == "vgg" and "not_measured" not in found and found["psnr"] == metrics["psnr"]
+    for name in ("lpips", "lpips_3dgs"):
+        assert found[name] == pytest.approx(sum(v[name] for v in found["per_view"]) / 2) and found[name] > 0
+
+    alex = written(tmp_path, weights("alex"))
+    found = evaluate_run(whole, alex)
+    assert found["lpips"] is None and found["not_measured"] == {"lpips": "some view is lower or narrower than 31 pixels"}
+    with pytest.raises(DataError, match=r"absent[.]pth: cannot be read"):
+        fit(words(scene, tmp_path / "early", 10**6, f"metrics.lpips={tmp_path / 'absent.pth'}"))  # before any training
+    assert not (tmp_path / "early").exists()
+
+    vgg = written(tmp_path, weights("vgg"))
+    out = fit(words(scene, tmp_path / "with", 10, f"metrics.lpips={vgg}"))
+    assert read_metrics(out)["lpips"] == evaluate_run(out)["lpips"] > 0 and "vgg, mean over views" in (out / "report.html").read_text()
 
 
 def test_curve(whole: Path) -> None:

@@ -17,10 +17,11 @@ import numpy as np
 import torch
 from kornia.metrics import ssim as ssim_map
 from torch import Tensor
+from torch.nn.functional import pad
 
 from neuprim.core.errors import DataError, NonFiniteError
 
-__all__ = ["SSIM_SIGMA", "SSIM_WINDOW", "from_json", "matched", "means", "psnr", "ssim", "to_json"]
+__all__ = ["SSIM_SIGMA", "SSIM_WINDOW", "from_json", "matched", "means", "psnr", "ssim", "ssim_3dgs", "to_json"]
 
 SSIM_WINDOW = 11
 """Taps of the Gaussian window per axis (Wang et al. 2004)."""
@@ -96,6 +97,23 @@ def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
     first, second = (image.permute(2, 0, 1)[None].contiguous() for image in (first, second))
     # kornia's eps would keep equal dark images below 1; the two constants already keep the denominator positive.
     return ssim_map(first, second, window_size=window, max_val=float(peak), eps=0.0, padding="valid").mean().item()
+
+
+def ssim_3dgs(rendered: Tensor, truth: Tensor) -> float:
+    """Structural similarity as the tools of 3D Gaussian splatting count it, those of the paper among them: for comparing with their tables.
+
+    The window, its sigma and the constants are those of :func:`ssim`, for a data range of 1. What differs is the border: every pixel has
+    a window, and beyond the image both are black (zero padding), where :func:`ssim` counts only windows inside. Windows at the border so
+    see an edge that both images share, and often an empty background, so the mean is mostly higher. Images lower or narrower than 11
+    pixels keep the whole window. Those tools read images back from 8-bit files; here nothing is quantised.
+
+    Args:
+        rendered, truth: (H, W, C) float images of 0 to 1, as displayed.
+    """
+    first, second = matched(rendered, truth)
+    border = SSIM_WINDOW // 2
+    first, second = (pad(image.permute(2, 0, 1)[None], (border,) * 4) for image in (first, second))
+    return ssim_map(first, second, window_size=SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid").mean().item()
 
 
 def to_json(key: str, value: float) -> dict[str, float | bool | None]:

@@ -39,7 +39,7 @@ __all__ = [
 class Cosine(Shaped):
     """f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2, world density (1 - |y|^2)^p f/m inside the ellipsoid |y| < 1.
 
-    p = 0 is equation 10 of the paper; p = 1 and 2 have a soft edge (:mod:`neuprim.core.model.edge`), and p = 2 with K = 0 is close to a
+    p = 0 is the paper's; p = 1 and 2 have a soft edge (:mod:`neuprim.core.model.edge`), and p = 2 with K = 0 is close to a
     Gaussian.
 
     Attributes:

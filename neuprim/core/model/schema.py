@@ -16,7 +16,10 @@ from torch import Tensor
 
 from neuprim.core.checked import Range, converted
 
-__all__ = ["InitContext", "ParameterSpec", "Params"]
+__all__ = ["InitContext", "ParameterSpec", "Params", "RateUnit"]
+
+RateUnit = Literal["absolute", "extent"]
+"""What a learning rate is a multiple of; see :class:`ParameterSpec`."""
 
 Params = Mapping[str, Tensor]
 """Parameter name -> tensor of shape (N, *spec.shape)."""
@@ -94,14 +97,15 @@ class ParameterSpec:
         shape: shape per primitive, ``()`` for a scalar.
         lr: base learning rate; ``train.rates.NAME`` overrides it.
         init: draws the (N, *shape) float32 start value.
-        lr_unit: "absolute", or "extent" for a rate in units of the scene's extent (positions).
+        lr_unit: what ``lr`` and ``train.rates.NAME`` are multiplied by: "absolute", nothing, so that a position's rate is in scene units
+            a step; "extent", the data set's :attr:`~neuprim.core.data.Dataset.extent` (positions). ``train.rate_units.NAME`` overrides it.
     """
 
     name: str
     shape: tuple[int, ...]
     lr: float
     init: Callable[[InitContext], Tensor]
-    lr_unit: Literal["absolute", "extent"] = "absolute"
+    lr_unit: RateUnit = "absolute"
 
     @property
     def size(self) -> int:

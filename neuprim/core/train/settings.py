@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from neuprim.core.checked import Range, text, verify
+from neuprim.core.model.schema import RateUnit
 
 __all__ = ["ModelSettings", "PopulationSettings", "TrainSettings"]
 
@@ -80,6 +81,8 @@ class TrainSettings:
         iterations: steps, one view each.
         max_seconds: stop after this many seconds of training, if given (such a run is not bit-reproducible).
         rates: learning rate by parameter name, over the specs' own.
+        rate_units: unit of a parameter's rate by its name, over the spec's own: "absolute" (a position's is in scene units a step), or
+            "extent" (the rate times the scene's extent, so that it does not depend on how large the scene is).
         final_rate: the rates decay exponentially to this fraction of themselves at the end of the budget; 1 is constant.
         adam_beta2: decay of Adam's second moment per step, in [0, 1).
         warmup_steps: steps over which the rates rise linearly from zero.
@@ -101,6 +104,7 @@ class TrainSettings:
     iterations: Annotated[int, Range(at_least=0)] = 30_000
     max_seconds: Annotated[float, Range(above=0, says="a positive number of seconds")] | None = None
     rates: dict[str, NotNegative] = field(default_factory=dict)
+    rate_units: dict[str, RateUnit] = field(default_factory=dict)
     final_rate: Annotated[float, Range(above=0, at_most=1)] = 0.05
     adam_beta2: Annotated[float, Range(at_least=0, below=1)] = 0.999
     warmup_steps: Annotated[int, Range(at_least=0)] = 0

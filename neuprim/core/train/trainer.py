@@ -130,9 +130,10 @@ class Trainer:
         if len(dataset.train) == 0:
             raise DataError(f"{dataset.name}: the training split is empty")
         names = [spec.name for spec in model.specs]
-        for key in settings.rates:
-            if key not in names:
-                raise ConfigError(f"train.rates.{key}: no such parameter{nearest(key, names)}")
+        for group, given in (("rates", settings.rates), ("rate_units", settings.rate_units)):
+            for key in given:
+                if key not in names:
+                    raise ConfigError(f"train.{group}.{key}: no such parameter{nearest(key, names)}")
         if settings.supervision == "auto":
             settings = replace(settings, supervision="images" if dataset.points is None else "both")
         if settings.supervision != "images" and dataset.points is None:
@@ -168,7 +169,8 @@ class Trainer:
         if self.step < s.warmup_steps:
             factor *= (self.step + 1) / s.warmup_steps
         unit = {"absolute": 1.0, "extent": self.dataset.extent}
-        return {spec.name: s.rates.get(spec.name, spec.lr) * unit[spec.lr_unit] * factor for spec in self.model.specs}
+        units = {spec.name: unit[s.rate_units.get(spec.name, spec.lr_unit)] for spec in self.model.specs}
+        return {spec.name: s.rates.get(spec.name, spec.lr) * units[spec.name] * factor for spec in self.model.specs}
 
     # ------------------------------------------------------------ the loop
 

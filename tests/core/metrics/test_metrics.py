@@ -8,9 +8,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.signal import convolve2d
 
 from neuprim.core.errors import DataError, NonFiniteError
-from neuprim.core.metrics import SSIM_SIGMA, SSIM_WINDOW, from_json, psnr, ssim, to_json
+from neuprim.core.metrics import SSIM_SIGMA, SSIM_WINDOW, from_json, psnr, ssim, ssim_3dgs, to_json
 
 
 def pair(height: int, width: int, channels: int, noise: float = 0.1, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -101,6 +102,22 @@ def test_ssim_equals_the_plain_implementation(channels: int) -> None:
 def test_ssim_window_shrinks_to_fit(height: int, width: int, window: int) -> None:
     rendered, truth = pair(height, width, 3)
     assert ssim(rendered, truth) == pytest.approx(plain_ssim(rendered.numpy(), truth.numpy(), window), abs=1e-12)
+
+
+@pytest.mark.parametrize(("height", "width", "channels"), [(23, 19, 3), (12, 30, 1), (8, 5, 3)])
+def test_ssim_of_3dgs_equals_a_convolution_over_black(height: int, width: int, channels: int) -> None:
+    """scipy's convolution of the same size with zeros around the image, from the formula of E[x²] − E[x]²."""
+    rendered, truth = (image.clamp(0, 1) for image in pair(height, width, channels, seed=height))
+    x = np.arange(11) - 5
+    taps = np.exp(-(x**2) / (2 * 1.5**2))
+    window = np.outer(taps, taps) / taps.sum() ** 2
+    values = []
+    for p, q in zip(rendered.permute(2, 0, 1).numpy(), truth.permute(2, 0, 1).numpy(), strict=True):
+        mp, mq, pp, qq, pq = (convolve2d(z, window, "same", "fill", 0) for z in (p, q, p * p, q * q, p * q))
+        values.append((2 * mp * mq + 1e-4) * (2 * (pq - mp * mq) + 9e-4) / ((mp**2 + mq**2 + 1e-4) * (pp - mp**2 + qq - mq**2 + 9e-4)))
+    assert ssim_3dgs(rendered, truth) == pytest.approx(float(np.mean(values)), abs=1e-12)
+    assert abs(ssim_3dgs(rendered, truth) - ssim(rendered, truth)) > 1e-3, "another convention"
+    assert ssim_3dgs(truth, truth) == pytest.approx(1.0, abs=1e-12)
 
 
 def test_ssim_peak_scales_with_the_images() -> None:

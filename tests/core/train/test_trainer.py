@@ -137,6 +137,20 @@ def test_a_step_works_on_as_many_threads_as_the_renderer_has(plain: Dataset, cou
     same(trainer, other)
 
 
+def test_units_of_rates(plain: Dataset) -> None:
+    """A word takes the place of a parameter's own unit, of positions and of anything else."""
+    assert plain.extent > 2, "otherwise the units could be mixed up"
+    units = {"means": "absolute", "b2": "extent"}
+    trainer = tiny.trainer(plain, 100, final_rate=1.0, rates={"means": 1.6e-4, "b2": 0.5}, rate_units=units)
+    assert trainer.rates()["means"] == pytest.approx(1.6e-4) and trainer.rates()["b2"] == pytest.approx(0.5 * plain.extent)
+    assert tiny.trainer(plain, 100, rates={"means": 1.6e-4}).rates()["means"] == pytest.approx(1.6e-4 * plain.extent)
+    before = trainer.model.params["means"].detach().clone()
+    trainer.train_step()  # the first step of Adam is the rate, whatever the gradient
+    assert (trainer.model.params["means"].detach() - before).abs().max().item() == pytest.approx(1.6e-4, rel=0.01)
+    with pytest.raises(ConfigError, match=r"train\.rate_units\.mean: no such parameter; did you mean 'means'"):
+        tiny.trainer(plain, 100, rate_units={"mean": "absolute"})
+
+
 def test_budget_of_seconds(plain: Dataset) -> None:
     trainer = tiny.trainer(plain, 10**9, max_seconds=0.05)
     reports = list(trainer.run())

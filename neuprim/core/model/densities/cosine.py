@@ -1,4 +1,4 @@
-"""The density of a neural primitive: one hidden layer of K cosines (equation 10 of the paper; method: "Density"), with an edge and a gain.
+"""The density of a neural primitive: one hidden layer of K cosines (the paper's; method: "Density"), with an edge and a gain.
 
     sigma(x) = g (1 - |y|^2)^p f(x~)/m inside the ellipsoid |y| < 1,   f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2,   g = exp(log_gain)
 

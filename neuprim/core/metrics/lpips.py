@@ -1,0 +1,186 @@
+"""LPIPS, the learned perceptual distance of two images (Zhang et al. 2018), by weights of the user's own.
+
+neuprim has the arithmetic and no weights, and downloads none. What it reads are the state dictionaries that the authors of LPIPS and
+torchvision publish, as torch or safetensors files: that of a whole ``lpips.LPIPS(net="vgg")``, or its linear layers (``lpips/weights/v0.1/
+vgg.pth``) and the network's convolutions (torchvision's ``vgg16-*.pth``) side by side in a folder. AlexNet and VGG16 are told apart by shapes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d, max_pool2d
+
+from neuprim.core.errors import DataError
+from neuprim.core.metrics.image import matched
+
+__all__ = ["Lpips"]
+
+
+class _Layer(NamedTuple):
+    """A convolution with its rectifier.
+
+    Attributes:
+        number: where it stands in torchvision's ``features``.
+        pool: side of the maximum, in steps of 2, that is taken before it; 0 for none.
+        tap: whether the distance looks at what comes out.
+    """
+
+    number: int
+    inputs: int
+    outputs: int
+    side: int
+    stride: int
+    padding: int
+    pool: int
+    tap: bool
+
+
+def _vgg16() -> tuple[_Layer, ...]:
+    layers, index, inputs = [], 0, 3
+    for block, (outputs, count) in enumerate(((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))):
+        for i in range(count):
+            layers.append(_Layer(index, inputs, outputs, 3, 1, 1, 2 if block and i == 0 else 0, i == count - 1))
+            index, inputs = index + 2, outputs
+        index += 1  # the maximum
+    return tuple(layers)
+
+
+_ALEXNET = (
+    _Layer(0, 3, 64, 11, 4, 2, 0, True),
+    _Layer(3, 64, 192, 5, 1, 2, 3, True),
+    _Layer(6, 192, 384, 3, 1, 1, 3, True),
+    _Layer(8, 384, 256, 3, 1, 1, 0, True),
+    _Layer(10, 256, 256, 3, 1, 1, 0, True),
+)
+_NETWORKS = {"alex": _ALEXNET, "vgg": _vgg16()}
+_LEAST = {"alex": 31, "vgg": 16}
+"""The smallest image side that leaves a pixel for the last layer."""
+
+_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+_EPS = 1e-10
+
+_CONVOLUTION = re.compile(r"(?:features|net\.slice\d+)\.(\d+)\.(weight|bias)")
+_LINEAR = re.compile(r"lins?\.?(\d+)\.model\.\d+\.weight")
+_SUFFIXES = (".pth", ".pt", ".safetensors")
+
+
+@dataclass(frozen=True)
+class Lpips:
+    """The distance, version 0.1, with one set of weights.
+
+    Attributes:
+        network: "alex" or "vgg".
+        weights, biases: of the convolutions, in order.
+        linear: (C,) per tap: how much each of its channels counts.
+    """
+
+    network: str
+    weights: tuple[Tensor, ...]
+    biases: tuple[Tensor, ...]
+    linear: tuple[Tensor, ...]
+
+    @property
+    def least(self) -> int:
+        """The smallest side of an image that it can be asked about."""
+        return _LEAST[self.network]
+
+    @staticmethod
+    def load(path: str | Path) -> Lpips:
+        """Weights of a file, or of all of a folder's ``.pth``, ``.pt`` and ``.safetensors`` files together; no code in them is run.
+
+        Raises:
+            DataError: unreadable, or not the weights of LPIPS; names what is missing.
+        """
+        where = Path(path)
+        files = sorted(f for f in where.iterdir() if f.suffix in _SUFFIXES) if where.is_dir() else [where]
+        if not files:
+            raise DataError(f"{where}: no weights in it; expected files that end in {', '.join(_SUFFIXES)}")
+        return _made({key: value for file in files for key, value in _read(file).items()}, where)
+
+    def __call__(self, rendered: Tensor, truth: Tensor) -> float:
+        """The distance as published: of values 0 to 1, which are mapped to -1 to 1 first.
+
+        Args:
+            rendered, truth: (H, W, 3) float display-referred sRGB values; clamped to 0..1.
+
+        Raises:
+            DataError, NonFiniteError: as :func:`neuprim.core.metrics.psnr`; images smaller than :attr:`least`, or not of 3 channels.
+        """
+        return self._distance(*(2.0 * image - 1.0 for image in self._images(rendered, truth)))
+
+    def unmapped(self, rendered: Tensor, truth: Tensor) -> float:
+        """The distance as the tools of 3D Gaussian splatting take it: the network, made for -1 to 1, gets values 0 to 1 as they are."""
+        return self._distance(*self._images(rendered, truth))
+
+    def _images(self, rendered: Tensor, truth: Tensor) -> list[Tensor]:
+        """Both as (1, 3, H, W) float32 of 0..1."""
+        images = [image.clamp(0.0, 1.0).permute(2, 0, 1)[None].float() for image in matched(rendered, truth)]
+        if images[0].shape[1] != 3 or min(images[0].shape[2:]) < self.least:
+            raise DataError(f"LPIPS: images of shape {tuple(rendered.shape)}; expected at least ({self.least}, {self.least}, 3)")
+        return images
+
+    def _distance(self, first: Tensor, second: Tensor) -> float:
+        with torch.inference_mode():
+            pairs = zip(self._features(first), self._features(second), self.linear, strict=True)
+            return sum(float(((a - b).square() * w[None, :, None, None]).sum(1).double().mean()) for a, b, w in pairs)
+
+    def _features(self, image: Tensor) -> Iterable[Tensor]:
+        """What comes out of every tap, each pixel's channels divided by their length."""
+        x = (image - torch.tensor(_SHIFT)[None, :, None, None]) / torch.tensor(_SCALE)[None, :, None, None]
+        for layer, weight, bias in zip(_NETWORKS[self.network], self.weights, self.biases, strict=True):
+            if layer.pool:
+                x = max_pool2d(x, layer.pool, 2)
+            x = conv2d(x, weight, bias, layer.stride, layer.padding).relu()
+            if layer.tap:
+                yield x / (x.square().sum(1, keepdim=True).sqrt() + _EPS)
+
+
+def _read(file: Path) -> Mapping[str, Any]:
+    try:
+        if file.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            return load_file(file)
+        found = torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged file fails in torch's pickle, zip and tensor code alike
+        reason = " ".join(str(error).split())
+        raise DataError(f"{file}: cannot be read as weights ({type(error).__name__}: {reason[:160]})") from error
+    if not isinstance(found, Mapping):
+        raise DataError(f"{file}: found {type(found).__name__}; expected a state dictionary")
+    return found
+
+
+def _made(found: Mapping[str, Any], where: Path) -> Lpips:
+    parts: dict[tuple[str, int], Tensor] = {}
+    for key, value in found.items():
+        for pattern in (_CONVOLUTION, _LINEAR):
+            match = pattern.fullmatch(key)
+            if match and isinstance(value, Tensor):
+                parts[match[2] if pattern is _CONVOLUTION else "linear", int(match[1])] = value.detach().float()
+    indices = {index for name, index in parts if name == "weight"}
+    for network, layers in _NETWORKS.items():
+        if indices == {layer.number for layer in layers}:
+            return _fitting(network, layers, parts, where)
+    raise DataError(f"{where}: convolutions {sorted(indices) or 'none'}; expected those of AlexNet or VGG16, as features.N or net.sliceM.N")
+
+
+def _fitting(network: str, layers: tuple[_Layer, ...], parts: Mapping[tuple[str, int], Tensor], where: Path) -> Lpips:
+    def part(name: str, index: int, *shape: int) -> Tensor:
+        value = parts.get((name, index))
+        if value is None or tuple(value.shape) != shape or not bool(torch.isfinite(value).all()):
+            label = f"lin{index}.model.1.weight" if name == "linear" else f"features.{index}.{name}"
+            state = "missing" if value is None else f"shape {tuple(value.shape)}, or not finite"
+            raise DataError(f"{where}: {label} of LPIPS ({network}): {state}; expected finite numbers of shape {shape}")
+        return value
+
+    weights = tuple(part("weight", l.number, l.outputs, l.inputs, l.side, l.side) for l in layers)
+    biases = tuple(part("bias", l.number, l.outputs) for l in layers)
+    taps = [l for l in layers if l.tap]
+    return Lpips(network, weights, biases, tuple(part("linear", i, 1, l.outputs, 1, 1).flatten() for i, l in enumerate(taps)))

@@ -1,0 +1,141 @@
+"""``neuprim bench paper``: its tables as the appendix prints them, and runs beside them on data of ours."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from neuprim.cli import main
+from neuprim.cli.bench import table_numbers
+from neuprim.config import presets
+from neuprim.core.errors import ConfigError
+from neuprim.plugins.registry import load_task
+from neuprim.runs.open import read_metrics
+from neuprim.runs.paper import budget_words, plan, tables
+from tests.core.tiny import write_blender
+
+SMALL = ["model.neurons=2", "model.sh_degree=1", "train.iterations=12"]
+
+
+def test_the_tables_are_those_of_the_appendix() -> None:
+    """Samples of every table, and the averages that it prints."""
+    found = tables()
+    assert [(t.title, t.numbers) for t in found] == [
+        ("Blender synthetic", (3, 4, 5)),
+        ("Mip-NeRF 360", (6,)),
+        ("Tanks and Temples", (7,)),
+        ("Deep Blending", (7,)),
+    ]
+    blender, mip, tanks, blending = found
+    least, middle, most = blender.rows
+    assert (least.figures["ship"].psnr, middle.figures["mic"].ssim, most.figures["drums"].lpips) == (24.23, 0.9866, 0.047)
+    assert middle.figures["materials"].ssim is None, "0.0471 in the paper"
+    assert [(row.beside[0], row.beside[1]["chair"].psnr) for row in blender.rows] == [
+        ("3DGS 500", 22.91),
+        ("3DGS 10k", 29.19),
+        ("3DGS nolimit", 35.83),
+    ]
+    assert (
+        max(f.primitives or 0 for t in found for r in t.rows for f in r.figures.values())
+        == mip.rows[0].figures["stump"].primitives
+        == 330_000
+    )
+    for table, psnr, ssim, lpips in ((mip, 27.21, 0.7907, 0.2160), (tanks, 23.58, 0.8478, 0.1597), (blending, None, 0.8921, 0.2644)):
+        own = list(table.rows[0].figures.values())
+        assert math.isclose(sum(f.ssim or 0 for f in own) / len(own), ssim, abs_tol=6e-4)
+        assert math.isclose(sum(f.lpips or 0 for f in own) / len(own), lpips, abs_tol=6e-4)
+        assert psnr is None or math.isclose(sum(f.psnr or 0 for f in own) / len(own), psnr, abs_tol=6e-3)
+    static = load_task("static")
+    assert {row.preset for t in found for row in t.rows} == {name for name in presets(static) if name.startswith("paper")}
+    assert {t.loader for t in found} <= {scene.name for scene in static.scenes}
+
+
+def test_without_data_it_lists(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "paper", "--tables", "6"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "table 6: Mip-NeRF 360 (task=static scene=colmap)" and len(lines) == 2 + 9 + 1
+    assert lines[9].split() == ["stump", "PSNR", "24.73", "SSIM", "0.6862", "LPIPS", "0.2780", "330,000", "primitives"]
+
+
+def test_words() -> None:
+    assert table_numbers("3-5,7") == {3, 4, 5, 7}
+    assert (budget_words("full"), budget_words("90s"), budget_words("1.5h")) == ([], ["train.max_seconds=90"], ["train.max_seconds=5400"])
+    for wrong in ("2", "3-8", "5-3", "", "all"):
+        with pytest.raises(ConfigError, match=f"--tables {wrong}: .*expected numbers from 3 to 7"):
+            table_numbers(wrong)
+    for wrong in ("10", "0m", "m", "ten minutes"):
+        with pytest.raises(ConfigError, match=f"--budget {wrong}: expected full, or"):
+            budget_words(wrong)
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    folder = tmp_path / "data"
+    write_blender(folder / "Chair")
+    write_blender(folder / "lego small")
+    for name in ("images", "images_2", "sparse"):
+        (folder / "bonsai" / name).mkdir(parents=True)
+    (folder / "garden").mkdir()
+    return folder
+
+
+def test_the_plan_is_the_protocol(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    planned = plan(data, tables(), {}, [], "10m", 2, Path("out"), ["train.ssim_weight=0"])
+    assert [(p.scene, p.row.name, p.config.seed) for p in planned] == [
+        *(("chair", row, seed) for row in ("200", "5k", "nolimit") for seed in (0, 1)),
+        *((scene, "real", seed) for scene in ("bonsai", "garden") for seed in (0, 1)),
+    ]
+    chair, bonsai, garden = planned[0].config, planned[-4].config, planned[-1].config
+    assert (chair.preset, chair.model.primitives, chair.train.max_seconds, chair.train.ssim_weight) == ("paper_200", 200, 600, 0)
+    assert Path(chair.scene["path"]) == data / "Chair" and chair.output_dir == Path("out/chair-200-10m-seed0")
+    assert (bonsai.preset, bonsai.scene["images"], garden.scene["images"]) == ("paper_real", "images_2", "images")
+    named = plan(data, tables()[:1], {"lego": "LEGO small"}, ["5k"], "full", 1, Path("out"), [])
+    assert [(p.scene, Path(p.config.scene["path"]).name, p.config.train.max_seconds) for p in named] == [("lego", "lego small", None)]
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--scenes", "chiar"], "--scenes chiar: not in these tables; did you mean 'chair'?"),
+        (["--scenes", "drums"], "--scenes drums: DATA has no folder drums"),
+        (["--rows", "5"], "--rows 5: not in these tables"),
+        (["--rows", "real", "--tables", "3"], "--rows real: not in these tables"),
+        (["--tables", "7"], "--data DATA: no folder named like a scene; expected one of train, truck, playroom, drjohnson"),
+        (["train.iteratons=3"], "train.iteratons: no such setting; did you mean 'train.iterations'"),
+        (["--budget", "soon"], "--budget soon: expected full"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(data: Path, capsys: pytest.CaptureFixture[str], words: list[str], text: str) -> None:
+    assert main(["bench", "paper", "--data", str(data), *words]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and text.replace("DATA", str(data)) in err
+
+
+def test_it_estimates_runs_and_compares(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["bench", "paper", "--data", str(data), "--scenes", "chair,lego=lego small", "--rows", "200", "--tables", "3", *SMALL]
+    assert main([*words, "--estimate"]) == 0
+    out = capsys.readouterr().out
+    assert (
+        "200, chair: " in out and "ms a step at the start, 12 steps" in out and "2 runs, about 0 s of training on this machine, and" in out
+    )
+    assert not Path("outputs").exists()
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    metrics = read_metrics(Path("outputs/paper/lego-200-full-seed0"))
+    assert metrics["image_size"] == [24, 24] and metrics["preset"] == "paper_200" and metrics["iterations"] == 12
+    assert "lego, 200: preset=paper_200, seed 0, last checkpoint after 12 steps in" in out
+    assert "images of 24x24, down-sampling none, model.neurons=2 model.sh_degree=1 train.iterations=12" in out
+    lines = [line.split() for line in out.split("lego, 200")[1].splitlines()]
+    assert ["PSNR", f"{metrics['psnr']:.2f}", "paper", "22.56", "3DGS", "500", "20.99"] in lines
+    assert ["SSIM", f"{metrics['ssim_3dgs']:.4f}", "paper", "0.8247", "3DGS", "500", "0.7819"] in lines
+    assert ["LPIPS", "–", "paper", "0.2000", "3DGS", "500", "0.3090"] in lines, "no weights, no number"
+    mean = (metrics["psnr"] + read_metrics(Path("outputs/paper/chair-200-full-seed0"))["psnr"]) / 2
+    assert ["PSNR", f"{mean:.2f}", "paper", f"{(24.60 + 22.56) / 2:.2f}"] in lines
+    assert "means over 2 scenes, 1 seed; ours of the last checkpoint, the paper's of the best" in out
+    assert main(words) == 2 and "exists and is not empty" in capsys.readouterr().err

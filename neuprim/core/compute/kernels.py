@@ -36,8 +36,17 @@ def _prefer_wide_vectors() -> None:
         numba.config.CPU_FEATURES = features.flatten() + ",-prefer-256-bit"  # type: ignore[attr-defined]
 
 
+def _one_vector_at_a_time() -> None:
+    """Ask LLVM not to compute several vectors at a time, for the whole process.
+
+    In loops that sum it would, without counting what the loop already holds in registers: it spills, and leaves up to three vectors over to
+    a loop of half the width. Lanes come in whole vectors, so that one at a time leaves nothing over.
+    """
+    llvm.set_option("neuprim", "-force-vector-interleave=1")
+
+
 _prefer_wide_vectors()
-llvm.set_option("neuprim", "-force-vector-interleave=1")
+_one_vector_at_a_time()
 
 FAST = {"nnan", "nsz", "arcp", "contract", "afn", "reassoc"}
 """Floating-point freedom of the pixel kernels. NaN checks vanish under it: rows are checked before (``prepare``)."""

@@ -1,6 +1,7 @@
 """Tile-wise compositing, backward: back to front, transmittance recovered by T/(1 - alpha).
 
-Each (tile, primitive) pair writes one gradient row; the rows of a primitive are then added in a fixed order, so the
+The optical depths of the lanes are the forward pass's (:mod:`~neuprim.core.render.cpu.kept`), so that what reaches a lane is known before its
+neurons are evaluated. Each (tile, primitive) pair writes one gradient row; the rows of a primitive are then added in a fixed order, so the
 result is bit-identical for any number of threads.
 """
 

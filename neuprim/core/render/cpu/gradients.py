@@ -1,9 +1,9 @@
 """From dL/d(2 FIELD HALF FADE) of every lane of a pair back to one gradient row: shared by both orders of compositing.
 
 The optical depths are known, from the forward pass or from the lists of hits, so that FIELD is not summed over the neurons again: one
-loop per pair of neurons goes from the phases to the sums. Two paths: :func:`gradients_from_lanes` reads chords from the lanes, which
-float64, colour networks and many neurons need; :func:`gradients_at_once` has a chord in registers from end to end, with at most two
-neurons.
+loop per pair of neurons goes from the phases to the sums. Two paths: :func:`neuron_gradients` and :func:`chord_gradient` read chords from the
+lanes, which float64, colour networks and many neurons need; :func:`gradients_at_once` has a chord in registers from end to end, with at most
+two neurons, and neither writes nor reads what lies between.
 """
 
 from __future__ import annotations

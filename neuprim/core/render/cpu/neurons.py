@@ -61,4 +61,3 @@ def field_values(S, D, n, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots
                 _values_slow(S, n, p, o, edge)
             else:
                 _values_fast(S, n, p, o, edge)
-

@@ -17,7 +17,7 @@ from neuprim.core.render.cpu.kept import Kept, alive
 from tests import scenes
 from tests.numerics.compare import assert_same_frame, draw
 
-SETTINGS = RenderSettings(backend="cpu", threads=1)
+SETTINGS = RenderSettings(backend="cpu", threads=1, alpha_max=0.98)  # 0.99 twice would be transmittance_min itself
 _bits = njit(lambda rows: alive(rows))
 
 
@@ -26,13 +26,13 @@ def wall(neurons: int = 2) -> dict[str, torch.Tensor]:
     t = scenes.tensors(24, neurons=neurons, seed=5)
     front, towards = (torch.arange(24) < 12)[:, None], scenes.camera().position.float() / 3
     t["means"] = torch.where(front, 0.1 * t["means"] + towards + torch.tensor([0.0, 0.0, 0.5]), t["means"] * 0.5)
-    t["log_scales"] = torch.where(front, -0.5, 0.1 * t["log_scales"])
+    t["log_scales"] = torch.where(front, 0.7 + t["log_scales"], 0.2 + 0.2 * t["log_scales"])
     t["b2"] = torch.where(front, 9.0, 0.2)
     t["w2"] = t["w2"] * 0.1
     return t
 
 
-def kept_of(t: dict[str, torch.Tensor], monkeypatch: pytest.MonkeyPatch, **settings: Any) -> tuple[Kept, Any]:
+def kept_of(t: dict[str, torch.Tensor], monkeypatch: pytest.MonkeyPatch) -> tuple[Kept, Any]:
     found: list[Kept] = []
 
     def of(pairs: int) -> Kept:
@@ -41,14 +41,14 @@ def kept_of(t: dict[str, torch.Tensor], monkeypatch: pytest.MonkeyPatch, **setti
 
     monkeypatch.setattr(backend.Kept, "of", of)
     leaves = {k: v.clone().requires_grad_() for k, v in t.items()}
-    out = render_lowered(scenes.lowered(leaves), scenes.camera(), RenderSettings(backend="cpu", threads=1, **settings))
+    out = render_lowered(scenes.lowered(leaves), scenes.camera(), SETTINGS)
     return found[0], out
 
 
 def test_depths_outgrow_their_first_room(monkeypatch: pytest.MonkeyPatch) -> None:
     """Primitives that fill their tiles have 256 lanes a pair: more than the room at first, and no lane is lost."""
     t = scenes.tensors(16, seed=2)
-    t["log_scales"] = t["log_scales"] * 0 + 0.5
+    t["log_scales"] = 0.9 + 0.3 * t["log_scales"]
     kept, out = kept_of(t, monkeypatch)
     lanes = out.stats.extra["forward_lanes"]
     assert lanes > 100 * out.stats.pairs, "the scene does not fill its tiles"

@@ -63,7 +63,7 @@ def test_gradients_where_rows_die_early(neurons: int, monkeypatch: pytest.Monkey
     kept, _ = kept_of(t, monkeypatch)
     monkeypatch.undo()
     assert ((kept.live != 0) & (kept.live != 2**layout.TILE - 1)).any(), "no row dies"
-    fast, _ = assert_same_frame(t, scenes.camera(), SETTINGS)
+    fast, _ = assert_same_frame(t, scenes.camera(), SETTINGS, image_bound=1e-4)  # what is asked here are the gradients
     extra = fast.output.stats.extra
     assert extra["backward_lanes"] <= extra["forward_lanes"]
 

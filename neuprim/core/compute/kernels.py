@@ -23,7 +23,7 @@ from numba.extending import overload
 from neuprim.core.io import files
 from neuprim.version import __version__
 
-__all__ = ["FAST", "by_length", "cache_directory", "exact_kernel", "inline", "kernel", "kernel_sources", "sources_hash"]
+__all__ = ["FAST", "by_length", "cache_directory", "exact_kernel", "inline", "kernel", "kernel_sources", "sources_hash", "text"]
 
 
 def _prefer_wide_vectors() -> None:
@@ -36,13 +36,23 @@ def _prefer_wide_vectors() -> None:
         numba.config.CPU_FEATURES = features.flatten() + ",-prefer-256-bit"  # type: ignore[attr-defined]
 
 
+def _one_vector_at_a_time() -> None:
+    """Ask LLVM not to compute several vectors at a time, for the whole process.
+
+    In loops that sum it would, without counting what the loop already holds in registers: it spills, and leaves up to three vectors over to
+    a loop of half the width. Lanes come in whole vectors, so that one at a time leaves nothing over.
+    """
+    llvm.set_option("neuprim", "-force-vector-interleave=1")
+
+
 _prefer_wide_vectors()
+_one_vector_at_a_time()
 
 FAST = {"nnan", "nsz", "arcp", "contract", "afn", "reassoc"}
 """Floating-point freedom of the pixel kernels. NaN checks vanish under it: rows are checked before (``prepare``)."""
 
 
-_COMPILED = re.compile(rb"\bnumba\b|\bcompute\.kernels import [^\n]*\b(?:exact_kernel|kernel|inline)\b")
+_COMPILED = re.compile(rb"\bnumba\b|\bcompute\.kernels import [^\n]*\b(?:exact_kernel|kernel|inline|text)\b")
 
 
 def kernel_sources(package: Path) -> list[Path]:
@@ -85,6 +95,9 @@ def _jit(**options: Any) -> Callable[[Any], Any]:
 
 inline = njit(fastmath=FAST, error_model="numpy", forceinline=True)
 """Building block of a pixel kernel; ``forceinline`` so that a cold and a cached process compute the same bits."""
+
+text = njit(fastmath=FAST, error_model="numpy", inline="always")
+"""As if its text stood in the caller: LLVM sees both at once, and computes the bits that it would compute of one function."""
 
 kernel = _jit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
 """A pixel kernel, called from worker threads."""

@@ -21,6 +21,7 @@ from neuprim.core.render.cpu.binning import TileLists, bin_primitives
 from neuprim.core.render.cpu.colour_net import Net, net_backward, net_rows
 from neuprim.core.render.cpu.entry import backward_tiles_by_entry, composite_tiles_by_entry
 from neuprim.core.render.cpu.forward import composite_tiles
+from neuprim.core.render.cpu.kept import Kept
 from neuprim.core.render.cpu.prepare import NON_FINITE, VISIBLE, prepare, prepare_backward, prepare_wide
 from neuprim.core.render.cpu.profiles import EDGE_TYPES
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
@@ -186,7 +187,7 @@ class _Rasterize(torch.autograd.Function):
     def forward(  # type: ignore[override]
         ctx: Any, means: Tensor, log_scales: Tensor, quats: Tensor, W1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor,
         colors: Tensor, viewmat: Tensor, background: Tensor, camera: Camera, omega0: float, edge: int, settings: RenderSettings, stats: RenderStats,
-        *net: Tensor,
+        differentiable: bool, *net: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         names = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
         painted = _NET if net else ("colors",)
@@ -198,14 +199,20 @@ class _Rasterize(torch.autograd.Function):
         rgb, T = np.empty((h, w, C), np.float32), np.empty((h, w), np.float32)
         z, last = np.zeros((h, w) if settings.depth else (1, 1), np.float32), np.empty((h, w), np.int32)
         palette = np.ascontiguousarray(tensors[painted[-1]], np.float32)
-        tiles = composite_tiles_by_entry if settings.sort == "entry" else composite_tiles
-        lanes = parallel_for(
-            tiles, frame.tiles, frame.chunk, settings.threads, frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
+        pixels = (
+            frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
             frame.lists.starts, frame.lists.ids, palette, frame.norms, frame.background, frame.limits, settings.depth, frame.neurons,
-            rgb, T, z, last, frame.net, EDGE_TYPES[frame.edge],
+            rgb, T, z, last,
         )  # fmt: skip
+        form, kept = (frame.net, EDGE_TYPES[frame.edge]), None
+        if settings.sort == "entry":
+            lanes = parallel_for(composite_tiles_by_entry, frame.tiles, frame.chunk, settings.threads, *pixels, *form)
+        else:
+            kept = Kept.of(frame.lists.pairs if differentiable else 0)
+            drawn = parallel_for(composite_tiles, frame.tiles, frame.chunk, settings.threads, *pixels, kept.live, kept.found, *form)
+            lanes, kept.depths = [n for n, _ in drawn], [depths for _, depths in drawn]
         stats.extra["forward_lanes"] = sum(lanes)
-        ctx.frame, ctx.tensors, ctx.palette, ctx.last, ctx.T = frame, tensors, palette, last, T
+        ctx.frame, ctx.tensors, ctx.palette, ctx.last, ctx.T, ctx.kept = frame, tensors, palette, last, T, kept
         ctx.dtypes = [x.dtype for x in (means, log_scales, quats, W1, b1, w2, b2, colors)]
         ctx.net_dtypes = [x.dtype for x in net]
         ctx.view_dtype, ctx.background_dtype = viewmat.dtype, background.dtype
@@ -229,12 +236,20 @@ class _Rasterize(torch.autograd.Function):
         error = np.zeros((h, w), np.float32) if watched is None else np.ascontiguousarray(_array(watched.error), np.float32)
         width = L.gradient_width(frame.neurons, C, frame.net.hidden if frame.net else 0)
         pair_rows = np.empty((frame.lists.pairs, width), np.float32)
-        tiles = backward_tiles_by_entry if s.sort == "entry" else backward_tiles
-        lanes = parallel_for(
-            tiles, frame.tiles, frame.chunk, s.threads, frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
+        pixels = (
+            frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
             frame.lists.starts, frame.lists.ids, ctx.palette, frame.norms, frame.limits, with_depth, frame.neurons,
-            ctx.T, ctx.last, grad_rgb, gT, gz, error, pair_rows, frame.net, EDGE_TYPES[frame.edge],
+            ctx.T, ctx.last, grad_rgb, gT, gz, error, pair_rows,
         )  # fmt: skip
+        form, kept = (frame.net, EDGE_TYPES[frame.edge]), ctx.kept
+        if kept is None:
+            lanes = parallel_for(backward_tiles_by_entry, frame.tiles, frame.chunk, s.threads, *pixels, *form)
+        else:
+
+            def tiles(start: int, stop: int, *arguments: Any) -> Any:
+                return backward_tiles(start, stop, kept.depths[start // frame.chunk], *arguments)
+
+            lanes = parallel_for(tiles, frame.tiles, frame.chunk, s.threads, *pixels, kept.live, kept.found, *form)
         frame.stats.extra["backward_lanes"] = sum(lanes)
         grads, touched = np.empty((count, width), np.float32), np.empty(count, np.bool_)
         parallel_for(
@@ -277,7 +292,7 @@ class _Rasterize(torch.autograd.Function):
         if ctx.needs_input_grad[9]:
             g_background = (g_rgb * torch.from_numpy(ctx.T)[..., None]).sum((0, 1)).to(ctx.background_dtype)
         nets = (torch.from_numpy(r).to(d) for r, d in zip(g_net, ctx.net_dtypes, strict=True))
-        return (*tensors, view, g_background, None, None, None, None, None, *nets)
+        return (*tensors, view, g_background, None, None, None, None, None, None, *nets)
 
 
 def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
@@ -289,10 +304,11 @@ def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings
     palette, net = (colour.base, (colour.Wx, colour.bias, colour.Wout)) if isinstance(colour, RayNet) else (colour.rgb, ())
     if background is None:
         background = torch.zeros(palette.shape[1])
-    rgb, T, zsum = _Rasterize.apply(
-        g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1), palette,
-        camera.viewmat, background, camera, density.omega0, density.edge, settings, stats, *net,
+    tensors = (
+        g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1), palette, camera.viewmat, background,
     )  # fmt: skip
+    differentiable = torch.is_grad_enabled() and any(x.requires_grad for x in (*tensors, *net))
+    rgb, T, zsum = _Rasterize.apply(*tensors, camera, density.omega0, density.edge, settings, stats, differentiable, *net)
     dtype = g.means.dtype
     alpha = 1 - T
     depth = mean_depth(zsum, alpha).to(dtype) if settings.depth else None

@@ -1,6 +1,7 @@
 """Tile-wise compositing, backward: back to front, transmittance recovered by T/(1 - alpha).
 
-Each (tile, primitive) pair writes one gradient row; the rows of a primitive are then added in a fixed order, so the
+The optical depths of the lanes are the forward pass's (:mod:`~neuprim.core.render.cpu.kept`), so that what reaches a lane is known before its
+neurons are evaluated. Each (tile, primitive) pair writes one gradient row; the rows of a primitive are then added in a fixed order, so the
 result is bit-identical for any number of threads.
 """
 
@@ -9,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import exact_kernel, inline, kernel
+from neuprim.core.compute.views import copy16, lent
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
-from neuprim.core.render.cpu.gradients import chord_gradient, density_alone, field_gradient, two_neurons
-from neuprim.core.render.cpu.neurons import field_with_slopes
+from neuprim.core.render.cpu.gradients import AT_ONCE, chord_gradient, gradients_at_once, lanes_with_slopes, neuron_gradients
 from neuprim.core.render.cpu.ray_colours import (
     ray_colour_gradient,
     ray_colour_gradient_row,
@@ -20,10 +21,10 @@ from neuprim.core.render.cpu.ray_colours import (
     uncomposite_rgb_ray_colours,
     weigh_ray_colours,
 )
-from neuprim.core.render.cpu.tiles import aligned, compact, fetch_ahead, row_spans
+from neuprim.core.render.cpu.tiles import aligned, compact, fetch_ahead, lanes_ahead, row_spans
 from neuprim.core.render.cpu.trigonometry import one_minus_exp
 
-__all__ = ["backward_tiles", "opacity", "sum_rows"]
+__all__ = ["backward_tiles", "opacity", "optical_depths", "sum_rows"]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
@@ -31,13 +32,20 @@ _STEPS = np.arange(L.TILE).astype(np.float32)
 
 
 @inline
-def opacity(S, n, amin, amax, edge):  # type: ignore[no-untyped-def]
-    """ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF FADE) of every lane, with exactly the forward pass's clamp and cut."""
+def optical_depths(S, n, edge):  # type: ignore[no-untyped-def]
+    """DEPTH of every lane, as the forward pass computes it."""
     for k in range(n):
-        norm = S[L.NORM_L + k]
-        depth = S[L.FIELD + k] * S[L.HALF + k] * norm * f(2)
+        depth = S[L.FIELD + k] * S[L.HALF + k] * S[L.NORM_L + k] * f(2)
         if len(edge) > 0:
             depth *= S[L.FADE + k]
+        S[L.DEPTH + k] = depth
+
+
+@inline
+def opacity(S, n, amin, amax):  # type: ignore[no-untyped-def]
+    """ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF FADE) of every lane from its DEPTH, with exactly the forward pass's clamp and cut."""
+    for k in range(n):
+        norm, depth = S[L.NORM_L + k], S[L.DEPTH + k]
         raw = one_minus_exp(depth)
         alpha = min(raw, amax)
         alpha = alpha if alpha >= amin else f(0)
@@ -121,13 +129,17 @@ def _total(sums, first):  # type: ignore[no-untyped-def]
 
 @kernel
 def backward_tiles(  # type: ignore[no-untyped-def]
-    start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, limits, with_depth, neurons,
-    transmittance, last, g_rgb, g_transmittance, g_z, error, pair_rows, net, edge,
+    start, stop, depths, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, limits, with_depth, neurons,
+    transmittance, last, g_rgb, g_transmittance, g_z, error, pair_rows, live, found, net, edge,
 ):  # fmt: skip
     """Gradient rows of every pair of tiles ``start:stop``. ``g_transmittance`` already holds the background's share.
 
-    ``net``: as for :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
+    ``depths``, ``live``, ``found``: what the forward pass kept of these tiles (:mod:`~neuprim.core.render.cpu.kept`). ``net``: as for
+    :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
     """
+    depths, rows, wide, slots, spans, kinds = lent(depths), lent(rows), lent(wide), lent(slots), lent(spans), lent(kinds)
+    boxes, starts, ids, colors, pair_rows = lent(boxes), lent(starts), lent(ids), lent(colors), lent(pair_rows)
+    live, found = lent(live), lent(found)
     height, width = norms.shape
     across = (width + L.TILE - 1) // L.TILE
     C = colors.shape[1]
@@ -142,14 +154,13 @@ def backward_tiles(  # type: ignore[no-untyped-def]
     state = aligned((6 + C) * L.PIXELS + 2 * L.TILE)
     w, cg, sums = aligned(L.TILE), aligned(L.TILE), aligned((2 + C) * L.TILE)
     bounds, offset = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32)
-    rows_live, reach = np.zeros(L.TILE, np.float32), np.zeros(L.TILE, np.float32)
+    rows_live = np.zeros(L.TILE, np.float32)
     evaluated = 0
     for t in range(start, stop):
         tx, ty = (t % across) * L.TILE, (t // across) * L.TILE
         state[:] = f(0)
         deepest = 0
         for y in range(L.TILE):
-            reach[y] = f(0)
             for x in range(L.TILE):
                 j, Y, X = y * L.TILE + x, ty + y, tx + x
                 state[j + L.T_] = f(1)
@@ -163,7 +174,6 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                     for c in range(C):
                         state[j + L.G_COLOR + c * L.PIXELS] = g_rgb[Y, X, c]
                     deepest = max(deepest, last[Y, X])
-                    reach[y] = max(reach[y], f(last[Y, X]))
         first = starts[t]
         for q in range(first + deepest, starts[t + 1]):
             pair_rows[q, :] = f(0)
@@ -171,14 +181,16 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             q = first + deepest - 1 - back
             if back + 1 < deepest:
                 fetch_ahead(np.int64(ids[q - 1]), rows, spans, boxes)
+                lanes_ahead(depths, np.int64(found[q - 1]), np.int64(found[q]))
             i = ids[q]
             p, out = rows[i], pair_rows[q]
             rank = f(q - first + 1)
             y0, y1 = max(boxes[i, 1] - ty, 0), min(boxes[i, 3] - ty, L.TILE)
             x0, x1 = max(boxes[i, 0] - tx, 0), min(boxes[i, 2] - tx, L.TILE)
             fx0, fy0 = f(tx) + f(0.5) - p[L.UX], f(ty) + f(0.5) - p[L.UY]
+            alive = np.int32(live[q])
             for y in range(L.TILE):
-                rows_live[y] = f(1) if reach[y] >= rank else f(0)
+                rows_live[y] = f((alive >> y) & 1)
             row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, rows_live, bounds)
             n = compact(S, state, offset, bounds, y0, y1)
             out[:] = f(0)
@@ -186,8 +198,12 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                 continue
             n16 = ((n + 15) // 16) * 16
             evaluated += n16
-            field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, edge)
-            opacity(S, n16, amin, amax, edge)
+            for k in range(0, n16, L.TILE):
+                copy16(S, L.DEPTH + k, depths, found[q] + k)
+            at_once = neurons <= AT_ONCE and slots[i] < 0 and net is None and not with_depth
+            if not at_once:
+                lanes_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, neurons, floor, edge)
+            opacity(S, n16, amin, amax)
             for k in range(n, n16):
                 S[L.GRAD + k] = f(0)
             if net is not None:
@@ -195,8 +211,9 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                 for c in range(C, 2 * C):
                     for k in range(n, n16):
                         S[L.RAY_COLOUR + c * L.LANES + k] = f(0)
-            for k in range(n16):
-                S[L.GMID + k] = f(0)
+            if not at_once:
+                for k in range(n16):
+                    S[L.GMID + k] = f(0)
             sums[:] = f(0)
             for y in range(y0, y1):
                 a, b = bounds[y], bounds[y + L.TILE]
@@ -240,11 +257,10 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             if net is None:
                 for c in range(C):
                     out[color_at + c] = _total(sums, (2 + c) * L.TILE)
-            field_gradient(S, n16, out, edge)
-            for m in range(0, neurons, 2):
-                two_neurons(S, V[m], V[m + 1], n16, p, m, out)
-            if len(edge) > 0 and slots[i] >= 0:
-                density_alone(S, n16)
+            if at_once:
+                gradients_at_once(S, n16, p, kinds[i], fx0, fy0, floor, neurons, edge, out)
+                continue
+            neuron_gradients(S, V, n16, p, kinds[i], neurons, edge, slots[i] >= 0, out)
             if net is not None:
                 ray_colour_gradient(S, waves, n16, i, net, C, out, color_at)
             chord_gradient(S, n16, p, out, edge, slots[i] >= 0)

@@ -17,10 +17,10 @@ import numpy as np
 
 from neuprim.core.compute.kernels import inline, kernel
 from neuprim.core.render.cpu import layout as L
-from neuprim.core.render.cpu.backward import opacity
+from neuprim.core.render.cpu.backward import opacity, optical_depths
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
-from neuprim.core.render.cpu.gradients import chord_gradient, density_alone, field_gradient, two_neurons
-from neuprim.core.render.cpu.neurons import field_values, field_with_slopes
+from neuprim.core.render.cpu.gradients import chord_gradient, lanes_with_slopes, neuron_gradients
+from neuprim.core.render.cpu.neurons import field_values
 from neuprim.core.render.cpu.ray_colours import ray_colour_gradient, ray_colours
 from neuprim.core.render.cpu.tiles import compact, row_spans
 
@@ -29,7 +29,7 @@ __all__ = ["backward_tiles_by_entry", "composite_tiles_by_entry"]
 f = np.float32
 
 # One row per hit of the tile, because hits are read in another order than they are written. The backward pass fills the last three.
-H_ENTRY, H_ALPHA, H_SLOPE, H_DEPTH, H_WEIGHT, H_BEFORE, H_GRAD = 0, 1, 2, 3, 4, 5, 6  # camera-z of the entry and of the chord's middle
+H_ENTRY, H_ALPHA, H_SLOPE, H_DEPTH, H_OPTICAL, H_WEIGHT, H_BEFORE, H_GRAD = range(8)  # H_DEPTH: camera-z of the chord's middle
 H_FLOATS = 8
 H_PIXEL, H_LANE, H_PAIR = 0, 1, 2  # pixel of the tile, lane of the pair, pair of the tile
 H_INTS = 4
@@ -90,7 +90,8 @@ def _list_hits(  # type: ignore[no-untyped-def]
         n16 = ((n + 15) // 16) * 16
         evaluated += n16
         field_values(S, D, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, False, True, edge)
-        opacity(S, n16, amin, amax, edge)
+        optical_depths(S, n16, edge)
+        opacity(S, n16, amin, amax)
         if net is not None:
             ray_colours(S, D, waves, n16, i, net, slots, colors[i], False)
         anchor, unit = p[L.ANCHOR_Z], p[L.UNIT]
@@ -102,7 +103,7 @@ def _list_hits(  # type: ignore[no-untyped-def]
                     middle = S[L.MID + k] + S[L.SLIDE + k]
                     hits[count, H_ENTRY] = anchor + unit * (middle - S[L.HALF + k]) if S[L.UNCUT + k] > f(0) else _CUT
                     hits[count, H_ALPHA], hits[count, H_SLOPE] = S[L.ALPHA + k], S[L.SLOPE + k]
-                    hits[count, H_DEPTH] = anchor + unit * middle
+                    hits[count, H_DEPTH], hits[count, H_OPTICAL] = anchor + unit * middle, S[L.DEPTH + k]
                     marks[count, H_PIXEL], marks[count, H_LANE], marks[count, H_PAIR] = y * L.TILE + x, k, q - first
                     if net is not None:
                         for c in range(hues.shape[1]):
@@ -294,9 +295,9 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
             n, y0, y1, fx0, fy0 = _lanes_of(S, state, offset, bounds, rows_live, spans[i], boxes[i], p, tx, ty)
             n16 = ((n + 15) // 16) * 16
             evaluated += n16
-            field_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, edge)
+            lanes_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, neurons, floor, edge)
             for k in range(n16):
-                S[L.GRAD + k], S[L.GMID + k] = f(0), f(0)
+                S[L.GRAD + k], S[L.GMID + k], S[L.DEPTH + k] = f(0), f(0), f(0)
             if net is not None:
                 ray_colours(S, D, waves, n16, i, net, slots, colors[i], True)
                 for c in range(C, 2 * C):
@@ -304,18 +305,14 @@ def backward_tiles_by_entry(  # type: ignore[no-untyped-def]
                         S[L.RAY_COLOUR + c * L.LANES + k] = f(0)
             for s in range(starts_of[q - first], starts_of[q - first + 1]):
                 k, j = marks[s, H_LANE], marks[s, H_PIXEL]
-                S[L.GRAD + k] = hits[s, H_GRAD]
+                S[L.GRAD + k], S[L.DEPTH + k] = hits[s, H_GRAD], hits[s, H_OPTICAL]
                 if net is not None:
                     for c in range(C):
                         if S[L.RAY_COLOUR + c * L.LANES + k] >= f(0):
                             S[L.RAY_COLOUR + (C + c) * L.LANES + k] = hits[s, H_WEIGHT] * g_rgb[ty + j // L.TILE, tx + j % L.TILE, c]
                 if with_depth:
                     S[L.GMID + k] = hits[s, H_WEIGHT] * g_z[ty + j // L.TILE, tx + j % L.TILE] * p[L.UNIT]
-            field_gradient(S, n16, out, edge)
-            for m in range(0, neurons, 2):
-                two_neurons(S, V[m], V[m + 1], n16, p, m, out)
-            if len(edge) > 0 and slots[i] >= 0:
-                density_alone(S, n16)
+            neuron_gradients(S, V, n16, p, kinds[i], neurons, edge, slots[i] >= 0, out)
             if net is not None:
                 ray_colour_gradient(S, waves, n16, i, net, C, out, color_at)
             chord_gradient(S, n16, p, out, edge, slots[i] >= 0)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import inline, kernel
+from neuprim.core.compute.views import lent
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
+from neuprim.core.render.cpu.kept import alive, grown, room
 from neuprim.core.render.cpu.neurons import field_values
 from neuprim.core.render.cpu.ray_colours import add_ray_colours, composite_rgb_ray_colours, ray_colours
 from neuprim.core.render.cpu.tiles import aligned, compact, fetch_ahead, row_spans
@@ -17,16 +19,19 @@ __all__ = ["composite_tiles"]
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(L.TILE).astype(np.float32)
+_LANES_PER_PAIR = 64  # that optical depths are given room for at first
 _LIVE_EVERY = 4  # pairs between two counts of live pixels: a dead row costs a few lanes, a count costs a reduction per row
 
 
 @inline
-def _opacity(S, n, amin, amax, edge):  # type: ignore[no-untyped-def]
-    """ALPHA of every lane: 0 below alpha_min and where the integral is not positive, at most alpha_max."""
+def _opacity(S, n, amin, amax, edge, keep, depths, at):  # type: ignore[no-untyped-def]
+    """ALPHA of every lane: 0 below alpha_min and where the integral is not positive, at most alpha_max; its depth to ``depths[at + k]``."""
     for k in range(n):
         depth = S[L.FIELD + k] * S[L.HALF + k] * S[L.NORM_L + k] * f(2)
         if len(edge) > 0:
             depth *= S[L.FADE + k]
+        if keep:
+            depths[index(at + k)] = depth
         alpha = min(one_minus_exp(depth), amax)
         alpha = alpha if alpha >= amin else f(0)
         S[L.ALPHA + k] = alpha if depth > f(0) else f(0)
@@ -65,16 +70,20 @@ def _composite_row(st, lanes, w, a, b, tmin, rank):  # type: ignore[no-untyped-d
 @kernel
 def composite_tiles(  # type: ignore[no-untyped-def]
     start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, background, limits, with_depth, neurons,
-    rgb, transmittance, zsum, last, net, edge,
+    rgb, transmittance, zsum, last, live, found, net, edge,
 ):  # fmt: skip
-    """Draw tiles ``start:stop``; returns the number of evaluated lanes.
+    """Draw tiles ``start:stop``; returns the number of evaluated lanes, and their optical depths if ``live`` and ``found`` have room for them.
 
     limits = (alpha_min, alpha_max, transmittance_min, depth_floor), all float32. ``norms`` (H, W) is the length of the
     pixel's ray direction whose camera-z is 1. Where ``slots[i]`` is not -1, primitive i is drawn in float64 from that row of
     ``wide``. ``last`` receives the rank + 1 of each pixel's last contributor. ``net`` is None where ``colors`` is all there is to a
     colour, which leaves no trace of it in the compiled kernel, or the :class:`~neuprim.core.render.cpu.colour_net.Net` on that base.
     """
+    rows, wide, slots, spans, kinds, boxes = lent(rows), lent(wide), lent(slots), lent(spans), lent(kinds), lent(boxes)
+    starts, ids, colors, live, found = lent(starts), lent(ids), lent(colors), lent(live), lent(found)
     height, width = norms.shape
+    keep = live.shape[0] > 0
+    depths = room(_LANES_PER_PAIR * (starts[stop] - starts[start]) if keep else 0)
     across = (width + L.TILE - 1) // L.TILE
     C = colors.shape[1]
     amin, amax, tmin, floor = limits[0], limits[1], limits[2], limits[3]
@@ -108,13 +117,17 @@ def composite_tiles(  # type: ignore[no-untyped-def]
             fx0, fy0 = f(tx) + f(0.5) - p[L.UX], f(ty) + f(0.5) - p[L.UY]
             row_spans(spans[i], fx0, fy0, y0, y1, x0, x1, rows_live, bounds)
             n = compact(S, state, offset, bounds, y0, y1)
+            if keep:
+                live[q], found[q] = alive(rows_live), evaluated
             if n > 0:
                 n16 = ((n + 15) // 16) * 16
-                evaluated += n16
+                if keep and evaluated + n16 > depths.shape[0]:
+                    depths = grown(depths, evaluated + n16)
                 field_values(
                     S, D, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, with_depth, False, edge
                 )
-                _opacity(S, n16, amin, amax, edge)
+                _opacity(S, n16, amin, amax, edge, keep, depths, evaluated)
+                evaluated += n16
                 if net is not None:
                     ray_colours(S, D, waves, n16, i, net, slots, colors[i], False)
                 rank = f(q - starts[t] + 1)
@@ -162,4 +175,4 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                 last[ty + y, tx + x] = np.int32(state[j + L.LAST])
                 if with_depth:
                     zsum[ty + y, tx + x] = state[j + L.ZSUM]
-    return evaluated
+    return evaluated, depths

@@ -1,4 +1,10 @@
-"""From dL/d(2 FIELD HALF FADE) of every lane back to one gradient row: shared by both orders of compositing."""
+"""From dL/d(2 FIELD HALF FADE) of every lane of a pair back to one gradient row: shared by both orders of compositing.
+
+The optical depths are known, from the forward pass or from the lists of hits, so that FIELD is not summed over the neurons again: one
+loop per pair of neurons goes from the phases to the sums. Two paths: :func:`neuron_gradients` and :func:`chord_gradient` read chords from the
+lanes, which float64, colour networks and many neurons need; :func:`gradients_at_once` has a chord in registers from end to end, with at most
+two neurons, and neither writes nor reads what lies between.
+"""
 
 from __future__ import annotations
 
@@ -6,72 +12,225 @@ import numpy as np
 
 from neuprim.core.compute.kernels import inline
 from neuprim.core.render.cpu import layout as L
+from neuprim.core.render.cpu.chord import add_ray, by_depth, chord, put_ray, ray, through_chord, weight, zero_ray
+from neuprim.core.render.cpu.float64 import chords_float64
+from neuprim.core.render.cpu.float64_edge import slopes_float64
+from neuprim.core.render.cpu.profiles import slopes_fast, slopes_medium, slopes_slow
+from neuprim.core.render.cpu.tiles import chords
+from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns
 
-__all__ = ["chord_gradient", "density_alone", "field_gradient", "two_neurons"]
+__all__ = ["AT_ONCE", "chord_gradient", "gradients_at_once", "lanes_with_slopes", "neuron_gradients"]
 
 f = np.float32
+AT_ONCE = 2  # neurons, at most, whose sums stay in registers beside those of the chord
+_TINY = f(1e-30)
 
 
 @inline
-def field_gradient(S, n, out, edge):  # type: ignore[no-untyped-def]
-    """From dL/d(2 FIELD HALF FADE) to dL/d FIELD, and the sums for b2 and log m."""
+def _neuron(p, o):  # type: ignore[no-untyped-def]
+    return p[o + L.WX], p[o + L.WY], p[o + L.WZ], p[o + L.PHASE], p[o + L.AMPLITUDE]
+
+
+def _products(slopes):  # type: ignore[no-untyped-def]
+    """cos B, d(cos B)/d phase and cos dB/d rate of two neurons on a chord with middle q and half chord vector v, phases in turns."""
+
+    @inline
+    def products(edge, qx, qy, qz, vx, vy, vz, first, second):  # type: ignore[no-untyped-def]
+        ax, ay, az, ab, _ = first
+        bx, by, bz, bb, _ = second
+        u = qx * ax + qy * ay + qz * az + ab
+        r = u - np.rint(u)
+        u1 = qx * bx + qy * by + qz * bz + bb
+        r1 = u1 - np.rint(u1)
+        b, slope, b1, slope1 = slopes(edge, vx * ax + vy * ay + vz * az, vx * bx + vy * by + vz * bz)
+        z, z1 = r * r, r1 * r1
+        c, c1 = cos_turns(z), cos_turns(z1)
+        s, s1 = -TAU * TAU * r * sinc_turns(z) * b, -TAU * TAU * r1 * sinc_turns(z1) * b1
+        return c * b, s, c * slope, c1 * b1, s1, c1 * slope1
+
+    return products
+
+
+_slow, _medium, _fast = _products(slopes_slow), _products(slopes_medium), _products(slopes_fast)
+
+
+@inline
+def _add_neuron(sums, cosine, u, v, qx, qy, qz, vx, vy, vz):  # type: ignore[no-untyped-def]
+    """One lane's share of dL/d(amplitude, phase, W) but for the amplitude, from the three products times dL/d FIELD."""
+    s0, s1, s2, s3, s4 = sums
+    return s0 + cosine, s1 + u, s2 + (u * qx + v * vx), s3 + (u * qy + v * vy), s4 + (u * qz + v * vz)
+
+
+@inline
+def _put_neuron(sums, amplitude, m, out):  # type: ignore[no-untyped-def]
+    s0, s1, s2, s3, s4 = sums
+    o = L.G_NEURONS + L.PER_NEURON * m
+    out[o + L.AMPLITUDE], out[o + L.PHASE] = s0, amplitude * s1
+    out[o + L.WX], out[o + L.WY], out[o + L.WZ] = amplitude * s2, amplitude * s3, amplitude * s4
+
+
+# ---------------------------------------------------------------- a chord in registers from end to end
+
+
+@inline
+def _without_neurons(S, n, p, fx0, fy0, depth_floor, edge, out):  # type: ignore[no-untyped-def]
+    row, tc, field = ray(p), p[L.TC], p[L.OFFSET]
+    total, rays = f(0), zero_ray()
+    for k in range(n):
+        du, dv, slide, ex, ey, ez, px, py, pz, D, ia, tm, h, uncut, mid, half = chord(S[L.PIXEL + k], fx0, fy0, row)
+        fade, by_d = weight(D, edge)
+        g = f(2) * S[L.GRAD + k]
+        total += g * half * fade
+        gmx, gmy, gmz, gex, gey, gez = through_chord(
+            g * field * fade, f(0), f(0), g * half * field * by_d, f(0), half, ex, ey, ez, px, py, pz, mid, tm, ia, h, uncut,
+            by_depth(D, ia, depth_floor, edge), f(0), f(0), f(0), f(0), f(0), f(0),
+        )  # fmt: skip
+        rays = add_ray(rays, du, dv, slide, tc + slide, gmx, gmy, gmz, gex, gey, gez)
+    out[L.G_OFFSET], out[L.G_LOG_M] = total, total * field
+    put_ray(rays, out)
+
+
+def _with_two(products):  # type: ignore[no-untyped-def]
+    @inline
+    def gradients(S, n, p, fx0, fy0, depth_floor, edge, out):  # type: ignore[no-untyped-def]
+        row, tc, offset = ray(p), p[L.TC], p[L.OFFSET]
+        first, second = _neuron(p, L.NEURONS), _neuron(p, L.NEURONS + L.PER_NEURON)
+        ax, ay, az, _, aa = first
+        bx, by, bz, _, ba = second
+        ax1, ay1, az1, bx1, by1, bz1 = ax * aa, ay * aa, az * aa, bx * ba, by * ba, bz * ba
+        total, rays = f(0), zero_ray()
+        sums, sums1 = (f(0), f(0), f(0), f(0), f(0)), (f(0), f(0), f(0), f(0), f(0))
+        for k in range(n):
+            du, dv, slide, ex, ey, ez, px, py, pz, D, ia, tm, h, uncut, mid, half = chord(S[L.PIXEL + k], fx0, fy0, row)
+            shift = mid - tm
+            qx, qy, qz = px + shift * ex, py + shift * ey, pz + shift * ez
+            vx, vy, vz = ex * half, ey * half, ez * half
+            c, s, d, c1, s1, d1 = products(edge, qx, qy, qz, vx, vy, vz, first, second)
+            field = offset + c * aa + c1 * ba
+            fade, by_d = weight(D, edge)
+            g = f(2) * S[L.GRAD + k]
+            gf = g * half * fade
+            total += gf
+            u, v, u1, v1 = gf * s, gf * d, gf * s1, gf * d1
+            sums = _add_neuron(sums, gf * c, u, v, qx, qy, qz, vx, vy, vz)
+            sums1 = _add_neuron(sums1, gf * c1, u1, v1, qx, qy, qz, vx, vy, vz)
+            gqx, gqy, gqz = u * ax1 + u1 * bx1, u * ay1 + u1 * by1, u * az1 + u1 * bz1
+            gvx, gvy, gvz = v * ax1 + v1 * bx1, v * ay1 + v1 * by1, v * az1 + v1 * bz1
+            gmx, gmy, gmz, gex, gey, gez = through_chord(
+                gvx * ex + gvy * ey + gvz * ez + g * field * fade, gqx * ex + gqy * ey + gqz * ez, f(0), g * half * field * by_d, f(0),
+                half, ex, ey, ez, px, py, pz, mid, tm, ia, h, uncut, by_depth(D, ia, depth_floor, edge), gqx, gqy, gqz, gvx, gvy, gvz,
+            )  # fmt: skip
+            rays = add_ray(rays, du, dv, slide, tc + slide, gmx, gmy, gmz, gex, gey, gez)
+        out[L.G_OFFSET], out[L.G_LOG_M] = total, total * offset + aa * sums[0] + ba * sums1[0]
+        _put_neuron(sums, aa, 0, out)
+        _put_neuron(sums1, ba, 1, out)
+        put_ray(rays, out)
+
+    return gradients
+
+
+_with_two_slow, _with_two_medium, _with_two_fast = _with_two(_slow), _with_two(_medium), _with_two(_fast)
+
+
+@inline
+def gradients_at_once(S, n, p, kinds, fx0, fy0, depth_floor, neurons, edge, out):  # type: ignore[no-untyped-def]
+    """The gradient row of a pair with at most :data:`AT_ONCE` neurons from PIXEL and GRAD of its lanes."""
+    if neurons == 0:
+        _without_neurons(S, n, p, fx0, fy0, depth_floor, edge, out)
+    elif kinds[0] == L.MEDIUM:
+        _with_two_medium(S, n, p, fx0, fy0, depth_floor, edge, out)
+    elif kinds[0] == L.SLOW:
+        _with_two_slow(S, n, p, fx0, fy0, depth_floor, edge, out)
+    else:
+        _with_two_fast(S, n, p, fx0, fy0, depth_floor, edge, out)
+
+
+# ---------------------------------------------------------------- a chord in the lanes
+
+
+@inline
+def lanes_with_slopes(S, D, V, n, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, neurons, floor, edge):  # type: ignore[no-untyped-def]
+    """Chords of ``n`` lanes of primitive ``i``; in float64, where float32 is too coarse, also the three products per neuron, in ``V``."""
+    if slots[i] >= 0:
+        chords_float64(S, D, bounds, y0, y1, tx, ty, n, wide[slots[i]], floor, False, True)
+        slopes_float64(edge, S, D, V, n, wide[slots[i]], neurons)
+    else:
+        chords(S, n, rows[i], fx0, fy0, floor, False, True, edge)
+
+
+@inline
+def _field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyped-def]
+    """From dL/d(2 FIELD HALF FADE) to dL/d FIELD, and the sums for b2 and log m. FIELD is what the optical depth says."""
     offset, log_m = f(0), f(0)
     for k in range(n):
         g = f(2) * S[L.GRAD + k]
-        gf = g * S[L.HALF + k] * S[L.FADE + k] if len(edge) > 0 else g * S[L.HALF + k]
-        S[L.GRAD + k], S[L.GF + k] = g, gf
+        length = S[L.HALF + k] * S[L.FADE + k] if len(edge) > 0 else S[L.HALF + k]
+        field = S[L.FIELD + k] if in_float64 else f(0.5) * S[L.DEPTH + k] / max(length * S[L.NORM_L + k], _TINY)
+        gf = g * length
+        S[L.GRAD + k], S[L.GF + k], S[L.FIELD + k] = g, gf, field
         offset += gf
-        log_m += gf * S[L.FIELD + k]
+        log_m += gf * field
         S[L.GQX + k], S[L.GQY + k], S[L.GQZ + k] = f(0), f(0), f(0)
         S[L.GEX + k], S[L.GEY + k], S[L.GEZ + k] = f(0), f(0), f(0)
     out[L.G_OFFSET], out[L.G_LOG_M] = offset, log_m
 
 
-@inline
-def two_neurons(S, V0, V1, n, p, m, out):  # type: ignore[no-untyped-def]
-    """Gradients of neurons m and m + 1, and their share of dL/dQ and dL/d(half e); two at a time to share the loads."""
-    o = L.NEURONS + L.PER_NEURON * m
-    ax, ay, az, aa = p[o + L.WX], p[o + L.WY], p[o + L.WZ], p[o + L.AMPLITUDE]
-    o2 = o + L.PER_NEURON
-    bx, by, bz, ba = p[o2 + L.WX], p[o2 + L.WY], p[o2 + L.WZ], p[o2 + L.AMPLITUDE]
-    s0, s1, s2, s3, s4 = f(0), f(0), f(0), f(0), f(0)
-    r0, r1, r2, r3, r4 = f(0), f(0), f(0), f(0), f(0)
-    # amplitudes once per neuron, not per lane: in the weights here, in the sums below
-    ax1, ay1, az1, bx1, by1, bz1 = ax * aa, ay * aa, az * aa, bx * ba, by * ba, bz * ba
-    for k in range(n):
-        gf, half = S[L.GF + k], S[L.HALF + k]
-        qx, qy, qz = S[L.QX + k], S[L.QY + k], S[L.QZ + k]
-        ex, ey, ez = S[L.EXL + k] * half, S[L.EYL + k] * half, S[L.EZL + k] * half
-        s0 += gf * V0[L.N_COS + k]
-        u = gf * V0[L.N_SIN + k]
-        v = gf * V0[L.N_DSINC + k]
-        s1 += u
-        s2 += u * qx + v * ex
-        s3 += u * qy + v * ey
-        s4 += u * qz + v * ez
-        r0 += gf * V1[L.N_COS + k]
-        u1 = gf * V1[L.N_SIN + k]
-        v1 = gf * V1[L.N_DSINC + k]
-        r1 += u1
-        r2 += u1 * qx + v1 * ex
-        r3 += u1 * qy + v1 * ey
-        r4 += u1 * qz + v1 * ez
-        S[L.GQX + k] += u * ax1 + u1 * bx1
-        S[L.GQY + k] += u * ay1 + u1 * by1
-        S[L.GQZ + k] += u * az1 + u1 * bz1
-        S[L.GEX + k] += v * ax1 + v1 * bx1
-        S[L.GEY + k] += v * ay1 + v1 * by1
-        S[L.GEZ + k] += v * az1 + v1 * bz1
-    o, o2 = L.G_NEURONS + L.PER_NEURON * m, L.G_NEURONS + L.PER_NEURON * (m + 1)
-    out[o + L.AMPLITUDE], out[o + L.PHASE], out[o + L.WX], out[o + L.WY], out[o + L.WZ] = s0, aa * s1, aa * s2, aa * s3, aa * s4
-    out[o2 + L.AMPLITUDE], out[o2 + L.PHASE], out[o2 + L.WX], out[o2 + L.WY], out[o2 + L.WZ] = r0, ba * r1, ba * r2, ba * r3, ba * r4
+def _two_neurons(products):  # type: ignore[no-untyped-def]
+    """Gradients of neurons m and m + 1, and their share of dL/dQ and dL/d(half e); without ``products`` from those in V0 and V1."""
+
+    @inline
+    def add(S, V0, V1, n, p, m, edge, out):  # type: ignore[no-untyped-def]
+        o = L.NEURONS + L.PER_NEURON * m
+        first, second = _neuron(p, o), _neuron(p, o + L.PER_NEURON)
+        ax, ay, az, _, aa = first
+        bx, by, bz, _, ba = second
+        # amplitudes once per neuron, not per lane: in the weights here, in the sums below
+        ax1, ay1, az1, bx1, by1, bz1 = ax * aa, ay * aa, az * aa, bx * ba, by * ba, bz * ba
+        sums, sums1 = (f(0), f(0), f(0), f(0), f(0)), (f(0), f(0), f(0), f(0), f(0))
+        for k in range(n):
+            gf, half = S[L.GF + k], S[L.HALF + k]
+            qx, qy, qz = S[L.QX + k], S[L.QY + k], S[L.QZ + k]
+            vx, vy, vz = S[L.EXL + k] * half, S[L.EYL + k] * half, S[L.EZL + k] * half
+            if products is None:
+                c, s, d = V0[L.N_COS + k], V0[L.N_SIN + k], V0[L.N_DSINC + k]
+                c1, s1, d1 = V1[L.N_COS + k], V1[L.N_SIN + k], V1[L.N_DSINC + k]
+            else:
+                c, s, d, c1, s1, d1 = products(edge, qx, qy, qz, vx, vy, vz, first, second)
+            u, v, u1, v1 = gf * s, gf * d, gf * s1, gf * d1
+            sums = _add_neuron(sums, gf * c, u, v, qx, qy, qz, vx, vy, vz)
+            sums1 = _add_neuron(sums1, gf * c1, u1, v1, qx, qy, qz, vx, vy, vz)
+            S[L.GQX + k] += u * ax1 + u1 * bx1
+            S[L.GQY + k] += u * ay1 + u1 * by1
+            S[L.GQZ + k] += u * az1 + u1 * bz1
+            S[L.GEX + k] += v * ax1 + v1 * bx1
+            S[L.GEY + k] += v * ay1 + v1 * by1
+            S[L.GEZ + k] += v * az1 + v1 * bz1
+        _put_neuron(sums, aa, m, out)
+        _put_neuron(sums1, ba, m + 1, out)
+
+    return add
+
+
+_two_slow, _two_medium, _two_fast, _two_float64 = _two_neurons(_slow), _two_neurons(_medium), _two_neurons(_fast), _two_neurons(None)
 
 
 @inline
-def density_alone(S, n):  # type: ignore[no-untyped-def]
-    """Keep dL/dQ . e before colours add to dL/dQ: see :func:`chord_gradient`."""
-    for k in range(n):
-        S[L.INSIDE + k] = S[L.GQX + k] * S[L.EXL + k] + S[L.GQY + k] * S[L.EYL + k] + S[L.GQZ + k] * S[L.EZL + k]
+def neuron_gradients(S, V, n, p, kinds, neurons, edge, in_float64, out):  # type: ignore[no-untyped-def]
+    """Gradients of b2, log m and every neuron of a pair, and dL/dQ and dL/d(half e) of its lanes."""
+    _field_gradient(S, n, out, edge, in_float64)
+    for m in range(0, neurons, 2):
+        kind = kinds[m // 2]
+        if in_float64:
+            _two_float64(S, V[m], V[m + 1], n, p, m, edge, out)
+        elif kind == L.MEDIUM:
+            _two_medium(S, V[m], V[m + 1], n, p, m, edge, out)
+        elif kind == L.SLOW:
+            _two_slow(S, V[m], V[m + 1], n, p, m, edge, out)
+        else:
+            _two_fast(S, V[m], V[m + 1], n, p, m, edge, out)
+    if len(edge) > 0 and in_float64:  # before colours add to dL/dQ: see chord_gradient
+        for k in range(n):
+            S[L.INSIDE + k] = S[L.GQX + k] * S[L.EXL + k] + S[L.GQY + k] * S[L.EYL + k] + S[L.GQZ + k] * S[L.EZL + k]
 
 
 @inline
@@ -84,57 +243,27 @@ def chord_gradient(S, n, p, out, edge, in_float64):  # type: ignore[no-untyped-d
     the ends are left out, and BY_D, BY_A and BY_TM are derivatives of the whole mean FADE FIELD.
     """
     tc, soft = p[L.TC], len(edge)
-    a0, a1, a2, a3, a4, a5 = f(0), f(0), f(0), f(0), f(0), f(0)
-    a6, a7, a8, a9, b0, b1 = f(0), f(0), f(0), f(0), f(0), f(0)
+    rays = zero_ray()
     for k in range(n):
         half, ex, ey, ez = S[L.HALF + k], S[L.EXL + k], S[L.EYL + k], S[L.EZL + k]
-        mid, tm, ia, uncut, dh = S[L.MID + k], S[L.TM + k], S[L.IA + k], S[L.UNCUT + k], S[L.DH + k]
-        h, slide = S[L.HEIGHT + k], S[L.SLIDE + k]
+        mid, tm, slide = S[L.MID + k], S[L.TM + k], S[L.SLIDE + k]
         shift = mid - tm  # the closest point again: three stores fewer before
         px, py, pz = S[L.QX + k] - shift * ex, S[L.QY + k] - shift * ey, S[L.QZ + k] - shift * ez
         gqx, gqy, gqz = S[L.GQX + k], S[L.GQY + k], S[L.GQZ + k]
-        vx, vy, vz = S[L.GEX + k], S[L.GEY + k], S[L.GEZ + k]
+        gvx, gvy, gvz = S[L.GEX + k], S[L.GEY + k], S[L.GEZ + k]
         g, field = S[L.GRAD + k], S[L.FIELD + k]
-        g_half = vx * ex + vy * ey + vz * ez + (g * field * S[L.FADE + k] if soft > 0 else g * field)
-        gex, gey, gez = vx * half + mid * gqx, vy * half + mid * gqy, vz * half + mid * gqz
+        g_half = gvx * ex + gvy * ey + gvz * ez + (g * field * S[L.FADE + k] if soft > 0 else g * field)
         g_mid = gqx * ex + gqy * ey + gqz * ez + S[L.GMID + k]
-        if soft > 0 and in_float64:
-            g_half, g_mid = f(0), g_mid - S[L.INSIDE + k]
-        gt1 = (g_mid + g_half) * f(0.5)
-        gt0 = (g_mid - g_half) * f(0.5) * uncut
-        g_tm, g_h = gt0 + gt1, gt1 - gt0  # t0 = tm - h, t1 = tm + h
-        if soft > 0 and in_float64:
-            g_tm += g * half * S[L.BY_TM + k]
-        gD = g_h * dh  # dh/dD with D floored
+        g_tm, gD, gA = f(0), f(0), f(0)
         if soft > 0:
-            gD += g * half * S[L.BY_D + k] if in_float64 else g * half * field * S[L.BY_D + k]
-        gA = -(g_h * h * f(0.5) + g_tm * tm) * ia  # via a = e.e, h = sqrt(D/a), tm = -(m.e)/a
-        if soft > 0 and in_float64:
-            gA += g * half * S[L.BY_A + k]
-        gB = -g_tm * ia
-        m2 = f(-2) * gD  # D = 1 - |p|^2, and |p| = |m + tm e| does not change with tm
-        gmx, gmy, gmz = gqx + m2 * px + gB * ex, gqy + m2 * py + gB * ey, gqz + m2 * pz + gB * ez
-        # the ray's origin is m = p - tm e
-        gA2 = f(2) * gA - gB * tm
-        gp = tm * m2 + gB
-        gex += gp * px + gA2 * ex
-        gey += gp * py + gA2 * ey
-        gez += gp * pz + gA2 * ez
-        du, dv, reach = S[L.DU + k], S[L.DV + k], tc + slide
-        hx, hy, hz = gex + reach * gmx, gey + reach * gmy, gez + reach * gmz
-        a0 += gex + slide * gmx
-        a1 += gey + slide * gmy
-        a2 += gez + slide * gmz
-        a3 += du * hx
-        a4 += du * hy
-        a5 += du * hz
-        a6 += dv * hx
-        a7 += dv * hy
-        a8 += dv * hz
-        a9 += gmx
-        b0 += gmy
-        b1 += gmz
-    out[L.E0], out[L.E0 + 1], out[L.E0 + 2] = a0, a1, a2
-    out[L.EX], out[L.EX + 1], out[L.EX + 2] = a3, a4, a5
-    out[L.EY], out[L.EY + 1], out[L.EY + 2] = a6, a7, a8
-    out[L.XA], out[L.XA + 1], out[L.XA + 2] = a9, b0, b1
+            if in_float64:
+                g_half, g_mid = f(0), g_mid - S[L.INSIDE + k]
+                g_tm, gD, gA = g * half * S[L.BY_TM + k], g * half * S[L.BY_D + k], g * half * S[L.BY_A + k]
+            else:
+                gD = g * half * field * S[L.BY_D + k]
+        gmx, gmy, gmz, gex, gey, gez = through_chord(
+            g_half, g_mid, g_tm, gD, gA, half, ex, ey, ez, px, py, pz, mid, tm, S[L.IA + k], S[L.HEIGHT + k], S[L.UNCUT + k],
+            S[L.DH + k], gqx, gqy, gqz, gvx, gvy, gvz,
+        )  # fmt: skip
+        rays = add_ray(rays, S[L.DU + k], S[L.DV + k], slide, tc + slide, gmx, gmy, gmz, gex, gey, gez)
+    put_ray(rays, out)

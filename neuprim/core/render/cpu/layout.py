@@ -78,6 +78,7 @@ QX, QY, QZ = lane(5), lane(6), lane(7)  # chord middle
 HALF = lane(8)  # half chord, units of m along e; 0 where the ray misses
 FIELD = lane(9)  # mean of f over the chord
 PIXEL = lane(10)  # 16 y + x in the tile
+DEPTH = lane(11)  # optical depth, 2 FIELD HALF FADE NORM_L
 MID, TM, IA = lane(13), lane(14), lane(15)  # chord middle, closest approach (both t), 1/(e.e)
 DH = lane(16)  # dh/dD with the floor on D
 UNCUT = lane(17)  # 1 where the near plane does not cut the chord
@@ -100,7 +101,7 @@ FORWARD_SCRATCH = lane(21)
 BACKWARD_SCRATCH = lane(38)
 # with a colour network also, forward and backward: C arrays of colours before max(0, .), then C of dL/d those
 RAY_COLOUR = BACKWARD_SCRATCH
-# per neuron in the backward pass: cos sinc, -2 pi sin sinc, cos dsinc
+# per neuron of the float64 backward pass: cos sinc, -2 pi sin sinc, cos dsinc
 N_COS, N_SIN, N_DSINC = lane(0), lane(1), lane(2)
 NEURON_SCRATCH = lane(3)
 # per unit of a colour network: cos of its phase, and -2 pi sin, its derivative by turns

@@ -1,7 +1,4 @@
-"""A pair's field: the mean density over every lane's chord, and for the backward pass its slopes.
-
-What forward and backward, in either order of compositing, evaluate per (tile, primitive) pair once its pixels are gathered.
-"""
+"""A pair's field: the mean density over every lane's chord, which either order of compositing evaluates once a pair's pixels are gathered."""
 
 from __future__ import annotations
 
@@ -10,12 +7,12 @@ import numpy as np
 from neuprim.core.compute.kernels import inline
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import chords_float64
-from neuprim.core.render.cpu.float64_edge import neurons_float64, slopes_float64
-from neuprim.core.render.cpu.profiles import profiles_fast, profiles_medium, profiles_slow, slopes_fast, slopes_medium, slopes_slow
+from neuprim.core.render.cpu.float64_edge import neurons_float64
+from neuprim.core.render.cpu.profiles import profiles_fast, profiles_medium, profiles_slow
 from neuprim.core.render.cpu.tiles import chords
-from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns
+from neuprim.core.render.cpu.trigonometry import cos_turns
 
-__all__ = ["field_values", "field_with_slopes"]
+__all__ = ["field_values"]
 
 f = np.float32
 
@@ -47,41 +44,6 @@ def _values(profiles):  # type: ignore[no-untyped-def]
 _values_slow, _values_medium, _values_fast = _values(profiles_slow), _values(profiles_medium), _values(profiles_fast)
 
 
-def _slopes(slopes):  # type: ignore[no-untyped-def]
-    """Forward value of two neurons, and the three products of each that the gradients need, with the profiles of their range of rates."""
-
-    @inline
-    def add(S, V0, V1, n, p, o, edge):  # type: ignore[no-untyped-def]
-        ax, ay, az, ab, aa = p[o + L.WX], p[o + L.WY], p[o + L.WZ], p[o + L.PHASE], p[o + L.AMPLITUDE]
-        o2 = o + L.PER_NEURON
-        bx, by, bz, bb, ba = p[o2 + L.WX], p[o2 + L.WY], p[o2 + L.WZ], p[o2 + L.PHASE], p[o2 + L.AMPLITUDE]
-        for k in range(n):
-            half = S[L.HALF + k]
-            ex, ey, ez = S[L.EXL + k], S[L.EYL + k], S[L.EZL + k]
-            qx, qy, qz = S[L.QX + k], S[L.QY + k], S[L.QZ + k]
-            v = (ex * ax + ey * ay + ez * az) * half
-            u = qx * ax + qy * ay + qz * az + ab
-            r = u - np.rint(u)
-            v1 = (ex * bx + ey * by + ez * bz) * half
-            u1 = qx * bx + qy * by + qz * bz + bb
-            r1 = u1 - np.rint(u1)
-            b, slope, b1, slope1 = slopes(edge, v, v1)
-            z, z1 = r * r, r1 * r1
-            c, c1 = cos_turns(z), cos_turns(z1)
-            V0[L.N_COS + k] = c * b
-            V0[L.N_SIN + k] = -TAU * TAU * r * sinc_turns(z) * b
-            V0[L.N_DSINC + k] = c * slope
-            V1[L.N_COS + k] = c1 * b1
-            V1[L.N_SIN + k] = -TAU * TAU * r1 * sinc_turns(z1) * b1
-            V1[L.N_DSINC + k] = c1 * slope1
-            S[L.FIELD + k] += c * b * aa + c1 * b1 * ba
-
-    return add
-
-
-_slopes_slow, _slopes_medium, _slopes_fast = _slopes(slopes_slow), _slopes(slopes_medium), _slopes(slopes_fast)
-
-
 @inline
 def field_values(S, D, n, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, with_mid, backward, edge):  # type: ignore[no-untyped-def]
     """Chords and FIELD of ``n`` lanes of primitive ``i``, in float64 where float32 is too coarse; see :func:`~tiles.chords`."""
@@ -99,22 +61,3 @@ def field_values(S, D, n, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots
                 _values_slow(S, n, p, o, edge)
             else:
                 _values_fast(S, n, p, o, edge)
-
-
-@inline
-def field_with_slopes(S, D, V, n, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, edge):  # type: ignore[no-untyped-def]
-    """The same for the backward pass: also the three products per neuron, in ``V``, that the gradients need."""
-    if slots[i] >= 0:
-        chords_float64(S, D, bounds, y0, y1, tx, ty, n, wide[slots[i]], floor, False, True)
-        slopes_float64(edge, S, D, V, n, wide[slots[i]], neurons)
-    else:
-        p = rows[i]
-        chords(S, n, p, fx0, fy0, floor, False, True, edge)
-        for m in range(0, neurons, 2):
-            o = L.NEURONS + L.PER_NEURON * m
-            if kinds[i, m // 2] == L.MEDIUM:
-                _slopes_medium(S, V[m], V[m + 1], n, p, o, edge)
-            elif kinds[i, m // 2] == L.SLOW:
-                _slopes_slow(S, V[m], V[m + 1], n, p, o, edge)
-            else:
-                _slopes_fast(S, V[m], V[m + 1], n, p, o, edge)

@@ -14,15 +14,16 @@ from numba import types
 from numba.extending import intrinsic
 
 from neuprim.core.compute.kernels import inline
-from neuprim.core.model.edge import NORMS
+from neuprim.core.compute.views import copy16
 from neuprim.core.render.cpu import layout as L
+from neuprim.core.render.cpu.chord import by_depth, chord, ray, weight
 
-__all__ = ["aligned", "chords", "compact", "fetch_ahead", "row_spans"]
+__all__ = ["aligned", "chords", "compact", "fetch_ahead", "lanes_ahead", "row_spans"]
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(L.TILE).astype(np.float32)
-_MEANS = tuple(f(n / 2) for n in NORMS)  # of (1 - u^2)^p over [-1, 1]
+_NUMBERS = np.arange(L.PIXELS + L.TILE).astype(np.float32)  # of the tile's pixels, and a vector beyond
 _MARGIN, _ROUNDING = f(2e-3), f(4e-7)  # pixels, and per pixel of the ellipse; a lane too many is rejected by its own D
 
 
@@ -60,6 +61,13 @@ def fetch_ahead(i, rows, spans, boxes):  # type: ignore[no-untyped-def]
 
 
 @inline
+def lanes_ahead(depths, first, stop):  # type: ignore[no-untyped-def]
+    """The same for the optical depths of a pair's lanes ``first:stop``."""
+    for at in range(first, stop, 16):
+        _ask(depths.ctypes.data + 4 * at)
+
+
+@inline
 def row_spans(span, fx0, fy0, y0, y1, x0, x1, rows_live, bounds):  # type: ignore[no-untyped-def]
     """Pixels [bounds[y], bounds[y + 16]) of each live tile row inside the silhouette, equal in the others and outside rows y0:y1.
 
@@ -87,18 +95,16 @@ def row_spans(span, fx0, fy0, y0, y1, x0, x1, rows_live, bounds):  # type: ignor
 def compact(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-def]
     """Gather pixels and their ray norms into lanes; ``offset[y]`` is where row y starts. Returns the lane count.
 
-    Every row writes a whole vector, without a branch that would be guessed wrong every other time; the next row, or the final padding,
+    Every row copies a whole vector, without a branch that would be guessed wrong every other time; the next row, or the final padding,
     overwrites what stands over, so tail lanes always hold numbers of pixels of the tile.
     """
     n = 0
     for y in range(y0, y1):
         offset[y] = n
         a = bounds[y]
-        pixel = f(y * L.TILE + a)
-        j = L.NORM + y * L.TILE + a
-        for k in range(L.TILE):
-            S[index(L.PIXEL + n + k)] = pixel + _STEPS[k]
-            S[index(L.NORM_L + n + k)] = state[index(j + k)]
+        j = y * L.TILE + a
+        copy16(S, L.PIXEL + n, _NUMBERS, j)
+        copy16(S, L.NORM_L + n, state, L.NORM + j)
         n += bounds[y + L.TILE] - a
     for k in range(L.TILE):
         S[index(L.PIXEL + n + k)] = f(y0 * L.TILE)
@@ -108,55 +114,28 @@ def compact(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-def]
 
 @inline
 def chords(S, n, p, fx0, fy0, depth_floor, with_mid, backward, edge):  # type: ignore[no-untyped-def]
-    """Chord middle Q, direction E and half length of n lanes (method: "Line integral"); HALF = 0 where the ray misses.
+    """Chord middle Q, direction E and half length of n lanes (:func:`~chord.chord`); HALF = 0 where the ray misses.
 
     Where the edge is soft, no chord may be cut: such primitives are drawn in float64.
     """
-    soft = len(edge)
-    depth_floor = depth_floor if soft == 0 else f(1e-12)  # D^p tames what grows as D^-1/2
-    e0, e1, e2 = p[L.E0], p[L.E0 + 1], p[L.E0 + 2]
-    x0, x1, x2 = p[L.EX], p[L.EX + 1], p[L.EX + 2]
-    y0, y1, y2 = p[L.EY], p[L.EY + 1], p[L.EY + 2]
-    a0, a1, a2 = p[L.XA], p[L.XA + 1], p[L.XA + 2]
-    u0, u1, u2 = p[L.XU], p[L.XU + 1], p[L.XU + 2]
-    v0, v1, v2 = p[L.XV], p[L.XV + 1], p[L.XV + 2]
-    tu, tv, near, offset = p[L.TU], p[L.TV], p[L.NEAR], p[L.OFFSET]
+    row, offset = ray(p), p[L.OFFSET]
     for k in range(n):
-        pixel = S[L.PIXEL + k]
-        y = np.floor(pixel * f(1 / L.TILE))
-        du, dv = fx0 + (pixel - y * f(L.TILE)), fy0 + y
-        slide = du * tu + dv * tv
-        gx, gy, gz = du * x0 + dv * y0, du * x1 + dv * y1, du * x2 + dv * y2
-        ex, ey, ez = e0 + gx, e1 + gy, e2 + gz
-        mx, my, mz = a0 + du * u0 + dv * v0 + slide * gx, a1 + du * u1 + dv * v1 + slide * gy, a2 + du * u2 + dv * v2 + slide * gz
-        ia = f(1) / (ex * ex + ey * ey + ez * ez)
-        tm = -(mx * ex + my * ey + mz * ez) * ia
-        px, py, pz = mx + tm * ex, my + tm * ey, mz + tm * ez
-        D = f(1) - (px * px + py * py + pz * pz)
-        h = np.sqrt(max(D, f(1e-12)) * ia)
-        t0, t1 = tm - h, tm + h
-        near_here = near - slide
-        uncut = f(1) if t0 > near_here else f(0)
-        t0 = max(t0, near_here)
-        mid = (t0 + t1) * f(0.5)
-        half = (t1 - t0) * f(0.5)
-        half = half if D > f(0) else f(0)
-        half = max(half, f(0))
+        du, dv, slide, ex, ey, ez, px, py, pz, D, ia, tm, h, uncut, mid, half = chord(S[L.PIXEL + k], fx0, fy0, row)
         # from the closest point, not from the ray's origin: the shift is zero unless the near plane cuts
         shift = mid - tm
         S[L.QX + k], S[L.QY + k], S[L.QZ + k] = px + shift * ex, py + shift * ey, pz + shift * ez
         S[L.EXL + k], S[L.EYL + k], S[L.EZL + k] = ex, ey, ez
         S[L.HALF + k] = half
         S[L.FIELD + k] = offset
-        if soft > 0:
-            inner = max(D, f(0))
-            S[L.FADE + k] = _MEANS[1] * inner if soft == 1 else _MEANS[2] * inner * inner
+        if len(edge) > 0:
+            fade, by_d = weight(D, edge)
+            S[L.FADE + k] = fade
             if backward:
-                S[L.BY_D + k] = _MEANS[1] if soft == 1 else f(2) * _MEANS[2] * inner
+                S[L.BY_D + k] = by_d
         if with_mid:
             S[L.MID + k] = mid + slide
         if backward:
             S[L.DU + k], S[L.DV + k] = du, dv
             S[L.MID + k], S[L.TM + k], S[L.IA + k], S[L.UNCUT + k] = mid, tm, ia, uncut
             S[L.HEIGHT + k], S[L.SLIDE + k] = h, slide
-            S[L.DH + k] = f(0.5) * ia / np.sqrt(max(D, depth_floor) * ia)
+            S[L.DH + k] = by_depth(D, ia, depth_floor, edge)

@@ -1,0 +1,129 @@
+"""The backward pass takes the forward pass's optical depths: they are there, they are of the same lanes, and nothing else is kept."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numba import njit
+
+from neuprim.core.compute.views import copy16, lent
+from neuprim.core.render import RenderSettings, render_lowered
+from neuprim.core.render.cpu import backend, layout
+from neuprim.core.render.cpu.kept import Kept, alive
+from tests import scenes
+from tests.numerics.compare import assert_same_frame, draw
+
+SETTINGS = RenderSettings(backend="cpu", threads=1, alpha_max=0.98)  # 0.99 twice would be transmittance_min itself
+_bits = njit(lambda rows: alive(rows))
+
+
+def wall(neurons: int = 2) -> dict[str, torch.Tensor]:
+    """Twelve opaque primitives in front of the upper half of the image, twelve faint ones behind them everywhere."""
+    t = scenes.tensors(24, neurons=neurons, seed=5)
+    front, towards = (torch.arange(24) < 12)[:, None], scenes.camera().position.float() / 3
+    t["means"] = torch.where(front, 0.1 * t["means"] + towards + torch.tensor([0.0, 0.0, 0.5]), t["means"] * 0.5)
+    t["log_scales"] = torch.where(front, 0.7 + t["log_scales"], 0.2 + 0.2 * t["log_scales"])
+    t["b2"] = torch.where(front, 9.0, 0.2)
+    t["w2"] = t["w2"] * 0.1
+    return t
+
+
+def kept_of(t: dict[str, torch.Tensor], monkeypatch: pytest.MonkeyPatch) -> tuple[Kept, Any]:
+    found: list[Kept] = []
+
+    def of(pairs: int) -> Kept:
+        found.append(Kept(np.zeros(pairs, np.uint16), np.zeros(pairs, np.int32)))
+        return found[-1]
+
+    monkeypatch.setattr(backend.Kept, "of", of)
+    leaves = {k: v.clone().requires_grad_() for k, v in t.items()}
+    out = render_lowered(scenes.lowered(leaves), scenes.camera(), SETTINGS)
+    return found[0], out
+
+
+def test_depths_outgrow_their_first_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Primitives that fill their tiles have 256 lanes a pair: more than the room at first, and no lane is lost."""
+    t = scenes.tensors(16, seed=2)
+    t["log_scales"] = 0.9 + 0.3 * t["log_scales"]
+    kept, out = kept_of(t, monkeypatch)
+    lanes = out.stats.extra["forward_lanes"]
+    assert lanes > 100 * out.stats.pairs, "the scene does not fill its tiles"
+    assert sum(len(d) for d in kept.depths) >= lanes
+    monkeypatch.undo()
+    assert_same_frame(t, scenes.camera(), SETTINGS)
+
+
+@pytest.mark.parametrize("neurons", [0, 1, 2, 3, 8])
+def test_gradients_where_rows_die_early(neurons: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    t = wall(neurons)
+    kept, _ = kept_of(t, monkeypatch)
+    monkeypatch.undo()
+    assert ((kept.live != 0) & (kept.live != 2**layout.TILE - 1)).any(), "no row dies"
+    fast, _ = assert_same_frame(t, scenes.camera(), SETTINGS, image_bound=1e-4)  # what is asked here are the gradients
+    extra = fast.output.stats.extra
+    assert extra["backward_lanes"] <= extra["forward_lanes"]
+
+
+def test_hidden_pairs_are_not_evaluated_again() -> None:
+    extra = draw("cpu", wall(), scenes.camera(), SETTINGS).output.stats.extra
+    assert 0 < extra["backward_lanes"] <= extra["forward_lanes"]
+
+
+def test_nothing_is_kept_where_no_gradient_can_be_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    t = scenes.tensors(8)
+    kept, _ = kept_of(t, monkeypatch)
+    assert len(kept.live) == len(kept.found) > 0 and sum(len(d) for d in kept.depths) > 0
+    with torch.no_grad():
+        kept, _ = kept_of(t, monkeypatch)
+    assert len(kept.live) == len(kept.found) == sum(len(d) for d in kept.depths) == 0
+
+
+@pytest.mark.parametrize("neurons", [0, 2, 5])
+def test_a_second_backward_pass_finds_the_same(neurons: int) -> None:
+    leaves = {k: v.clone().requires_grad_() for k, v in wall(neurons).items()}
+    out = render_lowered(scenes.lowered(leaves), scenes.camera(), SETTINGS)
+    wanted = [leaves[k] for k in ("means", "log_scales", "quats", "b2", "colors")]
+    first, second = (torch.autograd.grad(out.rgb.sum(), wanted, retain_graph=True) for _ in range(2))
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    assert first[0].abs().sum() > 0
+
+
+@pytest.mark.parametrize("neurons", [0, 2, 8])
+def test_depths_are_found_for_any_number_of_threads(neurons: int) -> None:
+    grads = [draw("cpu", wall(neurons), scenes.camera(), RenderSettings(backend="cpu", threads=n)).grads for n in (1, 2, 3)]
+    assert all(torch.equal(grads[0][k], g[k]) for g in grads[1:] for k in g)
+
+
+def test_live_rows_as_bits() -> None:
+    rows = np.zeros(layout.TILE, np.float32)
+    rows[[0, 3, 15]] = 1
+    assert int(_bits(rows)) == 1 | 8 | 1 << 15
+
+
+def test_sixteen_floats_are_read_before_they_are_written() -> None:
+    @njit
+    def copy(target: Any, at: Any, source: Any, first: Any) -> None:
+        copy16(target, at, source, first)
+
+    numbers = np.arange(40, dtype=np.float32)
+    copy(numbers, 5, numbers, 3)
+    assert numbers.tolist() == [*range(5), *range(3, 19), *range(21, 40)]
+
+
+def test_a_lent_array_is_the_same_array_and_its_owner_keeps_it() -> None:
+    @njit
+    def total(array: Any) -> float:
+        view, result = lent(array), 0.0
+        view[0, 0] = 7
+        for row in range(view.shape[0]):
+            result += view[row].sum()
+        return result
+
+    array = np.ones((3, 4), np.float32)
+    before = sys.getrefcount(array)
+    assert [total(array) for _ in range(100)] == [18.0] * 100
+    assert array[0, 0] == 7 and sys.getrefcount(array) == before

@@ -40,7 +40,7 @@ class Kept:
 @inline
 def alive(rows_live):  # type: ignore[no-untyped-def]
     """The rows that are alive as bits."""
-    bits = 0
+    bits = np.int64(0)
     for y in range(L.TILE):
         bits |= np.int64(rows_live[y] > np.float32(0)) << y
     return np.uint16(bits)

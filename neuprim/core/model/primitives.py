@@ -27,7 +27,6 @@ from neuprim.core.model.checks import (
 from neuprim.core.model.fields import ColourField, Conditions, DensityField, LoweredColour, LoweredDensity, Shade
 from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry
 from neuprim.core.model.pairs import Pairs
-from neuprim.core.model.rows import take_rows
 from neuprim.core.model.schema import InitContext, ParameterSpec
 from neuprim.core.model.tensors import function_fault
 from neuprim.core.settings import RenderSettings
@@ -221,7 +220,12 @@ class Primitives:
         rows = self.density.alive(self.of(self.density), conditions)
         if rows is not None:
             check_rows(rows, self.count, f"{method(self.density, 'alive')} returned")
-        params = self.params if rows is None else take_rows(self.params, rows)
+        if rows is None:
+            params = self.params
+        else:
+            from neuprim.core.model.rows import take_rows  # numba, loaded when first needed
+
+            params = take_rows(self.params, rows)
         if dtype is not None:
             params = {name: value.detach().to(dtype) for name, value in params.items()}
             conditions = {name: value.to(dtype) for name, value in conditions.items()}

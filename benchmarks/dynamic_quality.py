@@ -308,7 +308,6 @@ def main_table(recorded: dict[str, Any]) -> str:
         line("model, with the errors above", lambda own: f"{own[0]['model_bytes'] / 1e6:.2f} MB"),
         line("the .vdb files, which have none", lambda own: f"{own[0]['vdb_bytes'] / 1e6:.2f} MB"),
         line("primitives that never show", lambda own: f"{100 * statistics.mean(r['invisible_fraction'] for r in own):.1f} %"),
-        line("seconds of training here, one thread, beside other work", lambda own: f"{statistics.mean(r['train_seconds'] for r in own):.0f}"),
         line("seeds", lambda own: f"{len(own)}"),
     ])  # fmt: skip
 

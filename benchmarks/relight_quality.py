@@ -55,7 +55,7 @@ BASELINES = {
 
 
 DEFAULT = "equation 14, visibility per primitive"
-HEADLINES = {"equation 14": "equation 14, as in the paper", DEFAULT: "with visibility of the light (default)"}
+HEADLINES = {"equation 14": "equation 14 alone, as in the paper", DEFAULT: "with visibility of the light (default)"}
 SIZE = 128
 CLASSES = ("lit", "cast_shadow", "attached_shadow", "highlight")
 KEYS = (

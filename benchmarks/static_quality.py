@@ -3,7 +3,7 @@
     python benchmarks/static_quality.py DIR [--seeds 3] [--rows 2800x2500 2000x2500x8:0 ...] [--jobs 2] [--readme] [--docs]
 
 DIR holds the scene (transforms_train.json, ...). Every run is the preset `quick`, its own form or another, K:EDGE, for so many steps, one view
-each: budgets in steps are the same on every machine. The seconds beside them are this machine's, one thread a run. Numbers are means over seeds
+each, on one thread: budgets in steps are the same on every machine. Numbers are means over seeds
 +- half the spread, on the test views, of the last checkpoint. Results go to benchmarks/results/static_quality.json after every run, and only what
 is missing is run. --docs puts the table between the markers in docs/static.md, --readme a short one in README.md; without DIR nothing is run.
 """
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
 from pathlib import Path
 from typing import Any
 
@@ -61,17 +60,17 @@ def groups(results: dict[str, Any]) -> dict[Group, list[dict[str, Any]]]:
 
 def table(results: dict[str, Any]) -> str:
     lines = [
-        "| primitives | form | steps | PSNR | worst view | SSIM | seconds here | model |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| primitives | form | steps | PSNR | worst view | SSIM | model |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     for (primitives, steps, form), runs in groups(results).items():
         lines.append(
             f"| {primitives:,} | {shown(form)} | {steps:,} | {spread([r['psnr'] for r in runs], 2)} dB "
             f"| {spread([r['psnr_worst'] for r in runs], 1)} dB | {spread([r['ssim'] for r in runs], 4)} "
-            f"| {statistics.mean(r['train_seconds'] for r in runs):.0f} | {runs[0]['model_bytes'] / 1e6:.2f} MB |"
+            f"| {runs[0]['model_bytes'] / 1e6:.2f} MB |"
         )
     seeds = max(len(runs) for runs in groups(results).values())
-    note = f"\n{results['scene']}, {results['views']} test views, {seeds} seed(s); seconds of training on one thread of {results['cpu']}, beside other work."
+    note = f"\n{results['scene']}, {results['views']} test views, {seeds} seed(s), one thread of {results['cpu']}."
     return "\n".join(lines) + "\n" + note
 
 

@@ -24,7 +24,7 @@ from neuprim.runs.open import load_dataset
 
 __all__ = ["Trial", "begin", "held_out", "paces_of", "recorded", "run_all"]
 
-_GROWN, _ROUNDS, _STEPS = 150, 6, 16
+_GROWN, _ROUNDS, _STEPS, _DRAWS = 150, 6, 16, 500
 
 
 @dataclass(frozen=True)
@@ -131,6 +131,10 @@ def paces_of(trainers: Mapping[str, Trainer]) -> dict[str, float]:
     """Seconds a step of each, taking turns so that all meet the same noise; medians over rounds, of models that have trained a little."""
     for trainer in trainers.values():
         compile_kernels(trainer)
+        if trainer.dataset.points is not None:  # files are read once in a run, not in each of its first steps
+            generator = torch.Generator().manual_seed(0)
+            for _ in range(_DRAWS):
+                trainer.dataset.points.draw(8, generator)
         for _ in range(_GROWN):
             trainer.train_step()
     took: dict[str, list[float]] = {name: [] for name in trainers}

@@ -52,7 +52,9 @@ KEYS = (
 # the network's rates 28.90; only idle primitives moved 28.84. With those of 29.37 K = 0 p = 2 29.27, K = 8 hard 28.47 (at the old rates 28.8 on the test views).
 # smoke_fire, 10,000 steps, K = 0 p = 2, bytes of 2,000: the least used moved 47.74 dB, only the idle *48.65*; on the fire, 7,000 steps, level.
 # Voxels beside images on the fire at equal seconds, inside the mask and relative L2 of sigma: images 40.52 .148 .222 .312; 8,192 points in every
-# fourth step *40.62 .102 .189 .281*; that with four times the weight 40.19 .097 .188 .279; 4,096 in every second 40.55 .095 .187 .276.
+# fourth step 40.62 .102 .189 .281, in every sixteenth *40.64 .114 .198 .290*; the first with four times the weight 40.19 .097 .188 .279; 4,096 in every
+# second 40.55 .095 .187 .276. On smoke_fire with quick's 13,500 primitives: images 45.74 .251 .322 .328; every sixteenth 44.89 .285 .294 .309; every
+# fourth 44.15 .330 .273 .300; every step 42.70 .323 .288 .295.
 FORMS = {
     "static": ("8:0", "0:2", "2:2", "4:2"),
     "dynamic": ("8:0@images", "0:2@images", "0:2", "2:2"),
@@ -174,8 +176,8 @@ def forms_table(found: dict[str, Any]) -> str:
 SHORT = {
     "solids": ("`solids` (generated)", ("8:0", "0:2", "2:2")),
     "chair": ("NeRF-synthetic chair", ("8:0", "0:2", "2:2")),
-    "fire": ("EmberGen fire, inside the mask", ("8:0@images", "0:2", None)),
-    "smoke_fire": ("`smoke_fire` (simulated), inside the mask", ("8:0@images", "0:2", None)),
+    "fire": ("EmberGen fire, images alone, inside the mask", ("8:0@images", "0:2@images", None)),
+    "smoke_fire": ("`smoke_fire` (simulated), images alone, inside the mask", ("8:0@images", "0:2@images", None)),
     "lit_solids": ("`lit_solids` (generated), clamped linear", ("8:0", "0:2", "2:2")),
 }
 

@@ -1,6 +1,6 @@
 """Quality of the dynamic task on a real sequence, and which way of varying in time is worth its parameters.
 
-    python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--rows 5400x2500 13500x6000] [--presets quick equations hard] [--seeds 3]
+    python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--rows 13500x4000] [--presets quick equations hard] [--seeds 3]
         [--parts main variants control between equations] [--edges 0 2] [--neurons 0 8] [--jobs 2] [--readme] [--docs]
 
 DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free fire animation, frames 1 to 40). Parts:
@@ -186,7 +186,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--frames", default="1:40")
     parser.add_argument("--parts", nargs="*", default=["main", "variants", "control", "between"])
-    parser.add_argument("--rows", nargs="*", default=["5400x2500", "13500x6000"], help="PRIMITIVESxSTEPS, of main")
+    parser.add_argument("--rows", nargs="*", default=["13500x4000"], help="PRIMITIVESxSTEPS, of main")
     parser.add_argument("--presets", nargs="*", default=list(PRESETS), choices=list(PRESETS), help="of main")
     parser.add_argument("--edges", nargs="*", type=int, default=[0, 2], help="of equations")
     parser.add_argument("--neurons", nargs="*", type=int, default=[0, 8], help="of equations")

@@ -52,8 +52,6 @@ BASELINES = {
     "no_cast_shadows": "perfect shading without cast shadows",
     "nearest_light_of_25": "nearest light of 25, same camera",
 }
-
-
 DEFAULT = "equation 14, visibility per primitive"
 HEADLINES = {"equation 14": "equation 14 alone, as in the paper", DEFAULT: "with visibility of the light (default)"}
 SIZE = 128

@@ -23,7 +23,7 @@ from shared.trials import Trial, run_all
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "static_quality.json"
-ROWS = ("2800x2500", "7000x2500", "7000x6000", "2000x2500x8:0", "5000x6000x8:0")
+ROWS = ("2800x2500", "7000x4000", "2000x2500x8:0", "5000x4000x8:0")
 DEFAULT = "2:2"
 """What the preset has."""
 KEYS = ("psnr", "psnr_worst", "ssim", "train_seconds", "model_bytes", "parameters_per_primitive", "primitives")

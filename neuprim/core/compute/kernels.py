@@ -23,7 +23,7 @@ from numba.extending import overload
 from neuprim.core.io import files
 from neuprim.version import __version__
 
-__all__ = ["FAST", "by_length", "cache_directory", "exact_kernel", "inline", "kernel", "kernel_sources", "sources_hash", "text"]
+__all__ = ["FAST", "by_length", "cache_directory", "exact_kernel", "inline", "kernel", "kernel_sources", "sources_hash", "strict", "text"]
 
 
 def _prefer_wide_vectors() -> None:
@@ -52,7 +52,7 @@ FAST = {"nnan", "nsz", "arcp", "contract", "afn", "reassoc"}
 """Floating-point freedom of the pixel kernels. NaN checks vanish under it: rows are checked before (``prepare``)."""
 
 
-_COMPILED = re.compile(rb"\bnumba\b|\bcompute\.kernels import [^\n]*\b(?:exact_kernel|kernel|inline|text)\b")
+_COMPILED = re.compile(rb"\bnumba\b|\bcompute\.kernels import [^\n]*\b(?:exact_kernel|kernel|inline|strict|text)\b")
 
 
 def kernel_sources(package: Path) -> list[Path]:
@@ -121,3 +121,6 @@ def by_length(*functions: Any) -> Any:
 
 exact_kernel = _jit(error_model="numpy", nogil=True, cache=True)
 """A kernel in strict IEEE arithmetic: per-primitive preparation, binning, sums whose order matters."""
+
+strict = njit(error_model="numpy", forceinline=True)
+"""Building block of an :data:`exact_kernel`."""

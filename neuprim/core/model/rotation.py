@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from neuprim.core.compute.kernels import strict
 
 __all__ = ["rotation", "rotation_backward"]
-
-strict = njit(error_model="numpy", forceinline=True)
 
 
 @strict

@@ -10,8 +10,11 @@ from torch import Tensor
 
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.model.densities.gain_cpu import scale_backward
+from neuprim.core.model.edge import fade
 
-__all__ = ["fused_move", "fused_window"]
+__all__ = ["WINDOW_EDGE", "fused_move", "fused_window"]
+
+WINDOW_EDGE = 2  # the exponent of the window in time, which is to a life what an edge is to a support
 
 
 class _Window(torch.autograd.Function):
@@ -19,18 +22,17 @@ class _Window(torch.autograd.Function):
     def forward(ctx: Any, w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
         tau = log_window.exp()
         u = (xi.to(b2) - center) / tau
-        inner = (1 - u.square()).clamp_min(0)
-        weight = inner.square()
-        ctx.save_for_backward(w2, b2, tau, u, inner, weight)
+        weight = fade(u.square(), WINDOW_EDGE)
+        ctx.save_for_backward(w2, b2, tau, u, weight)
         return w2 * weight, b2 * weight
 
     @staticmethod
     def backward(ctx: Any, p_w2: Tensor, p_b2: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
-        w2, b2, tau, u, inner, weight = ctx.saved_tensors
+        w2, b2, tau, u, weight = ctx.saved_tensors
         g_w2, g_b2, pulled = (torch.empty(x.shape, dtype=x.dtype) for x in (w2, b2, weight))
         given = (x.detach().contiguous().numpy() for x in (w2, b2, weight, p_w2, p_b2))
         scale_backward(*given, g_w2.numpy(), g_b2.numpy(), pulled.numpy())
-        g_u = pulled.mul_(inner).mul_(u).mul_(-4.0)
+        g_u = pulled.mul_(fade(u.square(), WINDOW_EDGE - 1)).mul_(u).mul_(-2.0 * WINDOW_EDGE)
         return g_w2, g_b2, -g_u / tau, -g_u * u, None
 
 

@@ -6,18 +6,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
-from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.compute.kernels import exact_kernel, strict
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.model.colours.sh_constants import C0, C1, C2, C3
 
 __all__ = ["fused_colors"]
 
 _CHUNK = 1024
-
-strict = njit(error_model="numpy", forceinline=True)
 
 
 @strict

@@ -10,9 +10,8 @@ they carry no gradient.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.compute.kernels import exact_kernel, strict
 from neuprim.core.model.rotation import rotation, rotation_backward
 from neuprim.core.render.cpu import layout as L
 
@@ -38,8 +37,6 @@ _CUT = 1e-3  # of the reach: float32 may find a chord cut that float64 does not
 _FLOAT64_PIXELS = 16384.0  # from the corner of the image to the anchor
 _FLOAT64_RATIO = 256.0  # of the axes; for the gradients
 _FLOAT64_RATIO_NEAR = 16.0  # of the axes of a primitive anchored at the camera, which its chords pass closely
-
-strict = njit(error_model="numpy", forceinline=True)
 
 
 @strict

@@ -41,6 +41,7 @@ class RunSettings:
     def __post_init__(self) -> None:
         verify(self, "")
         backends.check_name(self.renderer.backend)
+        backends.check_pair(self.renderer)
         population.check_name(self.train.population.strategy)
 
 

@@ -7,9 +7,11 @@ from typing import Annotated, Literal
 
 from neuprim.core.checked import Range, text, verify
 
-__all__ = ["MetricsSettings", "RenderSettings", "SortOrder"]
+__all__ = ["DeviceChoice", "MetricsSettings", "RenderSettings", "SortOrder"]
 
 SortOrder = Literal["center", "entry"]
+
+DeviceChoice = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True)
@@ -19,6 +21,9 @@ class RenderSettings:
     Attributes:
         backend: a name of the table :mod:`neuprim.core.render.backends`, which refuses any other: "reference" (float64 torch, the
             oracle), "cpu" (numba); or "auto" (the fastest that can run the model).
+        device: where a run keeps the model, the optimiser's state and the images it compares: "cpu", "cuda" (an NVIDIA card, refused
+            where there is none), or "auto": the card, where there is one and a backend that draws the model on it, else the processor.
+            Files are the same either way: a run begun on one goes on on the other.
         sort: what is composited front to back. "center": whole primitives by camera-z of their centres, one order for all pixels.
             "entry": the chords of each pixel by camera-z of where the ray enters them, those cut by the near plane first, and by
             their centres where entries are equal; no popping when centres swap, but slower (``benchmarks/sorting.py``).
@@ -34,6 +39,7 @@ class RenderSettings:
     """
 
     backend: Annotated[str, text("auto or the name of a backend")] = "auto"
+    device: DeviceChoice = "auto"
     sort: SortOrder = "center"
     samples: Annotated[int, Range(1, 16, says="a whole number of rays per pixel side, 1 to 16")] = 1
     alpha_max: Annotated[float, Range(above=0, at_most=0.9999)] = 0.99

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, orbit
+from neuprim.core.compute import device as hardware
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Conditions
 
@@ -55,6 +56,11 @@ class Pixels:
     rgb: Tensor
     alpha: Tensor | None = None
     mask: Tensor | None = None
+
+    def to(self, device: torch.device) -> Pixels:
+        """The same on another device; copies to a card do not wait for it."""
+        alpha, mask = (None if x is None else hardware.from_host(x, device) for x in (self.alpha, self.mask))
+        return Pixels(hardware.from_host(self.rgb, device), alpha, mask)
 
     def over(self, background: Tensor) -> Tensor:
         """(H, W, C) composited over a (C,) colour; opaque pixels are returned as they are."""

@@ -5,7 +5,7 @@ would be read as something else, and torch would broadcast what does not fit. He
 tensors must be, with the sizes they share, and the first that does not fit is named. That costs microseconds per frame
 (``benchmarks/form_checks.py``).
 
-Tensors are float32 or float64, in any mix, dense and on the CPU; their strides do not matter, as backends copy what is not contiguous.
+Tensors are float32 or float64, in any mix, dense and all on one device; their strides do not matter, as backends copy what is not contiguous.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.errors import FormError
 from neuprim.core.model.fields import ColourField, Constant, Cosine, DensityField, Field, Opaque, OpaqueColour, RayNet, Shading
 from neuprim.core.model.geometry import Geometry
@@ -39,6 +40,10 @@ __all__ = [
 
 _DENSITIES: tuple[type[Shaped], ...] = (Cosine, Opaque)
 _COLOURS: tuple[type[Shaped], ...] = (Constant, RayNet, OpaqueColour)
+
+
+def _kept(value: Tensor) -> bool:
+    return value.is_cpu or value.device.type in device.KINDS
 
 
 # ---------------------------------------------------------------- entrances
@@ -110,10 +115,13 @@ def check_rows(rows: Any, model: int | None, who: str, length: int | None = None
     found = None
     if not isinstance(rows, Tensor):
         found = f"type {type(rows).__name__}"
-    elif not rows.is_cpu or rows.layout is not torch.strided or rows.dtype != torch.int64 or rows.dim() != 1:
+    elif not _kept(rows) or rows.layout is not torch.strided or rows.dtype != torch.int64 or rows.dim() != 1:
         found = f"{rows.dtype} {tuple(rows.shape)} on {rows.device}"
     elif length is not None and len(rows) != length:
         found = f"{len(rows)} rows for {length} primitives"
+    elif len(rows) and not rows.is_cpu:
+        if model is not None and not bool((rows[0] >= 0) & (rows[-1] < model) & (rows[1:] > rows[:-1]).all()):  # one wait for a card
+            found = f"rows that leave the model or do not ascend, {rows[:8].tolist()}{' ...' if len(rows) > 8 else ''}"
     elif len(rows):
         numbers = rows.numpy()  # whose overhead is a fraction of torch's
         if numbers[0] < 0 or (model is not None and numbers[-1] >= model):
@@ -126,17 +134,17 @@ def check_rows(rows: Any, model: int | None, who: str, length: int | None = None
 
 
 def check_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:
-    """What a field's own code returned: a dense tensor of real numbers on the CPU, of this shape.
+    """What a field's own code returned: a dense tensor of real numbers, of this shape.
 
     Raises:
         FormError: it is something else; ``who`` names field and method.
     """
-    if isinstance(value, Tensor) and value.device.type == "cpu" and value.layout is torch.strided and value.is_floating_point():
+    if isinstance(value, Tensor) and _kept(value) and value.layout is torch.strided and value.is_floating_point():
         if value.shape == shape:
             return value
         raise FormError(f"{who} returned shape {tuple(value.shape)}; expected {shape}, a row for each of the {shape[0]} that it was given")
     found = f"{value.dtype} {value.layout} on {value.device}" if isinstance(value, Tensor) else f"type {type(value).__name__}"
-    raise FormError(f"{who} returned {found}; expected a dense tensor of real numbers on the cpu")
+    raise FormError(f"{who} returned {found}; expected a dense tensor of real numbers on the {' or '.join(device.KINDS)}")
 
 
 def check_shading(found: Any, count: int, who: str) -> Shading:
@@ -199,7 +207,7 @@ def check_halves(found: Any, like: Mapping[str, Tensor], place: Geometry, who: s
         raise FormError(f"{who} returned type {type(found).__name__}; expected (mask, tensors, Geometry) or None")
     mask, halves, where = found
     parents = place.count // 2
-    if not isinstance(mask, Tensor) or mask.device.type != "cpu" or mask.dtype != torch.bool or mask.shape != (parents,):
+    if not isinstance(mask, Tensor) or mask.device != place.means.device or mask.dtype != torch.bool or mask.shape != (parents,):
         of = f"{mask.dtype} {tuple(mask.shape)} on {mask.device}" if isinstance(mask, Tensor) else f"type {type(mask).__name__}"
         raise FormError(f"{who} returned a mask of {of}; expected torch.bool ({parents},)")
     if not isinstance(where, Geometry):

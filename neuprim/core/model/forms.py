@@ -210,7 +210,7 @@ class OpaqueColour(Shaped):
         """Colours at the centres of the primitives, seen from ``position`` (3,), unchecked."""
         means = geometry.means
         directions = torch.nn.functional.normalize(means - position.to(means), dim=1)
-        return self.radiance(torch.arange(geometry.count), means, directions)
+        return self.radiance(torch.arange(geometry.count, device=means.device), means, directions)
 
 
 @dataclass(frozen=True)
@@ -263,7 +263,8 @@ class RayNet(Shaped):
 
     def at_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
         """(N, C) float64 colours at the centres of the primitives; the same from everywhere."""
-        return self.radiance(torch.arange(geometry.count), torch.zeros(geometry.count, 3, dtype=torch.float64))
+        middles = torch.zeros_like(geometry.means, dtype=torch.float64)
+        return self.radiance(torch.arange(geometry.count, device=middles.device), middles)
 
 
 LoweredColour = Constant | RayNet | OpaqueColour

@@ -24,7 +24,14 @@ from neuprim.core.model.checks import (
     method,
     source,
 )
-from neuprim.core.model.fields import ColourField, Conditions, DensityField, LoweredColour, LoweredDensity, Shade
+from neuprim.core.model.fields import (
+    ColourField,
+    Conditions,
+    DensityField,
+    LoweredColour,
+    LoweredDensity,
+    Shade,
+)
 from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.schema import InitContext, ParameterSpec
@@ -60,6 +67,7 @@ class Lowered:
         sizes = check_geometry(self.geometry, "geometry")
         check_density(self.density, sizes, density)
         check_colour(self.colour, sizes, colour)
+        self._check_devices()
         if self.rows is not None:
             check_rows(self.rows, None, "Lowered.rows holds", sizes["N"][0])
         if self.shade is not None and (fault := function_fault(self.shade)) is not None:
@@ -69,6 +77,28 @@ class Lowered:
             check_shape("background", background, (channels,), f", as {self.source('colour')} has C={channels}")
         if viewmat is not None:
             check_shape("viewmat", viewmat, (4, 4))
+
+    def _check_devices(self) -> None:
+        where = self.geometry.means.device
+        for kind, form in (("density", self.density), ("colour", self.colour), ("geometry", self.geometry)):
+            for name, value in form.tensors().items():
+                if value.device != where:
+                    who = kind if kind == "geometry" else self.source("density" if kind == "density" else "colour")
+                    raise FormError(f"{who}: {name} has device {value.device}; expected {where}, as means has")
+
+    @property
+    def kind(self) -> str:
+        """The kind of device that its tensors are on."""
+        return self.geometry.means.device.type
+
+    @property
+    def movable(self) -> bool:
+        """Whether all that it is made of are tensors: a model's own code stays where it is."""
+        return self.density.movable and self.colour.movable
+
+    def to(self, device: torch.device) -> Lowered:
+        """The same on another device, without ``rows`` and ``shade``; differentiable. It must be :attr:`movable`."""
+        return Lowered(self.geometry.to(device), self.density.to(device), self.colour.to(device), fields=self.fields)
 
     def owner(self, kind: Literal["density", "colour"]) -> str:
         """Whose form it is, for messages: ``"density field Waves"``."""
@@ -167,6 +197,11 @@ class Primitives:
         return int(self.params["means"].shape[0])
 
     @property
+    def device(self) -> torch.device:
+        """Where its tensors are."""
+        return self.params["means"].device
+
+    @property
     def parameters_per_primitive(self) -> int:
         return sum(s.size for s in self.specs)
 
@@ -235,6 +270,19 @@ class Primitives:
         if moved is not stored:
             check_geometry(moved, method(self.density, "move"), stored.count)
         return Living(self.density, conditions, rows, params, own, stored, moved)
+
+    def forms(self, camera: AnyCamera, conditions: Conditions) -> Lowered:
+        """As :meth:`lower`, unchecked and unshaded: what kind of forms the fields lower to."""
+        living = self.living(conditions)
+        own = {s.name: living.params[s.name] for s in self.colour.parameters()}
+        density = self._lower_density(living, conditions)
+        return Lowered(living.geometry, density, self.colour.lower(own, living.geometry, camera, conditions), living.rows)
+
+    def to(self, device: torch.device) -> Primitives:
+        """The same model on another device, without gradients; itself if it is there already."""
+        if self.device == device:
+            return self
+        return Primitives(self.density, self.colour, {name: value.detach().to(device) for name, value in self.params.items()})
 
     def rows(self, index: Tensor) -> dict[str, Tensor]:
         """Detached copies of some rows of every parameter."""

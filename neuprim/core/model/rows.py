@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.threads import parallel_for
 
@@ -19,10 +20,12 @@ __all__ = ["take_rows"]
 
 
 def take_rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    """Rows (M,) int64, ascending, of each of ``tensors`` (N, ...), float32 or float64 on the CPU; differentiable, once.
+    """Rows (M,) int64, ascending, of each of ``tensors`` (N, ...), float32 or float64; differentiable, once.
 
     Nothing is checked: the kernels would read and write beyond the ends.
     """
+    if not device.fused(rows, *tensors.values()):
+        return {name: value.index_select(0, rows) for name, value in tensors.items()}
     return dict(zip(tensors, _Rows.apply(rows, *tensors.values()), strict=True))
 
 

@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Mapping
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
+
+from neuprim.core.compute import device
 
 __all__ = [
     "MOST_UNITS",
@@ -44,8 +47,8 @@ def tensor_fault(value: Any) -> str | None:
     """``"dtype torch.int64; expected torch.float32 or torch.float64"`` and the like of what no kernel can read."""
     if not isinstance(value, Tensor):
         return f"type {type(value).__name__}; expected a torch tensor"
-    if not value.is_cpu:
-        return f"device {value.device}; expected cpu, where models are kept"
+    if not value.is_cpu and value.device.type not in device.KINDS:
+        return f"device {value.device}; expected {' or '.join(device.KINDS)}, where models are kept"
     if value.layout is not torch.strided or value.is_nested:
         return f"layout {'nested' if value.is_nested else value.layout}; expected a dense tensor"
     if value.dtype not in _DTYPES:
@@ -136,6 +139,15 @@ class Shaped:
     def tensors(self) -> dict[str, Tensor]:
         """Its tensors by the names that messages give them, each with a row per primitive."""
         return {name: getattr(self, name) for name in self.shapes}
+
+    @property
+    def movable(self) -> bool:
+        """Whether it is made of tensors; a model's own code stays on the device that its tensors are on."""
+        return bool(self.shapes)
+
+    def to(self, device: torch.device) -> Self:
+        """The same with its tensors on another device; differentiable."""
+        return replace(self, **{name: getattr(self, name).to(device) for name in self.shapes})  # type: ignore[type-var]
 
     def fault(self, sizes: Sizes) -> str | None:
         """The first part that does not fit, e.g. ``"w2 has shape (5,); expected (100, 3), as means has N=100 and W1 has K=3"``; None if

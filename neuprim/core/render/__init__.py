@@ -10,6 +10,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.rays import AnyCamera, RayCamera
+from neuprim.core.compute import device
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.primitives import Lowered, Primitives
@@ -17,7 +18,7 @@ from neuprim.core.render.backends import Backend, available, choose, find
 from neuprim.core.render.output import RenderOutput, RenderStats, Tally
 from neuprim.core.render.refusals import refuse_non_finite
 from neuprim.core.render.samples import render_samples
-from neuprim.core.render.shading import Draw, with_shade
+from neuprim.core.render.shading import Draw, elsewhere, with_shade
 from neuprim.core.settings import RenderSettings
 
 __all__ = [
@@ -46,6 +47,8 @@ def render(
 ) -> RenderOutput:
     """Draw one frame; differentiable in every parameter, in ``camera.viewmat`` and in ``background``.
 
+    Tensors may be on the processor or on a card, all of a model on one of them; the image is where they are.
+
     Args:
         model: the primitives; each field lowers under ``conditions`` first.
         camera: the view; rgb is (camera.height, camera.width, C). A :class:`RayCamera` (any central projection) is drawn
@@ -71,6 +74,10 @@ def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings
     if not backend.checks:
         refuse_non_finite(lowered)
     draw = backend.load()
+    if backend.place(settings) != lowered.kind:
+        draw = elsewhere(draw, device.of_kind(backend.place(settings)))
+    if background is not None:
+        background = background.to(lowered.geometry.means.device)
     paint: Draw = draw if lowered.shade is None else with_shade(draw)
     if settings.samples > 1:
         if isinstance(camera, RayCamera):

@@ -8,10 +8,13 @@ from __future__ import annotations
 import functools
 import platform
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import torch
+
 from neuprim.core.cameras.rays import AnyCamera, RayCamera
+from neuprim.core.compute import device as hardware
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.model.forms import Constant, Cosine, RayNet
 
@@ -20,7 +23,24 @@ if TYPE_CHECKING:
     from neuprim.core.render.shading import Draw
     from neuprim.core.settings import RenderSettings
 
-__all__ = ["AUTO", "ORACLE", "TABLE", "Backend", "available", "candidates", "check_name", "choose", "compiled_ahead", "find", "names"]
+__all__ = [
+    "AUTO",
+    "ORACLE",
+    "TABLE",
+    "Backend",
+    "at_hand",
+    "available",
+    "candidates",
+    "check_device",
+    "check_name",
+    "check_pair",
+    "choose",
+    "compiled_ahead",
+    "find",
+    "names",
+    "no_card",
+    "run_device",
+]
 
 AUTO = "auto"
 """The setting that takes the first backend of the table that does not refuse."""
@@ -54,6 +74,7 @@ class Backend:
         device: what it computes on, for a run's numbers.
         missing: why this machine cannot run it at all, such as a driver that is not there; None if it can. Cheap.
         compiles: whether it compiles something once per installation, which a run then does beside its other preparations.
+        devices: kinds of device that it draws tensors of, its own first: frames whose tensors are elsewhere are moved there and back.
         checks: whether it refuses numbers that are not finite itself, while it prepares a frame; the others get :func:`refuse_non_finite`.
         differentiates_intrinsics: whether gradients reach focal lengths and the principal point.
     """
@@ -66,13 +87,31 @@ class Backend:
     compiles: bool = False
     checks: bool = False
     differentiates_intrinsics: bool = False
+    devices: tuple[str, ...] = (hardware.PROCESSOR,)
 
-    def fault(self, lowered: Lowered, camera: AnyCamera | None) -> str | None:
-        """Why it does not draw this here, as the rest of a sentence; None if it does."""
-        missing = self.missing()
-        if missing is not None:
-            return f"cannot run here: {missing}"
+    def place(self, settings: RenderSettings) -> str:
+        """The kind of device that it draws on under these settings."""
+        return self.devices[0] if settings.device == AUTO else settings.device
+
+    def absent(self, place: str) -> str | None:
+        """Why it cannot draw on this kind of device here, as the rest of a sentence; None if it can."""
+        if place not in self.devices:
+            return f"draws on the {' or '.join(self.devices)}, but renderer.device is {place}"
+        missing = (hardware.card_missing() if place == hardware.CARD else None) or self.missing()
+        return None if missing is None else f"cannot run here: {missing}"
+
+    def fault(self, lowered: Lowered, camera: AnyCamera | None, place: str | None = None) -> str | None:
+        """Why it does not draw this here, as the rest of a sentence; None if it does.
+
+        Args:
+            place: the kind of device that it is to draw on; None is its own.
+        """
+        absent = self.absent(place or self.devices[0])
+        if absent is not None:
+            return absent
         refused = self.refuses(lowered, camera)
+        if refused is None and not lowered.movable and (place or self.devices[0]) != lowered.kind:
+            refused = f"code of the model's own that works on the {lowered.kind}; it draws on the {self.devices[0]}"
         return None if refused is None else f"cannot draw {refused}"
 
 
@@ -136,18 +175,88 @@ def find(name: str) -> Backend:
     raise ConfigError(f"renderer.backend={name}: expected the name of one backend: {', '.join(names())}")
 
 
-def candidates(settings: RenderSettings) -> tuple[Backend, ...]:
-    """Those that may draw under these settings, whatever is drawn.
+def candidates(settings: RenderSettings, kind: str = hardware.PROCESSOR) -> tuple[Backend, ...]:
+    """Those that may draw tensors on a ``kind`` of device under these settings, whatever is drawn.
+
+    Tensors stay where they are if they can: those on the processor go to a card only where the settings say so.
 
     Raises:
         ConfigError: they name a backend that does not exist.
     """
-    return available() if settings.backend == AUTO else (find(settings.backend),)
+    if settings.backend != AUTO:
+        return (find(settings.backend),)
+    chosen = kind if settings.device == AUTO else settings.device
+    own = tuple(backend for backend in TABLE if backend.devices[0] == chosen and backend.absent(chosen) is None)
+    if chosen == hardware.PROCESSOR or settings.device != AUTO:
+        return own
+    return own + candidates(settings)
+
+
+def no_card() -> str | None:
+    """Why nothing is drawn on a card here, in words; None if something is."""
+    missing = hardware.card_missing()
+    rows = [backend.missing() for backend in TABLE if backend.devices[0] == hardware.CARD]
+    if missing is None and not rows:
+        return "no backend draws there"
+    return missing or (None if None in rows else rows[0])
+
+
+def check_pair(settings: RenderSettings) -> None:
+    """Raise :class:`ConfigError` for a device that the backend asked for by name does not draw on, whatever the machine."""
+    if AUTO in (settings.backend, settings.device):
+        return
+    backend = find(settings.backend)
+    if settings.device not in backend.devices:
+        own = " or ".join((*backend.devices, AUTO))
+        raise ConfigError(f"renderer.device={settings.device}: renderer.backend={backend.name} does not draw there; expected {own}")
+
+
+def check_device(settings: RenderSettings) -> None:
+    """Refuse a card that is not there.
+
+    Raises:
+        BackendUnavailable: naming the setting, and why.
+    """
+    if settings.device == hardware.CARD:
+        why = no_card() if settings.backend == AUTO else hardware.card_missing()
+        if why is not None:
+            raise BackendUnavailable(f"renderer.device={hardware.CARD}: {why}; expected {hardware.PROCESSOR} or {AUTO}")
+
+
+def at_hand(settings: RenderSettings) -> RenderSettings:
+    """The same for what is drawn again later, perhaps on another machine: a card that is not there is not insisted on."""
+    gone = settings.device == hardware.CARD and no_card() is not None and settings.backend == AUTO
+    return replace(settings, device=AUTO) if gone else settings
 
 
 def compiled_ahead(settings: RenderSettings) -> Backend | None:
     """The one that a run may want to compile beside its other preparations, whatever it will draw."""
-    return next((backend for backend in candidates(settings) if backend.compiles), None)
+    kind = hardware.CARD if no_card() is None else hardware.PROCESSOR
+    return next((backend for backend in candidates(settings, kind) if backend.compiles), None)
+
+
+def run_device(settings: RenderSettings, forms: Callable[[], Lowered], camera: AnyCamera) -> torch.device:
+    """Where a run keeps its tensors.
+
+    Args:
+        forms: what its model lowers to, on the processor; asked for where a card could draw it.
+
+    Raises:
+        BackendUnavailable, ConfigError: see :func:`check_device`.
+    """
+    check_device(settings)
+    kind = settings.device
+    if kind == AUTO and settings.backend != AUTO:
+        kind = find(settings.backend).devices[0]
+        if kind == hardware.CARD and hardware.card_missing() is not None:
+            kind = hardware.PROCESSOR  # the first frame says why it is not drawn
+    elif kind == AUTO:
+        kind = hardware.PROCESSOR
+        if no_card() is None:
+            lowered = forms()
+            if any(b.fault(lowered, camera) is None for b in TABLE if b.devices[0] == hardware.CARD):
+                kind = hardware.CARD
+    return hardware.of_kind(kind)
 
 
 def choose(lowered: Lowered, settings: RenderSettings, camera: AnyCamera | None = None) -> Backend:
@@ -157,9 +266,10 @@ def choose(lowered: Lowered, settings: RenderSettings, camera: AnyCamera | None 
         BackendUnavailable: the one asked for by name does not know the model's forms or the camera, or cannot run here.
         ConfigError: there is none of this name.
     """
+    check_device(settings)
     faults = []
-    for backend in candidates(settings):
-        fault = backend.fault(lowered, camera)
+    for backend in candidates(settings, lowered.kind):
+        fault = backend.fault(lowered, camera, backend.place(settings))
         if fault is None:
             return backend
         faults.append(f"renderer.backend={backend.name} {fault}")

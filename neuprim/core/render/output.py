@@ -52,7 +52,7 @@ class Watch:
     def add(self, rows: Tensor, weight: Tensor, error_weight: Tensor) -> None:
         """Sums of some primitives ``rows`` (R,) over some of the rays, for backends that draw in blocks."""
         if self.sums is None:
-            self.sums = torch.zeros_like(self.tally.weight), torch.zeros_like(self.tally.error_weight)
+            self.sums = tuple(torch.zeros_like(x, device=rows.device) for x in (self.tally.weight, self.tally.error_weight))
         for total, part in zip(self.sums, (weight, error_weight), strict=True):
             total.index_add_(0, rows, part.to(total))
         self.fill(*self.sums)
@@ -60,6 +60,7 @@ class Watch:
     def fill(self, weight: Tensor, error_weight: Tensor) -> None:
         """Sums (N,) over all rays."""
         tally, n = self.tally, self.rays
+        weight, error_weight = (sums.to(tally.weight.device) for sums in (weight, error_weight))
         tally.weight, tally.error_weight = (weight, error_weight) if n == 1 else (weight / n, error_weight / n)
 
 
@@ -73,6 +74,7 @@ class RenderStats:
         pairs: tile-primitive pairs (cpu) or ray-primitive pairs (reference) that were evaluated.
         rows: which primitives of the model they are where some were left out of the frame; None for all.
         samples: rays per pixel side.
+        drawn_on: the device that it was drawn on, where that is not the one its tensors are on.
         watched: what :meth:`RenderOutput.watch` left for the backward pass.
     """
 
@@ -81,15 +83,16 @@ class RenderStats:
     pairs: int = 0
     rows: Tensor | None = None
     samples: int = 1
+    drawn_on: torch.device | None = None
     watched: Watch | None = None
     extra: dict[str, Any] = field(default_factory=dict)
 
     def watch(self, error: Tensor) -> Tally:
         """See :meth:`RenderOutput.watch`; ``error`` fits."""
         n, error = self.samples, error.detach()
-        tally = Tally(torch.zeros(self.count), torch.zeros(self.count), self.rows)
+        tally = Tally(*(torch.zeros(self.count, device=error.device) for _ in range(2)), self.rows)
         rays = error if n == 1 else error.repeat_interleave(n, 0).repeat_interleave(n, 1)
-        self.watched = Watch(rays, tally, n * n)
+        self.watched = Watch(rays if self.drawn_on is None else rays.to(self.drawn_on), tally, n * n)
         return tally
 
 

@@ -14,7 +14,7 @@ from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.output import RenderOutput
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["Draw", "points_seen", "with_shade"]
+__all__ = ["Draw", "elsewhere", "points_seen", "with_shade"]
 
 Draw = Callable[..., RenderOutput]
 """A backend's ``render(lowered, camera, background, settings)``; which cameras it takes differs."""
@@ -22,13 +22,13 @@ Draw = Callable[..., RenderOutput]
 
 def points_seen(depth: Tensor, camera: AnyCamera) -> Tensor:
     """(H, W, 3) float64 scene points at a depth image (H, W): camera-z, or distance for a ``RayCamera``; no gradient."""
-    view = camera.viewmat.detach().double()
     depth = depth.detach().double()
+    view = camera.viewmat.detach().double().to(depth.device)
     if isinstance(camera, RayCamera):
-        local = camera.directions.detach().double() * depth[..., None]
+        local = camera.directions.detach().double().to(depth.device) * depth[..., None]
     else:
-        x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
-        y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
+        x = (torch.arange(camera.width, dtype=torch.float64, device=depth.device) + 0.5 - camera.cx) / camera.fx
+        y = (torch.arange(camera.height, dtype=torch.float64, device=depth.device) + 0.5 - camera.cy) / camera.fy
         local = torch.stack([x[None, :] * depth, y[:, None] * depth, depth], -1)
     return (local - view[:3, 3]) @ view[:3, :3]
 
@@ -51,3 +51,16 @@ def with_shade(draw: Draw) -> Draw:
         return replace(output, rgb=rgb, depth=output.depth if settings.depth else None)
 
     return shaded
+
+
+def elsewhere(draw: Draw, device: torch.device) -> Draw:
+    """The same, drawn on another device than the frame's tensors are on, and moved back; differentiable."""
+
+    def moved(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
+        own = lowered.geometry.means.device
+        output = draw(lowered.to(device), camera, None if background is None else background.to(device), settings)
+        output.stats.drawn_on = device
+        depth = None if output.depth is None else output.depth.to(own)
+        return replace(output, rgb=output.rgb.to(own), alpha=output.alpha.to(own), depth=depth)
+
+    return moved

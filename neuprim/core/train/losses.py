@@ -13,6 +13,7 @@ import torch
 from kornia.metrics import ssim as kornia_ssim
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.task import Loss, Supervision
 
 __all__ = ["compressed", "l1", "photometric", "photometric_reference", "relative", "scale_anisotropy"]
@@ -44,7 +45,7 @@ def photometric(settings: Mapping[str, Any]) -> Loss:
 
     def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
         if (
-            rendered.device.type == "cpu"
+            device.fused(rendered, truth)
             and rendered.dtype == torch.float32
             and weight > 0
             and min(rendered.shape[:2]) >= 11

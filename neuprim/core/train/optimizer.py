@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import NonFiniteError
@@ -70,13 +71,20 @@ _INFINITY = 0x7F800000
 
 
 def _check_gradient(name: str, grad: Tensor) -> None:
-    if grad.device.type == "cpu" and grad.dtype == torch.float32:
+    if device.fused(grad) and grad.dtype == torch.float32:
         fine = _largest_bits(grad.contiguous().reshape(-1).numpy()) < _INFINITY
     else:
         fine = bool(torch.isfinite(grad).all())
     if not fine:
         row = int((~torch.isfinite(grad.reshape(grad.shape[0], -1)).all(dim=1)).nonzero()[0])
         raise NonFiniteError(f"gradient of {name} of primitive {row} is not finite: {grad[row].flatten()[:8].tolist()}")
+
+
+def _all_finite(gradients: list[Tensor]) -> bool:
+    """Whether they are, in one wait for a card: of a NaN and anything the largest is a NaN."""
+    if not gradients:
+        return True
+    return bool(torch.isfinite(torch.stack([torch.linalg.vector_norm(g, torch.inf).double() for g in gradients])).all())
 
 
 @lru_cache(maxsize=4)
@@ -100,7 +108,7 @@ class RowAdam:
         self.specs = tuple(specs)
         self.m = {s.name: torch.zeros_like(params[s.name]) for s in self.specs}
         self.v = {s.name: torch.zeros_like(params[s.name]) for s in self.specs}
-        self.age = torch.zeros(params["means"].shape[0], dtype=torch.int64)
+        self.age = torch.zeros(params["means"].shape[0], dtype=torch.int64, device=params["means"].device)
 
     def step(self, params: dict[str, Tensor], rates: dict[str, float]) -> None:
         """Update ``params`` in place from their ``.grad``.
@@ -112,16 +120,22 @@ class RowAdam:
         for spec in self.specs:
             value, grad = params[spec.name].detach(), params[spec.name].grad
             if grad is not None and value.numel():
-                _check_gradient(spec.name, grad)
                 updates.append((spec, value, grad))
+        fused = device.fused(self.age)
+        if fused or not _all_finite([grad for _, _, grad in updates]):
+            for spec, _, grad in updates:
+                _check_gradient(spec.name, grad)
         self.age += 1
+        if not fused:
+            self._step_rows(updates, rates)
+            return
         age = self.age.numpy()
         breaks = np.flatnonzero(age[1:] != age[:-1]) + 1
         correction, root = _corrections(self.beta2, 1 << int(age.max(initial=0)).bit_length())
         work = []  # (arguments of _adam_rows), small enough to share out
         for spec, value, grad in updates:
             m, v, rate = self.m[spec.name], self.v[spec.name], rates[spec.name]
-            if value.device.type == "cpu" and value.dtype == torch.float32:
+            if value.dtype == torch.float32:
                 flat = [x.reshape(-1).numpy() for x in (value, grad.contiguous(), m, v)]
                 rows = max(_CHUNK_NUMBERS // spec.size, 1)
                 starts = range(0, value.shape[0], rows)
@@ -136,6 +150,18 @@ class RowAdam:
                 _adam_rows(*arguments)
 
         parallel_for(share, len(work), 1, 0)
+
+    def _step_rows(self, updates: list[tuple[ParameterSpec, Tensor, Tensor]], rates: dict[str, float]) -> None:
+        """The update in torch code, in the arithmetic of the kernel."""
+        age = self.age.double()
+        correction, root = 1 / (1 - BETA1**age), (1 / (1 - self.beta2**age)).sqrt()
+        for spec, value, grad in updates:
+            shape = (-1, *[1] * (value.dim() - 1))
+            m, v = self.m[spec.name], self.v[spec.name]
+            m.mul_(BETA1).add_(grad, alpha=1 - BETA1)
+            v.mul_(self.beta2).addcmul_(grad, grad, value=1 - self.beta2)
+            step, slow = ((x.to(value).reshape(shape)) for x in (rates[spec.name] * correction, root))
+            value.sub_(step * m / (v.sqrt() * slow + EPS))
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
         """Follow a change of population: keep ``rows`` (in their new order); where ``fresh`` is set, start again from nothing."""
@@ -152,5 +178,5 @@ class RowAdam:
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         for name in self.m:
-            self.m[name], self.v[name] = state[f"m.{name}"].clone(), state[f"v.{name}"].clone()
-        self.age = state["age"].clone()
+            self.m[name], self.v[name] = (state[f"{moment}.{name}"].to(self.age.device, copy=True) for moment in "mv")
+        self.age = state["age"].to(self.age.device, copy=True)

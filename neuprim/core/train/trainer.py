@@ -19,8 +19,9 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.compute.threads import limited
-from neuprim.core.data import Dataset
+from neuprim.core.data import Dataset, Pixels
 from neuprim.core.data.check import check_pixels, check_points
 from neuprim.core.data.initial import subset
 from neuprim.core.data.points_file import read_points
@@ -29,8 +30,10 @@ from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
+from neuprim.core.render.backends import run_device
 from neuprim.core.render.output import Tally
 from neuprim.core.task import Loss, Supervision
+from neuprim.core.train.ahead import Ahead
 from neuprim.core.train.losses import scale_anisotropy
 from neuprim.core.train.optimizer import RowAdam
 from neuprim.core.train.points import PointStep, point_step
@@ -39,6 +42,8 @@ from neuprim.core.train.settings import ModelSettings, TrainSettings
 
 __all__ = ["StepReport", "Trainer", "initial_model"]
 
+
+_FEW = 64  # primitives that stand for a model where only its forms count
 
 _USUAL_OPACITY = 0.5
 """Of Gaussians that say how large they are, but not how opaque."""
@@ -120,7 +125,11 @@ class _ImageStep:
 class Trainer:
     """Fits a model to the training views of a data set.
 
+    The model's tensors move to the device that the renderer's settings choose, and so does all that belongs to them; random numbers are
+    drawn on the processor, so that they are the same on every device.
+
     Attributes:
+        device: where the training's tensors are.
         step, elapsed: steps done and seconds of training they took (held-out evaluations and file writes not counted).
     """
 
@@ -140,7 +149,12 @@ class Trainer:
             raise ConfigError(f"train.supervision={settings.supervision}: {dataset.name} has no voxels to learn from; expected images")
         self.model, self.dataset, self.loss = model, dataset, loss
         self.settings, self.renderer = settings, replace(renderer, depth=False)
+        first = dataset.train.view(0)
+        few = Primitives(model.density, model.colour, model.rows(torch.arange(min(model.count, _FEW), device=model.device)))
+        self.device = run_device(self.renderer, lambda: few.forms(first.camera, first.conditions), first.camera)
+        model.params = model.to(self.device).params
         self.optimizer = RowAdam(model.specs, model.params, settings.adam_beta2)
+        self._ahead = Ahead(self._pixels) if self.device.type == device.CARD else None
         self.population = make_population(settings.population)
         self.generator = torch.Generator().manual_seed(seed + 1)
         self.order = torch.empty(0, dtype=torch.int64)
@@ -207,8 +221,9 @@ class Trainer:
                 loss, parts = loss + self.settings.voxel_weight * known.loss, {**parts, **known.parts}
         if self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from:
             loss = loss + self.settings.anisotropy_weight * scale_anisotropy(model.params["log_scales"])
-        if not math.isfinite(loss.item()):
-            self._refuse(loss.item(), seen, known)
+        value = loss.item()
+        if not math.isfinite(value):
+            self._refuse(value, seen, known)
         loss.backward()
 
         tally = seen.tally if seen is not None else known.tally() if known is not None else None
@@ -223,14 +238,14 @@ class Trainer:
                 self._apply(change)
         self.elapsed += time.perf_counter() - start
         psnr, name = (seen.psnr, seen.name) if seen is not None else (known.psnr, known.name) if known is not None else (0.0, "")
-        return StepReport(self.step, self.elapsed, loss.item(), parts, psnr, model.count, name, change.text if change else None)
+        return StepReport(self.step, self.elapsed, value, parts, psnr, model.count, name, change.text if change else None)
 
     def _look(self, progress: float) -> _ImageStep:
         """Draw the next view and compare."""
         index = self._next_view()
-        view, pixels = self.dataset.train.view(index), self.dataset.train.pixels(index)
-        check_pixels("train", view, pixels, self.dataset.channels)
-        background = self._background()
+        view = self.dataset.train.view(index)
+        pixels = self._pixels(index) if self._ahead is None else self._ahead.take(index, self.order)
+        background = self._background().to(self.device)
         truth = pixels.over(background)
         output = render(self.model, view.camera, view.conditions, self.renderer, background)
         rgb = output.rgb if pixels.mask is None else torch.where(pixels.mask[..., None], output.rgb, truth)
@@ -238,12 +253,18 @@ class Trainer:
         with torch.no_grad():
             difference = rgb - truth
             channels = difference.shape[-1]
-            tally = output.watch(difference.abs() @ torch.full((channels,), 1.0 / channels))
+            tally = output.watch(difference.abs() @ torch.full((channels,), 1.0 / channels, device=self.device))
             flat = difference.reshape(-1)
             counted = flat.numel() if pixels.mask is None else int(pixels.mask.sum()) * channels
             mse = torch.dot(flat, flat).item() / counted
         psnr = -10 * math.log10(max(mse, 1e-20)) if math.isfinite(mse) else math.nan
         return _ImageStep(loss, parts, psnr, view.name, truth, tally)
+
+    def _pixels(self, index: int) -> Pixels:
+        """Those of a training view, where the training is."""
+        pixels = self.dataset.train.pixels(index)
+        check_pixels("train", self.dataset.train.view(index), pixels, self.dataset.channels)
+        return pixels.to(self.device)
 
     def _points_due(self) -> bool:
         """Whether this step looks at points, too; the last one before each multiple of ``voxels_every`` does, which is what logs show."""
@@ -295,11 +316,12 @@ class Trainer:
     # ------------------------------------------------------------ exact state
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Tensors and JSON-able numbers from which :meth:`load_state` goes on exactly."""
+        """Tensors and JSON-able numbers from which :meth:`load_state` goes on exactly, on any device; all of them on the processor."""
         tensors = {f"params.{k}": v.detach() for k, v in self.model.params.items()}
         tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
         tensors |= {f"population.{k}": v for k, v in self.population.state().items()}
         tensors |= {"generator": self.generator.get_state(), "order": self.order}
+        tensors = {name: value.cpu() for name, value in tensors.items()}
         return tensors, {"step": self.step, "elapsed": self.elapsed, "views": len(self.dataset.train), "names": self._names()}
 
     def _names(self) -> str:
@@ -350,8 +372,11 @@ class Trainer:
                     raise ValueError(f"statistic {name} has shape {tuple(value.shape)}; expected ({model.count},)")
         except (ValueError, KeyError, RuntimeError, TypeError, IndexError) as error:
             raise CheckpointError(f"{where}: does not fit this run's settings ({error})") from error
-        self.model.params = model.params
+        self.model.params = model.to(self.device).params
+        if self.device != model.device:
+            optimizer = RowAdam(self.model.specs, self.model.params, self.settings.adam_beta2)
+            optimizer.load_state(part("adam."))
         self.optimizer, self.order, self.generator = optimizer, order.clone(), generator
-        self.population.load_state(population)
+        self.population.load_state({name: value.to(self.device) for name, value in population.items()})
         self.step, self.elapsed = step, float(elapsed)
         self._watch()

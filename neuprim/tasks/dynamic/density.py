@@ -102,7 +102,7 @@ class TimeDensity(DensityField):
             return geometry
         from neuprim.tasks.dynamic.frame_cpu import fused_move  # numba, loaded when first needed
 
-        center = params["window_center"] if "window" in self.parts else torch.full((geometry.count, 1), 0.5, dtype=geometry.means.dtype)
+        center = params["window_center"] if "window" in self.parts else torch.full_like(geometry.means[:, :1], 0.5)
         means = fused_move(geometry.means, params["velocity"], params["acceleration"], center, time_of(conditions))
         return Geometry(means, geometry.log_scales, geometry.quats)
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.model.densities.gain_cpu import scale_backward
 from neuprim.core.model.edge import fade
@@ -39,8 +40,11 @@ class _Window(torch.autograd.Function):
 def fused_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor) -> tuple[Tensor, Tensor]:
     """(w2, b2) (N, K) and (N, 1) times (1 - u^2)^2, u = (xi - center)/exp(log_window), 0 beyond |u| = 1.
 
-    ``center`` and ``log_window`` are (N, 1), all of one dtype on the CPU; no gradient for the time ``xi`` ().
+    ``center`` and ``log_window`` are (N, 1), all of one dtype; no gradient for the time ``xi`` ().
     """
+    if not device.fused(w2, b2, center, log_window):
+        weight = fade(((xi.to(b2) - center) / log_window.exp()).square(), WINDOW_EDGE)
+        return w2 * weight, b2 * weight
     result: tuple[Tensor, Tensor] = _Window.apply(w2, b2, center, log_window, xi)
     return result
 
@@ -75,7 +79,10 @@ class _Move(torch.autograd.Function):
 def fused_move(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Tensor, xi: Tensor) -> Tensor:
     """(N, 3) means + velocity (xi - center) + acceleration (xi - center)^2.
 
-    ``velocity`` and ``acceleration`` are (N, 3), ``center`` (N, 1), all of one dtype on the CPU; no gradient for the time ``xi`` ().
+    ``velocity`` and ``acceleration`` are (N, 3), ``center`` (N, 1), all of one dtype; no gradient for the time ``xi`` ().
     """
+    if not device.fused(means, velocity, acceleration, center):
+        since = xi.to(velocity) - center
+        return means + (velocity + acceleration * since) * since
     moved: Tensor = _Move.apply(means, velocity, acceleration, center, xi)
     return moved

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.errors import FormError
 from neuprim.core.model.colours.sh_constants import C0, C1, C2, C3
 from neuprim.core.model.tensors import Shape, Sizes, tensors_fault
@@ -63,7 +64,7 @@ def colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degre
     if degree == 0:
         return (dc * C0 + 0.5).clamp_min(0.0)
     assert rest is not None  # checked above
-    if dc.device.type == "cpu" and dc.dtype == means.dtype == torch.float32:
+    if device.fused(means, dc, rest) and dc.dtype == means.dtype == torch.float32:
         from neuprim.core.model.colours.sh_cpu import fused_colors  # numba, loaded when first needed
 
         return fused_colors(means, dc, rest, origin, degree)

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
 
 __all__ = ["fused_gain", "scale_backward"]
@@ -43,6 +44,9 @@ class _Gain(torch.autograd.Function):
 
 
 def fused_gain(w2: Tensor, b2: Tensor, log_gain: Tensor, limit: float) -> tuple[Tensor, Tensor]:
-    """(w2, b2) (N, K) and (N, 1) times exp(log_gain), (N, 1), which counts as no further from 0 than ``limit``; one dtype, on the CPU."""
+    """(w2, b2) (N, K) and (N, 1) times exp(log_gain), (N, 1), which counts as no further from 0 than ``limit``; one dtype."""
+    if not device.fused(w2, b2, log_gain):
+        gain = log_gain.clamp(-limit, limit).exp()
+        return w2 * gain, b2 * gain
     result: tuple[Tensor, Tensor] = _Gain.apply(w2, b2, log_gain, limit)
     return result

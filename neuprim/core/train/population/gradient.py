@@ -30,9 +30,9 @@ class Gradient(Population):
 
     def observe(self, model: Primitives, tally: Tally) -> None:
         if self.total is None or self.seen is None:
-            self.total, self.seen = torch.zeros(model.count), torch.zeros(model.count)
+            self.total, self.seen = (torch.zeros(model.count, device=model.device) for _ in range(2))
         saw = tally.of_all(model.count)[0] > 0
-        norm = torch.zeros(model.count)
+        norm = torch.zeros_like(self.total)
         for name in model.of(model.density):
             grad = model.params[name].grad
             if grad is not None and grad.numel():
@@ -62,17 +62,17 @@ class Gradient(Population):
 
         params = {n: v.detach()[kept].clone() for n, v in model.params.items()}
         own = {k: model.params[k].detach()[clones] for k in model.of(model.density)}
-        halved = model.density.scale_density(own, torch.full((len(clones),), 0.5))
+        halved = model.density.scale_density(own, torch.full((len(clones),), 0.5, device=model.device))
         halved = check_tensors(halved, own, method(model.density, "scale_density"))
         copies = {**model.rows(clones), **halved}
-        place = torch.full((model.count,), -1, dtype=torch.int64)
-        place[kept] = torch.arange(len(kept))
+        place = torch.full_like(prune, -1, dtype=torch.int64)
+        place[kept] = torch.arange(len(kept), device=model.device)
         for name, value in halved.items():
             params[name][place[clones]] = value
         children = split(model, splits, SPLIT_SHIFT, SPLIT_GAUSSIAN, SPLIT_GAUSSIAN)
         params = {n: torch.cat([params[n], copies[n], children[n]]) for n in params}
         origin = torch.cat([kept, clones, splits, splits])
-        fresh = torch.zeros(len(origin), dtype=torch.bool)
+        fresh = torch.zeros_like(origin, dtype=torch.bool)
         fresh[len(kept) :] = True
         return Change(params, origin, fresh, f"cloned {len(clones)}, split {len(splits)}, pruned {int(prune.sum())}")
 

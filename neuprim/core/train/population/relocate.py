@@ -28,7 +28,7 @@ class Relocate(Population):
 
     def observe(self, model: Primitives, tally: Tally) -> None:
         if self.weight is None or self.error is None:
-            self.weight, self.error = torch.zeros(model.count), torch.zeros(model.count)
+            self.weight, self.error = (torch.zeros(model.count, device=model.device) for _ in range(2))
         weight, error = tally.of_all(model.count)
         self.weight += weight
         self.error += error
@@ -41,7 +41,7 @@ class Relocate(Population):
         count = model.count
         budget = int(self.settings.fraction * count)
         busiest = torch.argsort(error, descending=True, stable=True)[:budget]
-        busy = torch.zeros(count, dtype=torch.bool)
+        busy = torch.zeros(count, dtype=torch.bool, device=model.device)
         busy[busiest] = True
         idle = torch.argsort(weight, stable=True)
         idle = idle[~busy[idle]][:budget]
@@ -56,9 +56,9 @@ class Relocate(Population):
         target = torch.cat([busiest, idle])
         for name, value in params.items():
             value[target] = children[name]
-        origin = torch.arange(count)
+        origin = torch.arange(count, device=model.device)
         origin[idle] = busiest
-        fresh = torch.zeros(count, dtype=torch.bool)
+        fresh = torch.zeros(count, dtype=torch.bool, device=model.device)
         fresh[target] = True
         return Change(params, origin, fresh, f"moved {moves}")
 

@@ -1,0 +1,45 @@
+"""Where tensors are: the processor's memory or a card's, and what follows from it.
+
+Everything else lets tensors' own ``device`` flow. Operations that are compiled for the processor ask :func:`fused` whether they may take
+what they are given; where they may not, a twin in torch code computes the same.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import torch
+from torch import Tensor
+
+__all__ = ["CARD", "KINDS", "PROCESSOR", "card_missing", "from_host", "fused", "of_kind"]
+
+PROCESSOR, CARD = "cpu", "cuda"
+KINDS: tuple[str, ...] = (PROCESSOR, CARD)
+"""The devices that models are kept on."""
+
+
+def fused(*tensors: Tensor) -> bool:
+    """Whether operations that are compiled for the processor may read these tensors."""
+    return all(tensor.is_cpu for tensor in tensors)
+
+
+@functools.cache
+def card_missing() -> str | None:
+    """Why torch finds no card on this machine; None if it finds one."""
+    if torch.cuda.is_available():
+        return None
+    return "torch finds no CUDA device" if torch.backends.cuda.is_built() else "this torch was built without CUDA"
+
+
+def of_kind(kind: str) -> torch.device:
+    """The device of this kind that a run uses; of several cards torch's current one."""
+    return torch.device(kind, torch.cuda.current_device()) if kind == CARD else torch.device(kind)
+
+
+def from_host(tensor: Tensor, device: torch.device) -> Tensor:
+    """The tensor on ``device``, itself if it is there already. Copies to a card go by pinned memory and do not wait for it."""
+    if tensor.device == device:
+        return tensor
+    if device.type != CARD or not tensor.is_cpu:
+        return tensor.to(device)
+    return tensor.pin_memory().to(device, non_blocking=True)

@@ -1,0 +1,36 @@
+"""The next view's pixels, made ready while a card still works on this one's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
+
+from torch import Tensor
+
+from neuprim.core.data import Pixels
+
+__all__ = ["Ahead"]
+
+
+class Ahead:
+    """Reads pixels one view ahead, in a thread of its own; which views are looked at, and in which order, does not depend on it.
+
+    Args:
+        read: (index of a view) -> its pixels, where they are needed.
+    """
+
+    def __init__(self, read: Callable[[int], Pixels]) -> None:
+        self._read = read
+        self._pool: ThreadPoolExecutor | None = None
+        self._next: tuple[int, Future[Pixels]] | None = None
+
+    def take(self, index: int, order: Tensor) -> Pixels:
+        """Pixels of a view, of which the next are those in ``order`` (M,); what went wrong in reading them is raised here."""
+        found, self._next = self._next, None
+        pixels = found[1].result() if found is not None and found[0] == index else self._read(index)
+        if len(order):
+            self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="neuprim-views")
+            following = int(order[0])
+            self._next = following, self._pool.submit(copy_context().run, self._read, following)
+        return pixels

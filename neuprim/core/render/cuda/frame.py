@@ -14,6 +14,7 @@ from neuprim.core.compute.warp import array, launch, wp
 from neuprim.core.render.cpu.layout import SPAN_WIDTH
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.binning import TileLists, bin_primitives, count
+from neuprim.core.render.cuda.placement import PER_BLOCK
 from neuprim.core.render.cuda.prepare import prepare_kernel, wide_kernel
 
 __all__ = ["NAMES", "Frame", "NotFinite", "Projection", "as_arrays", "prepared"]
@@ -160,7 +161,7 @@ def prepared(
             matrix, projection.intrinsics, camera.width, camera.height, near, turns, edge, K, C,
             array(rows, wp.vec4), array(spans.view(N, 2, 4), wp.vec4), array(boxes, wp.vec4i), array(depth, wp.float64),
             array(status, wp.uint8), array(counts, wp.int32), array(bad, wp.int32),
-        ), str(device),
+        ), str(device), PER_BLOCK,
     )  # fmt: skip
     counted = count(counts, bad)
     if counted.bad >= 0:
@@ -169,6 +170,6 @@ def prepared(
     wide = empty(counted.delicate, L.wide_width(K), dtype=torch.float64)
     launch(
         wide_kernel(double), counted.delicate,
-        (array(which, wp.int32), *inputs, matrix, projection.intrinsics, near, turns, K, array(wide, wp.float64)), str(device),
+        (array(which, wp.int32), *inputs, matrix, projection.intrinsics, near, turns, K, array(wide, wp.float64)), str(device), PER_BLOCK,
     )  # fmt: skip
     return Frame(projection, parameters, K, C, rows, wide, slots, which, spans, boxes, depth, status, lists)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 import warp as wp
 from torch import Tensor
 
@@ -22,6 +23,7 @@ OPTIONS = {"enable_backward": False, "fast_math": False, "max_unroll": 16}
 
 def _start() -> None:
     wp.config.quiet = True
+    wp.config.log_level = wp.LOG_ERROR
     wp.config.enable_backward = False
     wp.config.enable_cpu_blocks = True  # without it a block on the CPU is one thread, and nothing complains
     wp.config.kernel_cache_dir = os.fspath(files.cache_directory() / "warp")
@@ -32,7 +34,12 @@ _start()
 
 
 def array(tensor: Tensor, dtype: Any) -> Any:
-    """A contiguous tensor as a Warp array of its memory; ``dtype`` may take several numbers together."""
+    """A contiguous tensor as a Warp array of its memory; ``dtype`` may take several numbers together, and int16 may be unsigned."""
+    if dtype is wp.uint16:  # which torch hardly knows
+        assert tensor.dtype == torch.int16 and tensor.is_contiguous()
+        kept = wp.array(ptr=tensor.data_ptr(), shape=tuple(tensor.shape), dtype=dtype, device=wp.device_from_torch(tensor.device))
+        kept._tensor = tensor  # the memory's owner
+        return kept
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 

@@ -1,0 +1,157 @@
+"""The pixel kernels of one frame in their order, on arrays that :mod:`~neuprim.core.render.cuda.frame` prepared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neuprim.core.compute.warp import array, launch, wp
+from neuprim.core.errors import BackendUnavailable
+from neuprim.core.render.cuda import layout as L
+from neuprim.core.render.cuda.backward_pairs import pairs_kernel, sum_pairs
+from neuprim.core.render.cuda.backward_pixels import pixels_kernel
+from neuprim.core.render.cuda.delicate import delicate_kernel
+from neuprim.core.render.cuda.delicate_backward import delicate_pairs_kernel
+from neuprim.core.render.cuda.forms import Form
+from neuprim.core.render.cuda.forward import forward_kernel
+from neuprim.core.render.cuda.frame import Frame
+from neuprim.core.render.cuda.spans import row_spans
+from neuprim.core.settings import RenderSettings
+
+__all__ = ["Composited", "backward", "forward"]
+
+_MOST_HITS = 2**31
+
+
+@dataclass
+class Composited:
+    """What a forward pass leaves.
+
+    Attributes:
+        rgb: (H W, C); transmittance: (H W,); zsum: (H W,) sum of w z, one number where no depth is wanted.
+        spans: (pairs, 16) int16, offsets: (pairs + 1,) int32: the pixels that each pair covers (:mod:`~neuprim.core.render.cuda.spans`).
+        hits: (slots, 2) opacity and transmittance before it, if they were kept; depths: (slots,) camera-z, if wanted, too.
+        reached: (tiles,) int32, the pairs before it were composited.
+    """
+
+    rgb: Tensor
+    transmittance: Tensor
+    zsum: Tensor
+    spans: Tensor
+    offsets: Tensor
+    hits: Tensor
+    depths: Tensor
+    reached: Tensor
+
+
+def _camera(frame: Frame) -> tuple[object, object]:
+    c = frame.projection.camera
+    return wp.vec4(c.fx, c.fy, c.cx, c.cy), wp.vec2i(c.width, c.height)
+
+
+def _limits(s: RenderSettings) -> object:
+    return wp.vec4(s.alpha_min, s.alpha_max, s.transmittance_min, 0.0)
+
+
+def forward(frame: Frame, form: Form, background: Tensor, settings: RenderSettings, differentiable: bool) -> Composited:
+    """Draw. The host waits for the device once where slots are kept, for how many there are.
+
+    Raises:
+        BackendUnavailable: the frame's hits are more than int32 counts.
+    """
+    lists, device, camera = frame.lists, frame.device, frame.projection.camera
+    pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
+    lens, size = _camera(frame)
+    where = str(device)
+    rows, ids, tile_of = array(frame.rows, wp.vec4), array(lists.ids, wp.int32), array(lists.tile_of, wp.int32)
+    spans = torch.empty(pairs, L.TILE, dtype=torch.int16, device=device)
+    counts = torch.empty(pairs, dtype=torch.int32, device=device)
+    shapes = array(spans, wp.uint16)
+    launch(
+        row_spans, pairs,
+        (rows, array(frame.spans, wp.float32), array(frame.boxes, wp.vec4i), ids, tile_of, size, shapes, array(counts, wp.int32)), where,
+    )  # fmt: skip
+    delicate = frame.wide.shape[0] > 0
+    keep = differentiable or delicate
+    total = 0
+    offsets = torch.zeros(pairs + 1, dtype=torch.int32, device=device)
+    if keep and pairs:
+        ends = torch.cumsum(counts, 0, dtype=torch.int64)
+        offsets[1:] = ends
+        total = int(ends[-1])
+        if total >= _MOST_HITS:
+            raise BackendUnavailable(f"primitives cover {total} pixels in all; the cuda backend counts to {_MOST_HITS - 1}: render a smaller image")
+
+    def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.empty(shape, dtype=dtype, device=device)
+
+    hits, depths = empty(total, 2), empty(total if settings.depth else 0)
+    starts_at = array(offsets, wp.int32)
+    if delicate:
+        launch(
+            delicate_kernel(settings.depth), (pairs, L.WARP),
+            (
+                array(frame.wide, wp.float64), array(frame.slots, wp.int32), ids, tile_of, shapes, starts_at, lens, _limits(settings), size,
+                form.neurons, form.edge, array(hits, wp.vec2), array(depths, wp.float32),
+            ), where, L.WARP,
+        )  # fmt: skip
+    pixels = camera.width * camera.height
+    rgb, T, z = empty(pixels, form.channels), empty(pixels), empty(pixels if settings.depth else 0)
+    reached = empty(tiles, dtype=torch.int32)
+    launch(
+        forward_kernel(form, keep, settings.depth), (tiles, L.PIXELS),
+        (
+            rows, array(lists.starts, wp.int32), ids, shapes, starts_at, lens, _limits(settings), array(background, wp.float32), size,
+            array(rgb, wp.float32), array(T, wp.float32), array(z, wp.float32), array(hits, wp.vec2), array(depths, wp.float32),
+            array(reached, wp.int32),
+        ), where, L.PIXELS,
+    )  # fmt: skip
+    return Composited(rgb, T, z, spans, offsets, hits, depths, reached)
+
+
+def backward(
+    frame: Frame, form: Form, drawn: Composited, settings: RenderSettings, g_rgb: Tensor, g_T: Tensor, g_z: Tensor | None, error: Tensor
+) -> Tensor:
+    """(N, gradient_width) gradient rows; the slots' contents are used up.
+
+    Args:
+        g_rgb: (H W, C); g_T: (H W,), with the background's share; g_z: (H W,) or None; error: (H W,). float32, contiguous.
+    """
+    lists, device = frame.lists, frame.device
+    pairs, tiles, where = lists.pairs, lists.starts.shape[0] - 1, str(device)
+    lens, size = _camera(frame)
+    depth = g_z is not None
+    gz = array(torch.empty(0, device=device) if g_z is None else g_z, wp.float32)
+    rows, ids, tile_of = array(frame.rows, wp.vec4), array(lists.ids, wp.int32), array(lists.tile_of, wp.int32)
+    shapes, starts_at, hits = array(drawn.spans, wp.uint16), array(drawn.offsets, wp.int32), array(drawn.hits, wp.vec2)
+    reached, grad = array(drawn.reached, wp.int32), array(g_rgb, wp.float32)
+    launch(
+        pixels_kernel(form, depth), (tiles, L.PIXELS),
+        (
+            rows, array(lists.starts, wp.int32), ids, shapes, starts_at, _limits(settings), size, array(drawn.transmittance, wp.float32), reached,
+            grad, array(g_T, wp.float32), gz, array(drawn.depths, wp.float32), hits,
+        ), where, L.PIXELS,
+    )  # fmt: skip
+    width = L.gradient_width(form.neurons, form.channels)
+    pair_rows = torch.empty(pairs, width, dtype=torch.float32, device=device)
+    out, error_at = array(pair_rows.view(-1), wp.float32), array(error, wp.float32)
+    launch(
+        pairs_kernel(form, depth), (pairs, L.WARP),
+        (rows, ids, tile_of, shapes, starts_at, lens, settings.depth_floor, size, reached, hits, grad, gz, error_at, out), where, L.WARP,
+    )  # fmt: skip
+    if frame.wide.shape[0] > 0:
+        launch(
+            delicate_pairs_kernel(form, depth), (pairs, L.WARP),
+            (
+                array(frame.wide, wp.float64), array(frame.slots, wp.int32), ids, tile_of, shapes, starts_at, lens, settings.depth_floor, size,
+                form.neurons, reached, hits, grad, gz, error_at, out,
+            ), where, L.WARP,
+        )  # fmt: skip
+    grads = torch.empty(frame.rows.shape[0], width, dtype=torch.float32, device=device)
+    launch(
+        sum_pairs, grads.shape,
+        (array(lists.first, wp.int32), array(lists.slots_of, wp.int32), array(pair_rows, wp.float32), array(grads, wp.float32)), where,
+    )  # fmt: skip
+    return grads

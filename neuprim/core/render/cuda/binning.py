@@ -12,9 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.compute.warp import OPTIONS, array, launch, wp
+from neuprim.core.compute.warp import array, launch, wp
 from neuprim.core.errors import BackendUnavailable
 from neuprim.core.render.cuda.layout import E0, EX, TILE
+from neuprim.core.render.cuda.placement import EXACT, PER_BLOCK
 from neuprim.core.render.cuda.silhouette import ellipse, tile_range
 
 __all__ = ["Counted", "TileLists", "bin_primitives", "count"]
@@ -80,7 +81,7 @@ def count(counts: Tensor, bad: Tensor) -> Counted:
 
 @functools.cache
 def _kernels() -> tuple[Any, Any]:
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def emit(
         rows: wp.array2d(dtype=wp.vec4), spans: wp.array2d(dtype=wp.vec4), boxes: wp.array(dtype=wp.vec4i), order: wp.array(dtype=wp.int64),
         counts: wp.array2d(dtype=wp.int32), ends: wp.array2d(dtype=wp.int64), across: int,
@@ -104,7 +105,7 @@ def _kernels() -> tuple[Any, Any]:
                     keys[at] = wp.int64(ty * across + tx) << wp.int64(32) | wp.int64(rank)
                     at += 1
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def list_pairs(
         keys: wp.array(dtype=wp.int64), came_from: wp.array(dtype=wp.int64), order: wp.array(dtype=wp.int64), pairs: int, tiles: int,
         starts: wp.array(dtype=wp.int32), ids: wp.array(dtype=wp.int32), tile_of: wp.array(dtype=wp.int32), slots_of: wp.array(dtype=wp.int32),
@@ -142,17 +143,17 @@ def bin_primitives(
     order = torch.argsort(depth, stable=True)
     first = torch.zeros(N + 1, dtype=torch.int32, device=device)
     slots, which, keys = integers(N), integers(counted.delicate), torch.empty(pairs, dtype=torch.int64, device=device)
-    inputs = (
+    reached = (
         array(rows, wp.vec4), array(spans.view(N, 2, 4), wp.vec4), array(boxes, wp.vec4i), array(order, wp.int64), array(counts, wp.int32),
         array(counted.ends, wp.int64), across, array(first, wp.int32), array(keys, wp.int64), array(slots, wp.int32), array(which, wp.int32),
     )  # fmt: skip
-    launch(emit, N, inputs, str(device))
+    launch(emit, N, reached, str(device), PER_BLOCK)
     keys, came_from = torch.sort(keys)
     starts = torch.zeros(across * down + 1, dtype=torch.int32, device=device)
     ids, tile_of, slots_of = integers(pairs), integers(pairs), integers(pairs)
-    inputs = (
+    found = (
         array(keys, wp.int64), array(came_from, wp.int64), array(order, wp.int64), pairs, across * down,
         array(starts, wp.int32), array(ids, wp.int32), array(tile_of, wp.int32), array(slots_of, wp.int32),
     )  # fmt: skip
-    launch(list_pairs, pairs, inputs, str(device))
+    launch(list_pairs, pairs, found, str(device))
     return TileLists(starts, ids, tile_of, first, slots_of), slots, which

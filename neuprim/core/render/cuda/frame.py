@@ -14,6 +14,7 @@ from neuprim.core.compute.warp import array, launch, wp
 from neuprim.core.render.cpu.layout import SPAN_WIDTH
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.binning import TileLists, bin_primitives, count
+from neuprim.core.render.cuda.placement import PER_BLOCK
 from neuprim.core.render.cuda.prepare import prepare_kernel, wide_kernel
 
 __all__ = ["NAMES", "Frame", "NotFinite", "Projection", "as_arrays", "prepared"]
@@ -144,7 +145,8 @@ def prepared(
     parameters = _alike([tensors[name] for name in NAMES])
     device, (N, K, _), C = parameters[0].device, parameters[3].shape, palette.shape[1]
     double = parameters[0].dtype == torch.float64
-    projection = Projection(view.detach().to(device, torch.float64).reshape(16).contiguous(), camera, near, turns, edge)
+    matrix = view.detach().to(device, torch.float64, non_blocking=device.type == "cuda").reshape(16).contiguous()  # a plain copy would wait
+    projection = Projection(matrix, camera, near, turns, edge)
 
     def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.empty(shape, dtype=dtype, device=device)
@@ -152,15 +154,15 @@ def prepared(
     rows, spans, boxes = empty(N, L.columns(K, C), 4), empty(N, SPAN_WIDTH), empty(N, 4, dtype=torch.int32)
     depth, status, counts = empty(N, dtype=torch.float64), empty(N, dtype=torch.uint8), empty(2, N, dtype=torch.int32)
     bad = torch.full((1,), N, dtype=torch.int32, device=device)
-    inputs, matrix = as_arrays(parameters), array(projection.matrix, wp.float64)
+    inputs, world = as_arrays(parameters), array(matrix, wp.float64)
     launch(
         prepare_kernel(double), N,
         (
             *inputs, array(palette.detach().float().contiguous(), wp.float32), None if forced is None else array(forced.contiguous(), wp.bool),
-            matrix, projection.intrinsics, camera.width, camera.height, near, turns, edge, K, C,
+            world, projection.intrinsics, camera.width, camera.height, near, turns, edge, K, C,
             array(rows, wp.vec4), array(spans.view(N, 2, 4), wp.vec4), array(boxes, wp.vec4i), array(depth, wp.float64),
             array(status, wp.uint8), array(counts, wp.int32), array(bad, wp.int32),
-        ), str(device),
+        ), str(device), PER_BLOCK,
     )  # fmt: skip
     counted = count(counts, bad)
     if counted.bad >= 0:
@@ -169,6 +171,6 @@ def prepared(
     wide = empty(counted.delicate, L.wide_width(K), dtype=torch.float64)
     launch(
         wide_kernel(double), counted.delicate,
-        (array(which, wp.int32), *inputs, matrix, projection.intrinsics, near, turns, K, array(wide, wp.float64)), str(device),
+        (array(which, wp.int32), *inputs, world, projection.intrinsics, near, turns, K, array(wide, wp.float64)), str(device), PER_BLOCK,
     )  # fmt: skip
     return Frame(projection, parameters, K, C, rows, wide, slots, which, spans, boxes, depth, status, lists)

@@ -4,10 +4,16 @@
 The twin of ``_frame`` and of the geometry in ``_wide_row`` of :mod:`neuprim.core.render.cpu.prepare`, which say what the numbers are.
 """
 
-from neuprim.core.compute.warp import wp
+from neuprim.core.compute.warp import OPTIONS, wp
 from neuprim.core.render.cpu.limits import ANCHOR_RADII
 
-__all__ = ["Placed", "Ray", "View", "place", "rounded", "view_of", "whiten"]
+__all__ = ["EXACT", "PER_BLOCK", "Placed", "Ray", "View", "place", "rounded", "view_of", "whiten"]
+
+EXACT = {**OPTIONS, "fuse_fp": False}
+"""Options of the per-primitive kernels: every product is rounded, so that two kernels that count the same tiles, and the CPU, agree."""
+
+PER_BLOCK = 64
+"""Primitives of a block: float64 takes 160 registers, and a few more small blocks lie on a processor than large ones."""
 
 d = wp.float64
 _ANCHOR_RADII = wp.constant(d(ANCHOR_RADII))

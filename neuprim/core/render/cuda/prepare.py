@@ -9,7 +9,7 @@ Three differences of form: rows are float4 with the colours in them, neurons sta
 import functools
 from typing import Any
 
-from neuprim.core.compute.warp import OPTIONS, wp
+from neuprim.core.compute.warp import wp
 from neuprim.core.render.cpu import layout as wide_layout
 from neuprim.core.render.cpu.limits import (
     CULLED,
@@ -25,7 +25,7 @@ from neuprim.core.render.cpu.limits import (
     VISIBLE,
 )
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.placement import Placed, Ray, View, place, rounded, view_of, whiten
+from neuprim.core.render.cuda.placement import EXACT, Placed, Ray, View, place, rounded, view_of, whiten
 from neuprim.core.render.cuda.silhouette import ellipse, tile_range
 
 __all__ = ["prepare_kernel", "wide_kernel"]
@@ -146,7 +146,7 @@ def prepare_kernel(double: bool) -> Any:
     """
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def prepare(
         means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4),
         W1: wp.array2d(dtype=vec3), b1: wp.array2d(dtype=real), w2: wp.array2d(dtype=real), b2: wp.array(dtype=real),
@@ -270,7 +270,7 @@ def wide_kernel(double: bool) -> Any:
     """Fills ``wide``, the float64 rows of primitives ``which``, which the pixel stage draws in float64; dim (M,)."""
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def prepare_wide(
         which: wp.array(dtype=wp.int32), means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4),
         W1: wp.array2d(dtype=vec3), b1: wp.array2d(dtype=real), w2: wp.array2d(dtype=real), b2: wp.array(dtype=real),

@@ -7,11 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.compute.warp import OPTIONS, array, launch, wp
+from neuprim.core.compute.warp import array, launch, wp
 from neuprim.core.render.cpu.layout import E0, EX, EY, XA
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.frame import Frame, as_arrays
-from neuprim.core.render.cuda.placement import place, view_of, whiten
+from neuprim.core.render.cuda.placement import EXACT, PER_BLOCK, place, view_of, whiten
 
 __all__ = ["prepare_backward"]
 
@@ -42,7 +42,7 @@ def _quaternion(q: wp.vec4d, n: wp.float64, g: wp.mat33d):
 def _kernel(double: bool) -> Any:
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def backward(
         means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4),
         W1: wp.array2d(dtype=vec3), b1: wp.array2d(dtype=real), w2: wp.array2d(dtype=real), b2: wp.array(dtype=real),
@@ -80,13 +80,12 @@ def _kernel(double: bool) -> Any:
                 g_W1[i, k] = wp.vec3(p.local * gw)
                 g_b1[i, k] = f(turns * d(grads[i, column + 3]))
                 g_w2[i, k] = grads[i, column + 4]
-            largest = wp.int32(0)
-            for j in range(1, 3):
-                if logs[j] > logs[largest]:
-                    largest = j
-            for j in range(3):
-                if j == largest:
-                    gl[j] += log_m
+            if logs[2] > wp.max(logs[0], logs[1]):  # the first of the longest axes is m
+                gl[2] += log_m
+            elif logs[1] > logs[0]:
+                gl[1] += log_m
+            else:
+                gl[0] += log_m
             g_means[i] = wp.vec3(wp.transpose(v.R) * gc)
             g_log_scales[i] = wp.vec3(gl)
             g_quats[i] = wp.vec4(_quaternion(quat, p.inverse, gL + wp.transpose(v.R) * gB))  # B = R local
@@ -129,6 +128,6 @@ def prepare_backward(frame: Frame, grads: Tensor, want_view: bool = False) -> tu
         (
             *frame.inputs, array(p.matrix, wp.float64), p.intrinsics, p.near, p.turns, frame.neurons, array(grads.contiguous(), wp.float32),
             *as_arrays(out), None if g_view is None else array(g_view, wp.float64),
-        ), str(grads.device),
+        ), str(grads.device), PER_BLOCK,
     )  # fmt: skip
     return out, None if g_view is None else g_view.sum(0).view(3, 4)

@@ -6,6 +6,7 @@ Importing this loads none of them: a row knows where its ``render`` is.
 from __future__ import annotations
 
 import functools
+import importlib.util
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -131,6 +132,21 @@ def _cpu() -> Draw:
     return render
 
 
+def _cuda() -> Draw:
+    from neuprim.core.render.cuda.backend import render
+
+    return render
+
+
+@functools.cache
+def _no_warp() -> str | None:
+    return None if importlib.util.find_spec("warp") else "Warp is not installed: pip install 'neuprim[cuda]'"
+
+
+def _card() -> str:
+    return "cuda (no card)" if hardware.card_missing() else f"cuda ({torch.cuda.get_device_name()})"
+
+
 def _reference() -> Draw:
     from neuprim.core.render.reference.backend import render
 
@@ -138,6 +154,7 @@ def _reference() -> Draw:
 
 
 TABLE: tuple[Backend, ...] = (
+    Backend("cuda", _cuda, kernels_refuse, _card, _no_warp, checks=True, devices=(hardware.CARD, hardware.PROCESSOR)),
     Backend("cpu", _cpu, kernels_refuse, compiles=True, checks=True),
     Backend(ORACLE, _reference, differentiates_intrinsics=True),
 )

@@ -147,7 +147,7 @@ def bin_primitives(
         array(rows, wp.vec4), array(spans.view(N, 2, 4), wp.vec4), array(boxes, wp.vec4i), array(order, wp.int64), array(counts, wp.int32),
         array(counted.ends, wp.int64), across, array(first, wp.int32), array(keys, wp.int64), array(slots, wp.int32), array(which, wp.int32),
     )  # fmt: skip
-    launch(emit, N, reached, str(device), PER_BLOCK)
+    launch(emit, N, reached, device, PER_BLOCK)
     keys, came_from = torch.sort(keys)
     starts = torch.zeros(across * down + 1, dtype=torch.int32, device=device)
     ids, tile_of, slots_of = integers(pairs), integers(pairs), integers(pairs)
@@ -155,5 +155,5 @@ def bin_primitives(
         array(keys, wp.int64), array(came_from, wp.int64), array(order, wp.int64), pairs, across * down,
         array(starts, wp.int32), array(ids, wp.int32), array(tile_of, wp.int32), array(slots_of, wp.int32),
     )  # fmt: skip
-    launch(list_pairs, pairs, found, str(device))
+    launch(list_pairs, pairs, found, device)
     return TileLists(starts, ids, tile_of, first, slots_of), slots, which

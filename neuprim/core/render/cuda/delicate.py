@@ -28,6 +28,7 @@ def delicate_kernel(depth: bool) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)  # type: ignore[untyped-decorator]
     def delicate(
+        pairs: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
         wide: wp.array2d(dtype=wp.float64),  # type: ignore[valid-type]
         slots: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
         ids: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
@@ -42,8 +43,9 @@ def delicate_kernel(depth: bool) -> Any:
         hits: wp.array(dtype=wp.vec2),  # type: ignore[valid-type]
         depths: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
     ):  # type: ignore[no-untyped-def]
-        """A warp a pair; ``slots[i]``: the row of primitive i in ``wide``, -1 if float32 will do."""
-        n, lane = wp.tid()
+        """A warp a pair of those listed in ``pairs``; ``slots[i]``: the row of primitive i in ``wide``."""
+        member, lane = wp.tid()
+        n = pairs[member]
         r = slots[ids[n]]
         if r >= 0:
             across = (size[0] + L.TILE - 1) // L.TILE

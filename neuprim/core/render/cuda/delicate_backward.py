@@ -32,6 +32,7 @@ def delicate_pairs_kernel(form: Form, depth: bool) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)  # type: ignore[untyped-decorator]
     def delicate_pairs(
+        pairs: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
         wide: wp.array2d(dtype=wp.float64),  # type: ignore[valid-type]
         slots: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
         ids: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
@@ -49,7 +50,8 @@ def delicate_pairs_kernel(form: Form, depth: bool) -> Any:
         error: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
         out: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
     ):  # type: ignore[no-untyped-def]
-        n, lane = wp.tid()
+        member, lane = wp.tid()
+        n = pairs[member]
         r = slots[ids[n]]
         if r >= 0:
             total = row_of()

@@ -162,7 +162,7 @@ def prepared(
             world, projection.intrinsics, camera.width, camera.height, near, turns, edge, K, C,
             array(rows, wp.vec4), array(spans.view(N, 2, 4), wp.vec4), array(boxes, wp.vec4i), array(depth, wp.float64),
             array(status, wp.uint8), array(counts, wp.int32), array(bad, wp.int32),
-        ), str(device), PER_BLOCK,
+        ), device, PER_BLOCK,
     )  # fmt: skip
     counted = count(counts, bad)
     if counted.bad >= 0:
@@ -171,6 +171,6 @@ def prepared(
     wide = empty(counted.delicate, L.wide_width(K), dtype=torch.float64)
     launch(
         wide_kernel(double), counted.delicate,
-        (array(which, wp.int32), *inputs, world, projection.intrinsics, near, turns, K, array(wide, wp.float64)), str(device), PER_BLOCK,
+        (array(which, wp.int32), *inputs, world, projection.intrinsics, near, turns, K, array(wide, wp.float64)), device, PER_BLOCK,
     )  # fmt: skip
     return Frame(projection, parameters, K, C, rows, wide, slots, which, spans, boxes, depth, status, lists)

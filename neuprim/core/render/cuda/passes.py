@@ -30,10 +30,11 @@ class Composited:
     """What a forward pass leaves.
 
     Attributes:
-        rgb: (H W, C); transmittance: (H W,); zsum: (H W,) sum of w z, one number where no depth is wanted.
+        rgb: (H W, C); transmittance: (H W,); zsum: (H W,) sum of w z, one number device no depth is wanted.
         spans: (pairs, 16) int16, offsets: (pairs + 1,) int32: the pixels that each pair covers (:mod:`~neuprim.core.render.cuda.spans`).
         hits: (slots, 2) opacity and transmittance before it, if they were kept; depths: (slots,) camera-z, if wanted, too.
         reached: (tiles,) int32, the pairs before it were composited.
+        delicate: (D,) int32, the pairs that are drawn in float64, rising.
     """
 
     rgb: Tensor
@@ -44,6 +45,14 @@ class Composited:
     hits: Tensor
     depths: Tensor
     reached: Tensor
+    delicate: Tensor
+
+
+def _numbers_of(marked: Tensor, count: int) -> Tensor:
+    """(count,) int32, where a mask with so many is set; the host does not wait."""
+    place = torch.where(marked, torch.cumsum(marked, 0) - 1, count)
+    numbers = torch.arange(marked.shape[0], dtype=torch.int32, device=marked.device)
+    return torch.empty(count + 1, dtype=torch.int32, device=marked.device).index_copy_(0, place, numbers)[:count]
 
 
 def _camera(frame: Frame) -> tuple[object, object]:
@@ -56,7 +65,7 @@ def _limits(s: RenderSettings) -> object:
 
 
 def forward(frame: Frame, form: Form, background: Tensor, settings: RenderSettings, differentiable: bool) -> Composited:
-    """Draw. The host waits for the device once where slots are kept, for how many there are.
+    """Draw. The host waits for the device once device slots are kept, for how many there are.
 
     Raises:
         BackendUnavailable: the frame's hits are more than int32 counts.
@@ -64,23 +73,26 @@ def forward(frame: Frame, form: Form, background: Tensor, settings: RenderSettin
     lists, device, camera = frame.lists, frame.device, frame.projection.camera
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
     lens, size = _camera(frame)
-    where = str(device)
     rows, ids, tile_of = array(frame.rows, wp.vec4), array(lists.ids, wp.int32), array(lists.tile_of, wp.int32)
     spans = torch.empty(pairs, L.TILE, dtype=torch.int16, device=device)
     counts = torch.empty(pairs, dtype=torch.int32, device=device)
     shapes = array(spans, wp.uint16)
     launch(
         row_spans, pairs,
-        (rows, array(frame.spans, wp.float32), array(frame.boxes, wp.vec4i), ids, tile_of, size, shapes, array(counts, wp.int32)), where,
+        (rows, array(frame.spans, wp.float32), array(frame.boxes, wp.vec4i), ids, tile_of, size, shapes, array(counts, wp.int32)), device,
     )  # fmt: skip
-    delicate = frame.wide.shape[0] > 0
-    keep = differentiable or delicate
-    total = 0
+    keep = differentiable or frame.wide.shape[0] > 0
+    total, delicate = 0, torch.empty(0, dtype=torch.int32, device=device)
     offsets = torch.zeros(pairs + 1, dtype=torch.int32, device=device)
     if keep and pairs:
         ends = torch.cumsum(counts, 0, dtype=torch.int64)
         offsets[1:] = ends
-        total = int(ends[-1])
+        if frame.wide.shape[0] > 0:
+            marked = frame.slots[lists.ids] >= 0
+            total, few = torch.stack((ends[-1], marked.sum())).tolist()
+            delicate = _numbers_of(marked, few)
+        else:
+            total = int(ends[-1])
         if total >= _MOST_HITS:
             raise BackendUnavailable(f"primitives cover {total} pixels in all; the cuda backend counts to {_MOST_HITS - 1}: render a smaller image")
 
@@ -89,13 +101,13 @@ def forward(frame: Frame, form: Form, background: Tensor, settings: RenderSettin
 
     hits, depths = empty(total, 2), empty(total if settings.depth else 0)
     starts_at = array(offsets, wp.int32)
-    if delicate:
+    if len(delicate):
         launch(
-            delicate_kernel(settings.depth), (pairs, L.WARP),
+            delicate_kernel(settings.depth), (len(delicate), L.WARP),
             (
-                array(frame.wide, wp.float64), array(frame.slots, wp.int32), ids, tile_of, shapes, starts_at, lens, _limits(settings), size,
+                array(delicate, wp.int32), array(frame.wide, wp.float64), array(frame.slots, wp.int32), ids, tile_of, shapes, starts_at, lens, _limits(settings), size,
                 form.neurons, form.edge, array(hits, wp.vec2), array(depths, wp.float32),
-            ), where, L.WARP,
+            ), device, L.WARP,
         )  # fmt: skip
     pixels = camera.width * camera.height
     rgb, T, z = empty(pixels, form.channels), empty(pixels), empty(pixels if settings.depth else 0)
@@ -106,9 +118,9 @@ def forward(frame: Frame, form: Form, background: Tensor, settings: RenderSettin
             rows, array(lists.starts, wp.int32), ids, shapes, starts_at, lens, _limits(settings), array(background, wp.float32), size,
             array(rgb, wp.float32), array(T, wp.float32), array(z, wp.float32), array(hits, wp.vec2), array(depths, wp.float32),
             array(reached, wp.int32),
-        ), where, L.PIXELS,
+        ), device, L.PIXELS,
     )  # fmt: skip
-    return Composited(rgb, T, z, spans, offsets, hits, depths, reached)
+    return Composited(rgb, T, z, spans, offsets, hits, depths, reached, delicate)
 
 
 def backward(
@@ -120,7 +132,7 @@ def backward(
         g_rgb: (H W, C); g_T: (H W,), with the background's share; g_z: (H W,) or None; error: (H W,). float32, contiguous.
     """
     lists, device = frame.lists, frame.device
-    pairs, tiles, where = lists.pairs, lists.starts.shape[0] - 1, str(device)
+    pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
     lens, size = _camera(frame)
     depth = g_z is not None
     gz = array(torch.empty(0, device=device) if g_z is None else g_z, wp.float32)
@@ -132,26 +144,26 @@ def backward(
         (
             rows, array(lists.starts, wp.int32), ids, shapes, starts_at, _limits(settings), size, array(drawn.transmittance, wp.float32), reached,
             grad, array(g_T, wp.float32), gz, array(drawn.depths, wp.float32), hits,
-        ), where, L.PIXELS,
+        ), device, L.PIXELS,
     )  # fmt: skip
     width = L.gradient_width(form.neurons, form.channels)
     pair_rows = torch.empty(pairs, width, dtype=torch.float32, device=device)
     out, error_at = array(pair_rows.view(-1), wp.float32), array(error, wp.float32)
     launch(
         pairs_kernel(form, depth), (pairs, L.WARP),
-        (rows, ids, tile_of, shapes, starts_at, lens, settings.depth_floor, size, reached, hits, grad, gz, error_at, out), where, L.WARP,
+        (rows, ids, tile_of, shapes, starts_at, lens, settings.depth_floor, size, reached, hits, grad, gz, error_at, out), device, L.WARP,
     )  # fmt: skip
-    if frame.wide.shape[0] > 0:
+    if len(drawn.delicate):
         launch(
-            delicate_pairs_kernel(form, depth), (pairs, L.WARP),
+            delicate_pairs_kernel(form, depth), (len(drawn.delicate), L.WARP),
             (
-                array(frame.wide, wp.float64), array(frame.slots, wp.int32), ids, tile_of, shapes, starts_at, lens, settings.depth_floor, size,
+                array(drawn.delicate, wp.int32), array(frame.wide, wp.float64), array(frame.slots, wp.int32), ids, tile_of, shapes, starts_at, lens, settings.depth_floor, size,
                 form.neurons, reached, hits, grad, gz, error_at, out,
-            ), where, L.WARP,
+            ), device, L.WARP,
         )  # fmt: skip
     grads = torch.empty(frame.rows.shape[0], width, dtype=torch.float32, device=device)
     launch(
         sum_pairs, grads.shape,
-        (array(lists.first, wp.int32), array(lists.slots_of, wp.int32), array(pair_rows, wp.float32), array(grads, wp.float32)), where,
+        (array(lists.first, wp.int32), array(lists.slots_of, wp.int32), array(pair_rows, wp.float32), array(grads, wp.float32)), device,
     )  # fmt: skip
     return grads

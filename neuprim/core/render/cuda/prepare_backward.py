@@ -128,6 +128,6 @@ def prepare_backward(frame: Frame, grads: Tensor, want_view: bool = False) -> tu
         (
             *frame.inputs, array(p.matrix, wp.float64), p.intrinsics, p.near, p.turns, frame.neurons, array(grads.contiguous(), wp.float32),
             *as_arrays(out), None if g_view is None else array(g_view, wp.float64),
-        ), str(grads.device), PER_BLOCK,
+        ), grads.device, PER_BLOCK,
     )  # fmt: skip
     return out, None if g_view is None else g_view.sum(0).view(3, 4)

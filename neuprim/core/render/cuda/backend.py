@@ -10,17 +10,33 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.model.fields import Constant, Cosine
+from neuprim.core.model.fields import Constant, Cosine, RayNet
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.forms import Form
 from neuprim.core.render.cuda.frame import NAMES, NotFinite, prepared
+from neuprim.core.render.cuda.net import Net, net_backward, prepared_net, wide_net
 from neuprim.core.render.cuda.passes import Composited, backward, forward
 from neuprim.core.render.cuda.prepare_backward import prepare_backward
+from neuprim.core.render.cuda.ray_colours import FIRST_COLOUR
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.settings import RenderSettings
 
 __all__ = ["render"]
+
+
+_NET = ("Wx", "bias", "Wout")
+
+
+def _refuse(tensors: dict[str, Tensor]) -> None:
+    """Raise for the first number of a colour network that is not finite; the host waits for the device."""
+    sums = torch.stack([t.sum(dtype=torch.float64) for t in tensors.values()])
+    if not bool(torch.isfinite(sums).all()):
+        for name, value in tensors.items():
+            bad = ~torch.isfinite(value).reshape(len(value), -1).all(dim=1)
+            if bool(bad.any()):
+                row = int(bad.nonzero()[0])
+                raise NonFiniteError(f"{name} of primitive {row} is not finite: {value[row].flatten()[:8].tolist()}")
 
 
 def _blame(tensors: dict[str, Tensor], row: int) -> NonFiniteError:
@@ -38,20 +54,29 @@ class _Rasterize(torch.autograd.Function):
     def forward(  # type: ignore[override]
         ctx: Any, means: Tensor, log_scales: Tensor, quats: Tensor, W1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor,
         colors: Tensor, viewmat: Tensor, background: Tensor, camera: Camera, omega0: float, edge: int, settings: RenderSettings,
-        stats: RenderStats, differentiable: bool,
+        stats: RenderStats, differentiable: bool, *network: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         tensors = dict(zip(NAMES, (means, log_scales, quats, W1, b1, w2, b2), strict=True))
-        form = Form(W1.shape[1], edge, colors.shape[1])
+        form = Form(W1.shape[1], edge, colors.shape[1], network[0].shape[1] if network else -1)
+        net: Net | None = None
+        if network:
+            _refuse(dict(zip(_NET, network, strict=True)))
+            net = prepared_net(log_scales, quats, *network)
         try:
-            frame = prepared(tensors, colors, camera, viewmat, settings.near, omega0 / (2 * math.pi), edge)
+            frame = prepared(
+                tensors, colors, camera, viewmat, settings.near, omega0 / (2 * math.pi), edge, net.fast if net is not None and net.hidden else None
+            )
         except NotFinite as error:
-            raise _blame(tensors | {"colors": colors}, error.row) from None
+            raise _blame(tensors | {"base" if network else "colors": colors}, error.row) from None
+        if net is not None and net.hidden and len(frame.which):
+            wide_net(net, frame.which, frame.parameters[1], frame.parameters[2])
         stats.pairs, stats.extra["float64"] = frame.lists.pairs, frame.wide.shape[0]
         behind = background.detach().to(means.device, torch.float32).contiguous()
-        drawn = forward(frame, form, behind, settings, differentiable)
+        drawn = forward(frame, form, net, behind, settings, differentiable)
         h, w = camera.height, camera.width
         stats.extra["hits"] = drawn.hits.shape[0]
-        ctx.frame, ctx.form, ctx.drawn, ctx.settings, ctx.stats, ctx.background = frame, form, drawn, settings, stats, behind
+        ctx.frame, ctx.form, ctx.net, ctx.drawn, ctx.settings, ctx.stats, ctx.background = frame, form, net, drawn, settings, stats, behind
+        ctx.net_dtypes = [x.dtype for x in network]
         ctx.dtypes = [x.dtype for x in (means, log_scales, quats, W1, b1, w2, b2, colors)]
         ctx.view_dtype, ctx.view_device, ctx.background_dtype, ctx.background_device = (
             viewmat.dtype, viewmat.device, background.dtype, background.device,
@@ -75,13 +100,22 @@ class _Rasterize(torch.autograd.Function):
         z = g_z.reshape(-1).float().contiguous() if settings.depth and g_z is not None else None
         watched = stats.watched
         error = torch.zeros(pixels, device=device) if watched is None else watched.error.to(device, torch.float32).reshape(-1).contiguous()
-        grads = backward(frame, form, drawn, settings, rgb, T.contiguous(), z, error)
+        net: Net | None = ctx.net
+        grads, net_grads = backward(frame, form, net, drawn, settings, rgb, T.contiguous(), z, error)
+        base = L.G_NEURONS + L.PER_NEURON * form.neurons
+        colours = grads[:, base : base + form.channels]
+        if net_grads is not None:
+            grads[:, : L.G_OFFSET] += net_grads[:, : L.G_OFFSET]
+            colours = net_grads[:, FIRST_COLOUR : FIRST_COLOUR + form.channels]
         want_view = bool(ctx.needs_input_grad[8])
         own, g_view = prepare_backward(frame, grads, want_view)
         if watched is not None:
             watched.fill(grads[:, L.G_WEIGHT].clone(), grads[:, L.G_ERROR].clone())
-        base = L.G_NEURONS + L.PER_NEURON * form.neurons
-        results = [*own, grads[:, base : base + form.channels].clone()]
+        g_net: tuple[Tensor, ...] = ()
+        if net is not None and net_grads is not None:
+            logs, quats = frame.parameters[1], frame.parameters[2]
+            g_net = net_backward(net, logs, quats, grads, net_grads, FIRST_COLOUR + form.channels, own[1], own[2])
+        results = [*own, colours.clone()]
         tensors = [r.to(d) for r, d in zip(results, ctx.dtypes, strict=True)]
         view = None
         if g_view is not None:
@@ -91,23 +125,24 @@ class _Rasterize(torch.autograd.Function):
         behind = None
         if ctx.needs_input_grad[9]:
             behind = (rgb * drawn.transmittance[:, None]).sum(0).to(ctx.background_device, ctx.background_dtype)
-        return (*tensors, view, behind, None, None, None, None, None, None)
+        nets = (g.to(dtype) for g, dtype in zip(g_net, ctx.net_dtypes, strict=True))
+        return (*tensors, view, behind, None, None, None, None, None, None, *nets)
 
 
 def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
-    """Render a :class:`Cosine` density with :class:`Constant` colours; see ``neuprim.core.render.render``."""
+    """Render a :class:`Cosine` density with :class:`Constant` or :class:`RayNet` colours; see ``neuprim.core.render.render``."""
     density, colour = lowered.density, lowered.colour
-    assert isinstance(density, Cosine) and isinstance(colour, Constant), "the caller chooses a backend that knows the forms"
+    assert isinstance(density, Cosine) and isinstance(colour, Constant | RayNet), "the caller chooses a backend that knows the forms"
     g = lowered.geometry
     stats = RenderStats("cuda", g.count)
-    palette = colour.rgb
+    palette, net = (colour.base, (colour.Wx, colour.bias, colour.Wout)) if isinstance(colour, RayNet) else (colour.rgb, ())
     if background is None:
         background = torch.zeros(palette.shape[1], device=g.means.device)
     tensors = (
         g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1), palette, camera.viewmat, background,
     )  # fmt: skip
-    differentiable = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
-    rgb, T, zsum = _Rasterize.apply(*tensors, camera, density.omega0, density.edge, settings, stats, differentiable)
+    differentiable = torch.is_grad_enabled() and any(x.requires_grad for x in (*tensors, *net))
+    rgb, T, zsum = _Rasterize.apply(*tensors, camera, density.omega0, density.edge, settings, stats, differentiable, *net)
     dtype = g.means.dtype
     alpha = 1 - T
     depth = mean_depth(zsum, alpha).to(dtype) if settings.depth else None

@@ -16,7 +16,7 @@ __all__ = ["pixels_kernel"]
 @functools.cache
 def pixels_kernel(form: Form, depth: bool) -> Any:
     """Of a form; ``depth``: a gradient of the sum of w z arrives, too."""
-    C = form.channels
+    C, H = form.channels, form.hidden
     colours = L.colours(form.neurons)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)  # type: ignore[untyped-decorator]
@@ -34,6 +34,7 @@ def pixels_kernel(form: Form, depth: bool) -> Any:
         g_transmittance: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
         g_z: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
         depths: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+        hues: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
         hits: wp.array(dtype=wp.vec2),  # type: ignore[valid-type]
     ):  # type: ignore[no-untyped-def]
         """``g_transmittance`` already holds the background's share. With b what lies behind a hit, sum of w (dL/dw) and the rest of the light:
@@ -61,9 +62,12 @@ def pixels_kernel(form: Form, depth: bool) -> Any:
                         by_weight = float(0.0)
                         hue = wp.vec4()
                         for k in range(wp.static(C)):
-                            if wp.static(k % 4 == 0):
-                                hue = rows[i, wp.static(colours + k // 4)]
-                            by_weight += hue[wp.static(k % 4)] * g_rgb[n, k]
+                            if wp.static(H >= 0):
+                                by_weight += wp.max(hues[slot, k], 0.0) * g_rgb[n, k]
+                            else:
+                                if wp.static(k % 4 == 0):
+                                    hue = rows[i, wp.static(colours + k // 4)]
+                                by_weight += hue[wp.static(k % 4)] * g_rgb[n, k]
                         if wp.static(depth):
                             by_weight += g_z[n] * depths[slot]
                         slope = float(0.0)

@@ -31,12 +31,16 @@ def forward_kernel(form: Form, keep: bool, depth: bool) -> Any:
     width = L.columns(K, C)
     amplitudes, colours = L.amplitudes(K), L.colours(K)
     value, _ = band_of(P)
+    H = form.hidden
+    each = L.net_columns(C)
+    net_width = max(H * each, 1)
     colour_type = wp.types.vector(length=C, dtype=wp.float32)
     mean = float(NORMS[P])
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)  # type: ignore[untyped-decorator]
     def forward(
         rows: wp.array2d(dtype=wp.vec4),  # type: ignore[valid-type]
+        net: wp.array2d(dtype=wp.vec4),  # type: ignore[valid-type]
         starts: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
         ids: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
         spans: wp.array2d(dtype=wp.uint16),  # type: ignore[valid-type]
@@ -50,9 +54,11 @@ def forward_kernel(form: Form, keep: bool, depth: bool) -> Any:
         zsum: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
         hits: wp.array(dtype=wp.vec2),  # type: ignore[valid-type]
         depths: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+        hues: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
         reached: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
     ):  # type: ignore[no-untyped-def]
-        """limits = (alpha_min, alpha_max, transmittance_min, -); ``reached[tile]``: the pairs before it were composited."""
+        """limits = (alpha_min, alpha_max, transmittance_min, -); ``net``, ``hues``: of colour networks; ``reached[tile]``: the pairs before it
+        were composited."""
         tile, lane = wp.tid()
         across = (size[0] + L.TILE - 1) // L.TILE
         at = pixel(lane)
@@ -72,6 +78,8 @@ def forward_kernel(form: Form, keep: bool, depth: bool) -> Any:
         for base in range(first, end, BATCH):
             which = wp.tile_load(ids, shape=BATCH, offset=base, storage="shared")
             staged = wp.tile_load_indexed(rows, indices=which, shape=(BATCH, width), axis=0, storage="shared")
+            if wp.static(H > 0):
+                units = wp.tile_load_indexed(net, indices=which, shape=(BATCH, net_width), axis=0, storage="shared")
             count = wp.min(BATCH, end - base)
             for j in range(count):
                 slot = place(int(spans[base + j, at[1]]), offsets[base + j], at[0])
@@ -81,12 +89,22 @@ def forward_kernel(form: Form, keep: bool, depth: bool) -> Any:
                     if T >= limits[2]:
                         mid = float(0.0)
                         known = float(0.0)
+                        hue = wp.vec4()
+                        tint = colour_type()
+                        if wp.static(H >= 0):
+                            for k in range(wp.static(C)):
+                                if wp.static(k % 4 == 0):
+                                    hue = staged[j, wp.static(colours + k // 4)]
+                                tint[k] = hue[wp.static(k % 4)]
                         if wp.static(keep):
                             known = staged[j, L.REST][3]
                         if known > 0.0:
                             alpha = hits[slot][0]
                             if wp.static(depth):
                                 mid = depths[slot]
+                            if wp.static(H > 0):
+                                for k in range(wp.static(C)):
+                                    tint[k] = hues[slot, k]
                         else:
                             c = chord(ray_of(staged, j), px, py)
                             if c.half > 0.0:
@@ -110,15 +128,29 @@ def forward_kernel(form: Form, keep: bool, depth: bool) -> Any:
                                     alpha = wp.min(1.0 - wp.exp(-I), limits[1])
                                     if alpha < limits[0]:
                                         alpha = 0.0
+                                if wp.static(H > 0):
+                                    for h in range(wp.static(H)):
+                                        w = units[j, wp.static(each * h)]
+                                        u = wp.dot(q, xyz(w)) + w[3]
+                                        r = u - wp.rint(u)
+                                        wave = cos_turns(r * r)
+                                        for k in range(wp.static(C)):
+                                            if wp.static(k % 4 == 0):
+                                                hue = units[j, wp.static(each * h + 1 + k // 4)]
+                                            tint[k] += wave * hue[wp.static(k % 4)]
                                 if wp.static(depth):
                                     rest = staged[j, L.REST]
                                     mid = rest[2] + rest[1] * (c.mid + c.slide)
                         weight = alpha * T
-                        hue = wp.vec4()
                         for k in range(wp.static(C)):
-                            if wp.static(k % 4 == 0):
-                                hue = staged[j, wp.static(colours + k // 4)]
-                            color[k] += weight * hue[wp.static(k % 4)]
+                            if wp.static(H >= 0):
+                                color[k] += weight * wp.max(tint[k], 0.0)
+                                if wp.static(keep):
+                                    hues[slot, k] = tint[k]
+                            else:
+                                if wp.static(k % 4 == 0):
+                                    hue = staged[j, wp.static(colours + k // 4)]
+                                color[k] += weight * hue[wp.static(k % 4)]
                         if wp.static(depth):
                             z += weight * mid
                             if wp.static(keep):

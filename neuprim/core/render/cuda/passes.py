@@ -17,6 +17,8 @@ from neuprim.core.render.cuda.delicate_backward import delicate_pairs_kernel
 from neuprim.core.render.cuda.forms import Form
 from neuprim.core.render.cuda.forward import forward_kernel
 from neuprim.core.render.cuda.frame import Frame
+from neuprim.core.render.cuda.net import Net
+from neuprim.core.render.cuda.ray_colours import delicate_hues_kernel, delicate_net_kernel, net_pairs_kernel, net_width
 from neuprim.core.render.cuda.spans import row_spans
 from neuprim.core.settings import RenderSettings
 
@@ -32,7 +34,8 @@ class Composited:
     Attributes:
         rgb: (H W, C); transmittance: (H W,); zsum: (H W,) sum of w z, one number device no depth is wanted.
         spans: (pairs, 16) int16, offsets: (pairs + 1,) int32: the pixels that each pair covers (:mod:`~neuprim.core.render.cuda.spans`).
-        hits: (slots, 2) opacity and transmittance before it, if they were kept; depths: (slots,) camera-z, if wanted, too.
+        hits: (slots, 2) opacity and transmittance before it, if they were kept; depths: (slots,) camera-z, if wanted, too;
+            hues: (slots, C) colours before max(0, .), of colour networks.
         reached: (tiles,) int32, the pairs before it were composited.
         delicate: (D,) int32, the pairs that are drawn in float64, rising.
     """
@@ -44,6 +47,7 @@ class Composited:
     offsets: Tensor
     hits: Tensor
     depths: Tensor
+    hues: Tensor
     reached: Tensor
     delicate: Tensor
 
@@ -64,7 +68,7 @@ def _limits(s: RenderSettings) -> object:
     return wp.vec4(s.alpha_min, s.alpha_max, s.transmittance_min, 0.0)
 
 
-def forward(frame: Frame, form: Form, background: Tensor, settings: RenderSettings, differentiable: bool) -> Composited:
+def forward(frame: Frame, form: Form, net: Net | None, background: Tensor, settings: RenderSettings, differentiable: bool) -> Composited:
     """Draw. The host waits for the device once device slots are kept, for how many there are.
 
     Raises:
@@ -100,6 +104,8 @@ def forward(frame: Frame, form: Form, background: Tensor, settings: RenderSettin
         return torch.empty(shape, dtype=dtype, device=device)
 
     hits, depths = empty(total, 2), empty(total if settings.depth else 0)
+    hues = empty(total if net is not None else 0, form.channels)
+    units = array(empty(1, 1, 4) if net is None or not net.hidden else net.rows, wp.vec4)
     starts_at = array(offsets, wp.int32)
     if len(delicate):
         launch(
@@ -109,24 +115,33 @@ def forward(frame: Frame, form: Form, background: Tensor, settings: RenderSettin
                 form.neurons, form.edge, array(hits, wp.vec2), array(depths, wp.float32),
             ), device, L.WARP,
         )  # fmt: skip
+    if len(delicate) and net is not None and net.hidden:
+        launch(
+            delicate_hues_kernel(form.channels), (len(delicate), L.WARP),
+            (
+                array(delicate, wp.int32), array(frame.wide, wp.float64), array(net.wide, wp.vec4d), units, rows, L.colours(form.neurons), net.hidden,
+                array(frame.slots, wp.int32), ids, tile_of, shapes, starts_at, size, array(hues, wp.float32),
+            ), device, L.WARP,
+        )  # fmt: skip
     pixels = camera.width * camera.height
     rgb, T, z = empty(pixels, form.channels), empty(pixels), empty(pixels if settings.depth else 0)
     reached = empty(tiles, dtype=torch.int32)
     launch(
         forward_kernel(form, keep, settings.depth), (tiles, L.PIXELS),
         (
-            rows, array(lists.starts, wp.int32), ids, shapes, starts_at, lens, _limits(settings), array(background, wp.float32), size,
+            rows, units, array(lists.starts, wp.int32), ids, shapes, starts_at, lens, _limits(settings), array(background, wp.float32), size,
             array(rgb, wp.float32), array(T, wp.float32), array(z, wp.float32), array(hits, wp.vec2), array(depths, wp.float32),
-            array(reached, wp.int32),
+            array(hues, wp.float32), array(reached, wp.int32),
         ), device, L.PIXELS,
     )  # fmt: skip
-    return Composited(rgb, T, z, spans, offsets, hits, depths, reached, delicate)
+    return Composited(rgb, T, z, spans, offsets, hits, depths, hues, reached, delicate)
 
 
 def backward(
-    frame: Frame, form: Form, drawn: Composited, settings: RenderSettings, g_rgb: Tensor, g_T: Tensor, g_z: Tensor | None, error: Tensor
-) -> Tensor:
-    """(N, gradient_width) gradient rows; the slots' contents are used up.
+    frame: Frame, form: Form, net: Net | None, drawn: Composited, settings: RenderSettings, g_rgb: Tensor, g_T: Tensor, g_z: Tensor | None,
+    error: Tensor,
+) -> tuple[Tensor, Tensor | None]:
+    """(N, gradient_width) gradient rows, and (N, net_width) of colour networks; the slots' contents are used up.
 
     Args:
         g_rgb: (H W, C); g_T: (H W,), with the background's share; g_z: (H W,) or None; error: (H W,). float32, contiguous.
@@ -143,7 +158,7 @@ def backward(
         pixels_kernel(form, depth), (tiles, L.PIXELS),
         (
             rows, array(lists.starts, wp.int32), ids, shapes, starts_at, _limits(settings), size, array(drawn.transmittance, wp.float32), reached,
-            grad, array(g_T, wp.float32), gz, array(drawn.depths, wp.float32), hits,
+            grad, array(g_T, wp.float32), gz, array(drawn.depths, wp.float32), array(drawn.hues, wp.float32), hits,
         ), device, L.PIXELS,
     )  # fmt: skip
     width = L.gradient_width(form.neurons, form.channels)
@@ -161,9 +176,34 @@ def backward(
                 form.neurons, reached, hits, grad, gz, error_at, out,
             ), device, L.WARP,
         )  # fmt: skip
-    grads = torch.empty(frame.rows.shape[0], width, dtype=torch.float32, device=device)
+    grads = _sums(frame, pair_rows)
+    if net is None:
+        return grads, None
+    hues, own = array(drawn.hues, wp.float32), torch.empty(pairs, net_width(form), device=device)
+    units = array(net.rows if net.hidden else torch.empty(1, 1, 4, device=device), wp.vec4)
+    launch(
+        net_pairs_kernel(form), (pairs, L.WARP),
+        (rows, units, ids, tile_of, shapes, starts_at, settings.depth_floor, size, reached, hits, hues, grad, array(own.view(-1), wp.float32)),
+        device, L.WARP,
+    )  # fmt: skip
+    if len(drawn.delicate):
+        launch(
+            delicate_net_kernel(form), (len(drawn.delicate), L.WARP),
+            (
+                array(drawn.delicate, wp.int32), array(frame.wide, wp.float64), array(net.wide, wp.vec4d), units, net.hidden,
+                array(frame.slots, wp.int32), ids, tile_of, shapes, starts_at, settings.depth_floor, size, reached, hits, hues, grad,
+                array(own.view(-1), wp.float32),
+            ), device, L.WARP,
+        )  # fmt: skip
+    return grads, _sums(frame, own)
+
+
+def _sums(frame: Frame, pair_rows: Tensor) -> Tensor:
+    """(N, width) sums of the rows of each primitive's pairs."""
+    grads = torch.empty(frame.rows.shape[0], pair_rows.shape[1], dtype=torch.float32, device=frame.device)
+    lists = frame.lists
     launch(
         sum_pairs, grads.shape,
-        (array(lists.first, wp.int32), array(lists.slots_of, wp.int32), array(pair_rows, wp.float32), array(grads, wp.float32)), device,
+        (array(lists.first, wp.int32), array(lists.slots_of, wp.int32), array(pair_rows, wp.float32), array(grads, wp.float32)), frame.device,
     )  # fmt: skip
     return grads

@@ -13,7 +13,7 @@ from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.frame import Frame, as_arrays
 from neuprim.core.render.cuda.placement import EXACT, PER_BLOCK, place, view_of, whiten
 
-__all__ = ["prepare_backward"]
+__all__ = ["prepare_backward", "quaternion_gradient"]
 
 d, f = wp.float64, wp.float32
 _E0, _EX, _EY, _XA = E0, EX, EY, XA
@@ -26,7 +26,7 @@ def _three(grads: wp.array2d(dtype=wp.float32), i: int, column: int):
 
 
 @wp.func
-def _quaternion(q: wp.vec4d, n: wp.float64, g: wp.mat33d):
+def quaternion_gradient(q: wp.vec4d, n: wp.float64, g: wp.mat33d):
     """dL/dq from dL/dR; the normalisation projects out the radial part."""
     two = d(2.0)
     w, x, y, z = q[0] * n, q[1] * n, q[2] * n, q[3] * n
@@ -88,7 +88,7 @@ def _kernel(double: bool) -> Any:
                 gl[0] += log_m
             g_means[i] = wp.vec3(wp.transpose(v.R) * gc)
             g_log_scales[i] = wp.vec3(gl)
-            g_quats[i] = wp.vec4(_quaternion(quat, p.inverse, gL + wp.transpose(v.R) * gB))  # B = R local
+            g_quats[i] = wp.vec4(quaternion_gradient(quat, p.inverse, gL + wp.transpose(v.R) * gB))  # B = R local
             g_b2[i] = grads[i, _G_OFFSET]
             if g_view:
                 gR = wp.outer(gc, mean) + gB * wp.transpose(p.local)

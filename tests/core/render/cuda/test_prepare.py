@@ -11,6 +11,7 @@ import torch
 pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
 
 from neuprim.core.render.cpu import layout as P
+from neuprim.core.render.cpu.limits import CULLED
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.frame import NAMES, Frame, NotFinite
 from neuprim.core.render.cuda.prepare_backward import prepare_backward
@@ -124,6 +125,16 @@ def test_the_first_primitive_that_is_not_finite_is_named(name: str, value: float
     with pytest.raises(NotFinite) as error:
         frame_of(case, t, device)
     assert error.value.row == 77
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_small_discs_beyond_float32_are_not_seen(device: str) -> None:
+    """So thin and small that float32 has no number for a ray in their axes, which is no error."""
+    case = CASES["K=8"]
+    t = case.tensors()
+    t["log_scales"][::2] = torch.tensor([-129.5, -40.0, -40.0])
+    numba, frame = numba_frame(case, t), frame_of(case, t, device)
+    assert (numpy(frame.status) == numba.status).all() and (numba.status[::2] == CULLED).all() and not numpy(frame.boxes)[::2].any()
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -1,4 +1,4 @@
-"""Opacities in float64 of the primitives that float32 cannot follow, left in their pixels' slots before compositing begins."""
+"""Opacities in float64 of the primitives that float32 cannot follow, and where rays enter them, left in their pixels' slots beforehand."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from neuprim.core.render.cpu import layout as W
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.backward_pairs import pixel_of_slot
 from neuprim.core.render.cuda.chord64 import chord64, dot64, moments, neuron64, phase64, rate64, weight_of
+from neuprim.core.render.cuda.forward import CUT_AT
 
 __all__ = ["delicate_kernel", "ray_norm"]
 
@@ -72,7 +73,10 @@ def delicate_kernel(depth: bool) -> Any:
                         alpha = wp.min(float(wp.float64(1.0) - wp.exp(-I)), limits[1])
                         if alpha < limits[0]:
                             alpha = 0.0
-                hits[begin + s] = wp.vec2(alpha, 0.0)
+                entry = float(CUT_AT)
+                if c.uncut > wp.float64(0.0):
+                    entry = float(wide[r, W.ANCHOR_Z] + wide[r, W.UNIT] * (c.mid - c.half))
+                hits[begin + s] = wp.vec2(alpha, entry)
                 if wp.static(depth):
                     depths[begin + s] = float(wide[r, W.ANCHOR_Z] + wide[r, W.UNIT] * c.mid)
 

@@ -18,15 +18,34 @@ from neuprim.core.render.cuda.forms import Form
 from neuprim.core.render.cuda.functions import band_of, cos_turns
 from neuprim.core.render.cuda.together import any_thread
 
-__all__ = ["BATCH", "forward_kernel"]
+__all__ = ["BATCH", "CUT_AT", "forward_kernel"]
+
+CUT_AT = -1e30
+"""Entry of every chord that the near plane cuts: in front of all others, and equal."""
+
+
+@wp.func
+def key_of(pixel: int, entry: float):  # type: ignore[no-untyped-def]
+    """Sorts by pixel, then by entry: floats in the order of integers."""
+    bits = wp.int64(wp.cast(entry, wp.int32))
+    if bits < wp.int64(0):
+        bits = wp.int64(-1) - bits  # negative floats: larger ones have more bits
+    else:
+        bits = bits + (wp.int64(1) << wp.int64(31))
+    return (wp.int64(pixel) << wp.int64(32)) | bits
+
 
 BATCH = 16
 """Rows in shared memory at a time."""
 
 
 @functools.cache
-def forward_kernel(form: Form, keep: bool, depth: bool) -> Any:
-    """Of a form; ``keep``: fill the slots, and take delicate primitives from there; ``depth``: also the sum of w z."""
+def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False) -> Any:
+    """Of a form; ``keep``: fill the slots, and take delicate primitives from there; ``depth``: also the sum of w z.
+
+    ``listing``: composite nothing, but list every hit for :mod:`~neuprim.core.render.cuda.by_entry`, with its sorting key and its pair.
+    """
+    assert keep or not listing
     K, P, C = form.neurons, form.edge, form.channels
     width = L.columns(K, C)
     amplitudes, colours = L.amplitudes(K), L.colours(K)
@@ -56,6 +75,8 @@ def forward_kernel(form: Form, keep: bool, depth: bool) -> Any:
         depths: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
         hues: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
         reached: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        keys: wp.array(dtype=wp.int64),  # type: ignore[valid-type]
+        owners: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
     ):  # type: ignore[no-untyped-def]
         """limits = (alpha_min, alpha_max, transmittance_min, -); ``net``, ``hues``: of colour networks; ``reached[tile]``: the pairs before it
         were composited."""
@@ -88,6 +109,7 @@ def forward_kernel(form: Form, keep: bool, depth: bool) -> Any:
                     before = float(T)
                     if T >= limits[2]:
                         mid = float(0.0)
+                        entry = float(CUT_AT)
                         known = float(0.0)
                         hue = wp.vec4()
                         tint = colour_type()
@@ -102,6 +124,8 @@ def forward_kernel(form: Form, keep: bool, depth: bool) -> Any:
                             alpha = hits[slot][0]
                             if wp.static(depth):
                                 mid = depths[slot]
+                            if wp.static(listing):
+                                entry = hits[slot][1]
                             if wp.static(H > 0):
                                 for k in range(wp.static(C)):
                                     tint[k] = hues[slot, k]
@@ -141,7 +165,16 @@ def forward_kernel(form: Form, keep: bool, depth: bool) -> Any:
                                 if wp.static(depth):
                                     rest = staged[j, L.REST]
                                     mid = rest[2] + rest[1] * (c.mid + c.slide)
+                                if wp.static(listing):
+                                    if c.uncut > 0.0:
+                                        rest = staged[j, L.REST]
+                                        entry = rest[2] + rest[1] * (c.mid + c.slide - c.half)
                         weight = alpha * T
+                        if wp.static(listing):
+                            weight = 0.0
+                            before = 0.0  # of slots that are no hits, which nothing else will touch
+                            keys[slot] = key_of(wp.where(alpha > 0.0, Y * size[0] + X, size[0] * size[1]), entry)
+                            owners[slot] = base + j
                         for k in range(wp.static(C)):
                             if wp.static(H >= 0):
                                 color[k] += weight * wp.max(tint[k], 0.0)

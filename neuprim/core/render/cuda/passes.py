@@ -12,6 +12,7 @@ from neuprim.core.errors import BackendUnavailable
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.backward_pairs import pairs_kernel, sum_pairs
 from neuprim.core.render.cuda.backward_pixels import pixels_kernel
+from neuprim.core.render.cuda.by_entry import composite_kernel, uncomposite_kernel
 from neuprim.core.render.cuda.delicate import delicate_kernel
 from neuprim.core.render.cuda.delicate_backward import delicate_pairs_kernel
 from neuprim.core.render.cuda.forms import Form
@@ -38,6 +39,8 @@ class Composited:
             hues: (slots, C) colours before max(0, .), of colour networks.
         reached: (tiles,) int32, the pairs before it were composited.
         delicate: (D,) int32, the pairs that are drawn in float64, rising.
+        order: (slots,) int64 slots by pixel and entry, begins: (H W + 1,) int32 and owners: (slots,) int32, the pair of each; where hits were
+            sorted by entry.
     """
 
     rgb: Tensor
@@ -50,6 +53,9 @@ class Composited:
     hues: Tensor
     reached: Tensor
     delicate: Tensor
+    order: Tensor | None = None
+    begins: Tensor | None = None
+    owners: Tensor | None = None
 
 
 def _numbers_of(marked: Tensor, count: int) -> Tensor:
@@ -85,7 +91,8 @@ def forward(frame: Frame, form: Form, net: Net | None, background: Tensor, setti
         row_spans, pairs,
         (rows, array(frame.spans, wp.float32), array(frame.boxes, wp.vec4i), ids, tile_of, size, shapes, array(counts, wp.int32)), device,
     )  # fmt: skip
-    keep = differentiable or frame.wide.shape[0] > 0
+    sorts = settings.sort == "entry"
+    keep = differentiable or sorts or frame.wide.shape[0] > 0
     total, delicate = 0, torch.empty(0, dtype=torch.int32, device=device)
     offsets = torch.zeros(pairs + 1, dtype=torch.int32, device=device)
     if keep and pairs:
@@ -126,15 +133,30 @@ def forward(frame: Frame, form: Form, net: Net | None, background: Tensor, setti
     pixels = camera.width * camera.height
     rgb, T, z = empty(pixels, form.channels), empty(pixels), empty(pixels if settings.depth else 0)
     reached = empty(tiles, dtype=torch.int32)
+    keys, owners = empty(total if sorts else 0, dtype=torch.int64), empty(total if sorts else 0, dtype=torch.int32)
     launch(
-        forward_kernel(form, keep, settings.depth), (tiles, L.PIXELS),
+        forward_kernel(form, keep, settings.depth, sorts), (tiles, L.PIXELS),
         (
             rows, units, array(lists.starts, wp.int32), ids, shapes, starts_at, lens, _limits(settings), array(background, wp.float32), size,
             array(rgb, wp.float32), array(T, wp.float32), array(z, wp.float32), array(hits, wp.vec2), array(depths, wp.float32),
             array(hues, wp.float32), array(reached, wp.int32),
+            array(keys, wp.int64), array(owners, wp.int32),
         ), device, L.PIXELS,
     )  # fmt: skip
-    return Composited(rgb, T, z, spans, offsets, hits, depths, hues, reached, delicate)
+    if not sorts:
+        return Composited(rgb, T, z, spans, offsets, hits, depths, hues, reached, delicate)
+    keys, order = torch.sort(keys, stable=True)
+    begins = torch.empty(pixels + 1, dtype=torch.int32, device=device)
+    begins[pixels] = torch.searchsorted(keys, pixels << 32)
+    launch(
+        composite_kernel(form, settings.depth), pixels,
+        (
+            rows, ids, array(keys, wp.int64), array(order, wp.int64), total, array(owners, wp.int32), _limits(settings), array(background, wp.float32),
+            array(hues, wp.float32), array(depths, wp.float32), array(hits, wp.vec2), array(rgb, wp.float32), array(T, wp.float32),
+            array(z, wp.float32), array(begins, wp.int32),
+        ), device,
+    )  # fmt: skip
+    return Composited(rgb, T, z, spans, offsets, hits, depths, hues, reached, delicate, order, begins, owners)
 
 
 def backward(
@@ -154,13 +176,21 @@ def backward(
     rows, ids, tile_of = array(frame.rows, wp.vec4), array(lists.ids, wp.int32), array(lists.tile_of, wp.int32)
     shapes, starts_at, hits = array(drawn.spans, wp.uint16), array(drawn.offsets, wp.int32), array(drawn.hits, wp.vec2)
     reached, grad = array(drawn.reached, wp.int32), array(g_rgb, wp.float32)
-    launch(
-        pixels_kernel(form, depth), (tiles, L.PIXELS),
-        (
-            rows, array(lists.starts, wp.int32), ids, shapes, starts_at, _limits(settings), size, array(drawn.transmittance, wp.float32), reached,
-            grad, array(g_T, wp.float32), gz, array(drawn.depths, wp.float32), array(drawn.hues, wp.float32), hits,
-        ), device, L.PIXELS,
-    )  # fmt: skip
+    T, gT, zs, hues = array(drawn.transmittance, wp.float32), array(g_T, wp.float32), array(drawn.depths, wp.float32), array(drawn.hues, wp.float32)
+    if drawn.order is None or drawn.begins is None or drawn.owners is None:
+        launch(
+            pixels_kernel(form, depth), (tiles, L.PIXELS),
+            (rows, array(lists.starts, wp.int32), ids, shapes, starts_at, _limits(settings), size, T, reached, grad, gT, gz, zs, hues, hits),
+            device, L.PIXELS,
+        )  # fmt: skip
+    else:
+        launch(
+            uncomposite_kernel(form, depth), len(drawn.transmittance),
+            (
+                rows, ids, array(drawn.order, wp.int64), array(drawn.begins, wp.int32), array(drawn.owners, wp.int32), _limits(settings), T, grad, gT, gz,
+                zs, hues, hits,
+            ), device,
+        )  # fmt: skip
     width = L.gradient_width(form.neurons, form.channels)
     pair_rows = torch.empty(pairs, width, dtype=torch.float32, device=device)
     out, error_at = array(pair_rows.view(-1), wp.float32), array(error, wp.float32)
@@ -179,7 +209,7 @@ def backward(
     grads = _sums(frame, pair_rows)
     if net is None:
         return grads, None
-    hues, own = array(drawn.hues, wp.float32), torch.empty(pairs, net_width(form), device=device)
+    own = torch.empty(pairs, net_width(form), device=device)
     units = array(net.rows if net.hidden else torch.empty(1, 1, 4, device=device), wp.vec4)
     launch(
         net_pairs_kernel(form), (pairs, L.WARP),

@@ -46,7 +46,7 @@ class _Photometric(torch.autograd.Function):
         grad = (1 - weight) / x.numel() * difference.sign() - weight * (from_x + 2 * x * from_xx + y * from_xy)
         means = torch.stack([difference.abs().mean(dtype=torch.float64), S.mean(dtype=torch.float64)])
         parts["l1"], parts["ssim"] = means.tolist()
-        ctx.save_for_backward(grad.permute(1, 2, 0))
+        ctx.save_for_backward(grad.permute(1, 2, 0).contiguous())
         return ((1 - weight) * means[0] + weight * (1 - means[1])).to(rendered.dtype)
 
     @staticmethod

@@ -25,7 +25,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Living, Primitives
 from neuprim.core.volumes.points_cpu import add_values, count_pairs, fill_pairs, pull_values
 from neuprim.core.volumes.points_prepare import merge_parts, prepare_axes, prepare_values, pull_parameters, sort_points
-from neuprim.core.volumes.points_torch import cosine_values, pairs_on, summed
+from neuprim.core.volumes.points_torch import cosine_values, numbers_finite, pairs_on, summed
 
 __all__ = ["PointValues", "Shares", "cells_of", "pairs_of", "values_at"]
 
@@ -89,6 +89,9 @@ def values_at(model: Primitives, conditions: Conditions, points: Tensor, colour:
     shares = Shares(living.geometry.count, living.geometry.means.device)
     places = points.detach().double().cpu().contiguous().numpy()
     if not device.fused(living.geometry.means):
+        if not numbers_finite(living.geometry, form):
+            model.check_finite()
+            raise NonFiniteError("extinction at points: a product of finite parameters is not finite")
         sigma, source = _elsewhere(living, form, places, colors, shares)
     elif isinstance(form, Cosine):
         g, shown = living.geometry, torch.zeros(living.geometry.count, 0) if colors is None else colors

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from neuprim.core.model.densities.cosine import cosine_density
-from neuprim.core.model.forms import Cosine
+from neuprim.core.model.forms import Cosine, LoweredDensity
 from neuprim.core.model.geometry import Geometry
 
 if TYPE_CHECKING:
     from neuprim.core.volumes.points import Cells
 
-__all__ = ["cosine_values", "pairs_on", "summed"]
+__all__ = ["cosine_values", "numbers_finite", "pairs_on", "summed"]
 
 
 def pairs_on(geometry: Geometry, cells: Cells) -> tuple[Tensor, Tensor]:
@@ -40,6 +40,13 @@ def pairs_on(geometry: Geometry, cells: Cells) -> tuple[Tensor, Tensor]:
     inner = (axes[prim].transpose(1, 2) @ (placed[place] - means[prim])[:, :, None])[..., 0] / scales[prim]
     inside = (inner.square().sum(1) < 1.0).nonzero()[:, 0]
     return order[place[inside]], prim[inside]
+
+
+def numbers_finite(geometry: Geometry, form: LoweredDensity) -> bool:
+    """Whether primitives have a place and a density; one wait for a card."""
+    with torch.no_grad():
+        given = [geometry.means, geometry.scales, 1 / geometry.scales, geometry.rotations, *form.tensors().values()]
+        return bool(torch.isfinite(torch.stack([x.double().sum() for x in given])).all())
 
 
 def cosine_values(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from neuprim.config import RunConfig, compose
+from neuprim.core.compute import device
 from neuprim.core.data import Dataset, Pixels
 from neuprim.core.errors import DataError, NonFiniteError
 from neuprim.core.io.vdb import write_vdb
@@ -76,28 +78,29 @@ def trained(words: list[str], dataset: Dataset | None, steps: int) -> tuple[Fitt
 
 @pytest.mark.parametrize("task", ["static", "lights", "shadows per pixel", "time"])
 def test_a_card_trains_what_the_processor_trains(task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps, with interventions in the population and looks at voxels, and the state after them."""
-    config = configured(task, tmp_path, "train.voxels_every=2", "train.ssim_weight=0.2") if task == "time" else configured(task, tmp_path)
+    """Steps with interventions in the population, and looks at voxels. Bit for bit what the twins compute on the processor, and but for
+    rounding what its own kernels do: training multiplies that, as Adam's first steps are as long where a gradient is nothing but rounding.
+    """
+    config = configured(task, tmp_path, *(["train.voxels_every=2"] if task == "time" else []))
     own, told = trained(config, None, 8)
+    with monkeypatch.context() as patch:
+        patch.setattr(device, "fused", lambda *tensors: False)
+        twin, twins = trained(config, own.dataset, 8)
     with pretended(monkeypatch) as card:
         other, heard = trained(config, own.dataset, 8)
         assert other.trainer.device == CARD and all(v.device == CARD for v in other.model.params.values())
         tensors, header = other.trainer.state()
-        image = other.trainer.model.to(torch.device("cpu"))
         waits = card.waits.total()
-    assert all(type(value) is Tensor and value.is_cpu for value in tensors.values()) and all(v.is_cpu for v in image.params.values())
-    mine, _ = own.trainer.state()
-    assert {**header, "elapsed": 0} == {**own.trainer.state()[1], "elapsed": 0} and tensors.keys() == mine.keys()
+    mine, theirs = own.trainer.state()[0], twin.trainer.state()[0]
+    assert all(type(value) is Tensor and value.is_cpu for value in tensors.values()) and waits > 0
+    assert {**header, "elapsed": 0} == {**own.trainer.state()[1], "elapsed": 0} and tensors.keys() == mine.keys() == theirs.keys()
+    assert all(torch.equal(value, theirs[name]) for name, value in tensors.items())
+    assert [replace(r, seconds=0) for r in heard] == [replace(r, seconds=0) for r in twins] and any(r.change for r in heard)
     for a, b in zip(told, heard, strict=True):
         assert (a.view, a.primitives, a.change, a.parts.keys()) == (b.view, b.primitives, b.change, b.parts.keys())
-        assert b.loss == pytest.approx(a.loss, rel=1e-2) and b.psnr == pytest.approx(a.psnr, abs=0.1)
-    assert heard[0].loss == pytest.approx(told[0].loss, rel=1e-5) and any(r.change for r in heard)
-    for name in ("generator", "order", "adam.age"):
-        assert torch.equal(tensors[name], mine[name])
-    for name, value in mine.items():
-        if name.startswith("population.") or name == "params.means":
-            assert torch.allclose(tensors[name], value, rtol=1e-2, atol=1e-3 * float(value.abs().max())), name
-    assert waits > 0
+        assert b.loss == pytest.approx(a.loss, rel=2e-2) and b.psnr == pytest.approx(a.psnr, abs=0.2)
+    assert heard[0].loss == pytest.approx(told[0].loss, rel=1e-5)
+    assert all(torch.equal(tensors[name], mine[name]) for name in ("generator", "order", "adam.age"))
 
 
 def test_first_gradients_are_the_processors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -135,7 +135,7 @@ def rasterize(
     if colors.dim() == 3 and len(colors) != views:
         raise _wrong("colors", f"shape {tuple(colors.shape)}", f"({views}, {count}, channels), one set per camera of viewmats")
     backdrop = _check_backgrounds(backgrounds, views, channels)
-    if Ks.requires_grad and not all(backend.differentiates_intrinsics for backend in backends.candidates(knobs)):
+    if Ks.requires_grad and not all(backend.differentiates_intrinsics for backend in backends.candidates(knobs, means.device.type)):
         able = " or ".join(f'backend="{b.name}"' for b in backends.available() if b.differentiates_intrinsics)
         raise BackendUnavailable(
             f'rasterize: Ks requires a gradient, which backend="{knobs.backend}" does not compute; pass {able} or Ks.detach()'
@@ -179,7 +179,7 @@ def _settings(settings: dict[str, Any]) -> RenderSettings:
 
 
 def _check_tensor(name: str, value: Any) -> None:
-    """A float32 or float64 tensor on the CPU."""
+    """A float32 or float64 tensor on the processor or a card."""
     fault = tensor_fault(value)
     if fault is not None:
         raise DataError(f"rasterize: {name} has {fault}")
@@ -191,6 +191,8 @@ def _check_primitives(t: dict[str, Tensor], omega0: float, edge: int) -> tuple[i
         _check_tensor(name, value)
         if value.dtype != t["means"].dtype:
             raise _wrong(name, f"dtype {value.dtype}", f"{t['means'].dtype}, as means has")
+        if value.device != t["means"].device:
+            raise _wrong(name, f"device {value.device}", f"{t['means'].device}, as means has")
     sizes: Sizes = {}
     density = Cosine(t["W1"], t["b1"], t["w2"], t["b2"], omega0, edge)
     for form in (Geometry(t["means"], t["log_scales"], t["quats"]), density):

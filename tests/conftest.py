@@ -1,8 +1,10 @@
-"""What all tests share: how long one may take."""
+"""What all tests share: how long one may take, and both ways in which an operation is computed."""
 
 from __future__ import annotations
 
 import pytest
+
+from neuprim.core.compute import device
 
 SLOW = 3600.0
 """Seconds that a test marked slow may take; the others have ``timeout`` of pyproject.toml."""
@@ -12,3 +14,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(SLOW))
+
+
+@pytest.fixture(params=["fused", "twin"])
+def either_way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Once as compiled for the processor, once by the twins in torch code that tensors on a card take."""
+    if request.param == "twin":
+        monkeypatch.setattr(device, "fused", lambda *tensors: False)
+    return str(request.param)

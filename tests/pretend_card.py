@@ -23,6 +23,7 @@ from neuprim.core.compute import device
 from neuprim.core.render import backends
 from neuprim.core.render.backends import Backend
 from neuprim.core.render.cpu.backend import render as draw_on_processor
+from neuprim.core.render.output import RenderOutput
 from neuprim.core.render.shading import Draw, elsewhere
 
 __all__ = ["CARD", "Card", "pretended"]
@@ -111,10 +112,6 @@ def _held(value: Any) -> Any:
     return value.held if isinstance(value, _OnCard) else value
 
 
-def _load() -> Draw:
-    return elsewhere(draw_on_processor, torch.device("cpu"))
-
-
 @contextmanager
 def pretended(monkeypatch: pytest.MonkeyPatch) -> Iterator[Card]:
     """Inside, this machine has a card, and a backend that draws on it: the processor's, with what it takes and makes moved."""
@@ -123,9 +120,22 @@ def pretended(monkeypatch: pytest.MonkeyPatch) -> Iterator[Card]:
         patch.setattr(device, "KINDS", ("cpu", CARD.type))
         patch.setattr(device, "card_missing", lambda: None)
         patch.setattr(device, "of_kind", torch.device)
-        patch.setattr(device, "from_host", lambda tensor, where: tensor.to(where) if where != CARD else _OnCard(tensor.clone()))  # in any thread
+        patch.setattr(
+            device, "from_host", lambda tensor, where: tensor.to(where) if where != CARD else _OnCard(tensor.clone())
+        )  # in any thread
         patch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # which knows nothing of this device
-        row = Backend("card", _load, backends.kernels_refuse, lambda: "a pretended card", devices=(CARD.type,))
+        card = Card()
+
+        def load() -> Draw:
+            def draw(*frame: Any) -> RenderOutput:
+                before = card.waits.copy()
+                output = elsewhere(draw_on_processor, torch.device("cpu"))(*frame)
+                card.waits = before  # for the numbers that the pretended backend moves
+                return output
+
+            return draw
+
+        row = Backend("card", load, backends.kernels_refuse, lambda: "a pretended card", checks=True, devices=(CARD.type,))
         patch.setattr(backends, "TABLE", (row, *backends.TABLE))
-        with _Written(), Card() as card:
+        with _Written(), card:
             yield card

@@ -24,7 +24,7 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import facts_of, orbit_of
 from neuprim.runs.measure import draw, draw_sum
-from neuprim.runs.open import LOGS, load_dataset, load_run
+from neuprim.runs.open import LOGS, load_dataset, load_run, placed
 
 __all__ = ["FORMATS", "render_run", "with_conditions"]
 
@@ -91,6 +91,7 @@ def render_run(
         views = [replace(v, conditions={**v.conditions, **lights[0]}) for v in views]
     with watch:
         views, animated = with_conditions(views, task, conditions, tell)
+    model = placed(model, config.renderer, views[0])
     format = format or _format_of(out, animated)
     if channels.partial and format not in _RAW:
         tell(f"shown: {channels.shown}; --format exr and npy hold all channels")

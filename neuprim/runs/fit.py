@@ -15,6 +15,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.data.check import check_dataset
 from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import backends
 from neuprim.core.task import Loss, TaskSpec
 from neuprim.core.train.trainer import StepReport, Trainer, initial_model
 from neuprim.core.uses import build_settings, loss_settings
@@ -44,7 +45,7 @@ class Fitted:
 
     @property
     def model(self) -> Primitives:
-        """As it is now."""
+        """As it is now, on the device of its training; ``model.to(torch.device("cpu"))`` is a copy elsewhere."""
         return self.trainer.model
 
     @property
@@ -95,6 +96,7 @@ def start(config: RunConfig, events: Events = silent, dataset: Dataset | None = 
     Args:
         suspects: who is watched for crashes around this call; told whose code the data set is.
     """
+    backends.check_device(config.renderer)
     task = task_of(config)
     config = replace(config, made_by=made_now(config, task))
     loss = make_loss(config, task)  # options that it refuses must not cost the loading of the data

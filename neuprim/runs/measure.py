@@ -23,6 +23,7 @@ from torch import Tensor
 
 from neuprim.config import RunConfig, suspects_of
 from neuprim.core.channels import Channels, channels_of
+from neuprim.core.compute import device
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.check import check_dataset, check_pixels
 from neuprim.core.io import images
@@ -33,7 +34,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, choose, render
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import clips_of, diagnosed, judged, mask_of
-from neuprim.runs.open import LOGS, load_dataset, load_run
+from neuprim.runs.open import LOGS, load_dataset, load_run, placed
 from neuprim.version import __version__
 
 __all__ = ["ViewMetrics", "draw", "draw_sum", "evaluate_run", "measure", "summary"]
@@ -59,9 +60,9 @@ class ViewMetrics:
 
 
 def draw(model: Primitives, view: View, settings: RenderSettings, background: Tensor) -> Tensor:
-    """(H, W, C) image of one view, without gradients."""
+    """(H, W, C) image of one view, without gradients; on the processor, wherever it was drawn."""
     with torch.no_grad():
-        return render(model, view.camera, view.conditions, settings, background).rgb
+        return render(model, view.camera, view.conditions, settings, background).rgb.cpu()
 
 
 def draw_sum(
@@ -72,7 +73,7 @@ def draw_sum(
     background: Tensor,
     drawn: Callable[[], None] = lambda: None,
 ) -> Tensor:
-    """(H, W, C) sum of one view's images under conditions that change light alone, over the background once; without gradients.
+    """(H, W, C) sum of one view's images under conditions that change light alone, over the background once; as :func:`draw`.
 
     Exact for what is linear in light, as opacity does not depend on it. Sums are float64.
 
@@ -86,7 +87,7 @@ def draw_sum(
             frame = render(model, view.camera, {**view.conditions, **light}, settings)
         total, alpha = total + frame.rgb.double(), frame.alpha
         drawn()
-    return (total + (1.0 - alpha.double())[..., None] * background.double()).to(frame.rgb)
+    return (total + (1.0 - alpha.double())[..., None] * background.double().to(alpha.device)).to(frame.rgb).cpu()
 
 
 def measure(
@@ -168,6 +169,7 @@ def evaluate_run(run_dir: Path, lpips: str | Path | None = None) -> dict[str, An
         path = run_dir / "model.safetensors"
         training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
         channels = channels_of(task, dataset)
+        model = placed(model, config.renderer, dataset.test.view(0))
         views = measure(model, task, dataset, config.renderer, channels, lpips=distance)
         return summary(config, model, task, dataset, channels, views, path.stat().st_size, training, distance)
 
@@ -220,7 +222,7 @@ def summary(
         "data_source": dataset.data_source,
         "train_views": len(dataset.train),
         "seed": config.seed,
-        **diagnosed(task, dataset, model),
+        **diagnosed(task, dataset, model.to(device.HOST)),
         "non_default": {key: list(pair) for key, pair in config.non_default.items()},
         "versions": {
             "neuprim": __version__,

@@ -5,23 +5,27 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from neuprim.config import RunConfig, scene_of, suspects_of, task_of
 from neuprim.core.checkpoint import load_model
-from neuprim.core.data import Dataset
+from neuprim.core.data import Dataset, View
 from neuprim.core.errors import DataError
 from neuprim.core.extensions import TrainedModel
 from neuprim.core.io.files import cache_directory
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import RenderSettings
+from neuprim.core.render.backends import at_hand
+from neuprim.core.render.place import device_of
 from neuprim.core.task import SceneContext, TaskSpec
 from neuprim.core.volumes.source import VolumeSource
 from neuprim.plugins.blame import blamed
 from neuprim.plugins.mechanism import PluginError
 from neuprim.plugins.provenance import warn_of_neuprim
 
-__all__ = ["LOGS", "load_dataset", "load_run", "read_metrics", "open_run"]
+__all__ = ["LOGS", "load_dataset", "load_run", "open_run", "placed", "read_metrics"]
 
 LOGS = "logs"
 """Folder of a run directory for tracebacks of plugins."""
@@ -72,7 +76,12 @@ def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Pr
     if config.made_by is not None:
         warn_of_neuprim(config.made_by, place)
     model, header = load_model(run_dir / "model.safetensors", task)
-    return config, task, model, header
+    return replace(config, renderer=at_hand(config.renderer)), task, model, header
+
+
+def placed(model: Primitives, settings: RenderSettings, view: View) -> Primitives:
+    """The model where views like this one are best drawn."""
+    return model.to(device_of(model, settings, view.camera, view.conditions))
 
 
 def open_run(run_dir: Path, progress: Progress = lambda text, fraction: None) -> TrainedModel:

@@ -61,7 +61,7 @@ class Camera:
 
 def check_viewmat(viewmat: Tensor, where: str) -> None:
     """Raise :class:`DataError` naming ``where`` unless ``viewmat`` is a finite (4, 4) matrix with a rotation in its upper left."""
-    view = viewmat.detach().double()
+    view = viewmat.detach().double().cpu()
     if view.shape != (4, 4) or not torch.isfinite(view).all():
         raise DataError(f"{where}: camera matrix has shape {tuple(view.shape)} or non-finite entries; expected finite 4x4")
     R = view[:3, :3]

@@ -11,11 +11,13 @@ import functools
 import torch
 from torch import Tensor
 
-__all__ = ["CARD", "KINDS", "PROCESSOR", "card_missing", "from_host", "fused", "of_kind"]
+__all__ = ["CARD", "HOST", "KINDS", "PROCESSOR", "card_missing", "from_host", "fused", "of_kind"]
 
 PROCESSOR, CARD = "cpu", "cuda"
 KINDS: tuple[str, ...] = (PROCESSOR, CARD)
 """The devices that models are kept on."""
+
+HOST = torch.device(PROCESSOR)
 
 
 def fused(*tensors: Tensor) -> bool:

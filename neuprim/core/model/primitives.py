@@ -67,7 +67,6 @@ class Lowered:
         sizes = check_geometry(self.geometry, "geometry")
         check_density(self.density, sizes, density)
         check_colour(self.colour, sizes, colour)
-        self._check_devices()
         if self.rows is not None:
             check_rows(self.rows, None, "Lowered.rows holds", sizes["N"][0])
         if self.shade is not None and (fault := function_fault(self.shade)) is not None:
@@ -77,9 +76,12 @@ class Lowered:
             check_shape("background", background, (channels,), f", as {self.source('colour')} has C={channels}")
         if viewmat is not None:
             check_shape("viewmat", viewmat, (4, 4))
+        self._check_devices(viewmat)
 
-    def _check_devices(self) -> None:
+    def _check_devices(self, viewmat: Tensor | None) -> None:
         where = self.geometry.means.device
+        if viewmat is not None and not viewmat.is_cpu and viewmat.device != where:
+            raise FormError(f"viewmat has device {viewmat.device}; expected {where}, as means has, or cpu")
         for kind, form in (("density", self.density), ("colour", self.colour), ("geometry", self.geometry)):
             for name, value in form.tensors().items():
                 if value.device != where:

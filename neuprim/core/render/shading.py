@@ -58,8 +58,9 @@ def elsewhere(draw: Draw, device: torch.device) -> Draw:
 
     def moved(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
         own = lowered.geometry.means.device
+        camera = replace(camera, viewmat=camera.viewmat.to(device))
         output = draw(lowered.to(device), camera, None if background is None else background.to(device), settings)
-        output.stats.drawn_on = device
+        output.stats.drawn_on = output.stats.drawn_on or device
         depth = None if output.depth is None else output.depth.to(own)
         return replace(output, rgb=output.rgb.to(own), alpha=output.alpha.to(own), depth=depth)
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.task import Loss, Supervision
+from neuprim.core.train.ssim_torch import photometric_torch
 
 __all__ = ["compressed", "l1", "photometric", "photometric_reference", "relative", "scale_anisotropy"]
 
@@ -40,20 +41,17 @@ def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -
 
 
 def photometric(settings: Mapping[str, Any]) -> Loss:
-    """Loss of a run, from ``{"ssim_weight": lambda}``; fused on float32 CPU tensors, kornia elsewhere."""
+    """Loss of a run, from ``{"ssim_weight": lambda}``; of float32 tensors with its own gradient, kornia's else."""
     weight = float(settings["ssim_weight"])
 
     def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
-        if (
-            device.fused(rendered, truth)
-            and rendered.dtype == torch.float32
-            and weight > 0
-            and min(rendered.shape[:2]) >= 11
-            and rendered.shape[2] <= 51
-        ):
-            from neuprim.core.train.ssim_cpu import photometric_fused
+        if rendered.dtype == torch.float32 and weight > 0 and min(rendered.shape[:2]) >= 11:
+            if not device.fused(rendered, truth):
+                return photometric_torch(rendered, truth, weight)
+            if rendered.shape[2] <= 51:
+                from neuprim.core.train.ssim_cpu import photometric_fused
 
-            return photometric_fused(rendered, truth, weight)
+                return photometric_fused(rendered, truth, weight)
         return photometric_reference(rendered, truth, weight)
 
     return loss

@@ -153,15 +153,20 @@ class RowAdam:
 
     def _step_rows(self, updates: list[tuple[ParameterSpec, Tensor, Tensor]], rates: dict[str, float]) -> None:
         """The update in torch code, in the arithmetic of the kernel."""
+        if not updates:
+            return
         age = self.age.double()
         correction, root = 1 / (1 - BETA1**age), (1 / (1 - self.beta2**age)).sqrt()
-        for spec, value, grad in updates:
+        gradients = [grad for _, _, grad in updates]
+        first, second = ([moments[spec.name] for spec, _, _ in updates] for moments in (self.m, self.v))
+        torch._foreach_mul_(first, BETA1)
+        torch._foreach_add_(first, gradients, alpha=1 - BETA1)
+        torch._foreach_mul_(second, self.beta2)
+        torch._foreach_addcmul_(second, gradients, gradients, value=1 - self.beta2)
+        for (spec, value, _), m, size in zip(updates, first, torch._foreach_sqrt(second), strict=True):
             shape = (-1, *[1] * (value.dim() - 1))
-            m, v = self.m[spec.name], self.v[spec.name]
-            m.mul_(BETA1).add_(grad, alpha=1 - BETA1)
-            v.mul_(self.beta2).addcmul_(grad, grad, value=1 - self.beta2)
-            step, slow = ((x.to(value).reshape(shape)) for x in (rates[spec.name] * correction, root))
-            value.sub_(step * m / (v.sqrt() * slow + EPS))
+            step, slow = (x.to(value).reshape(shape) for x in (rates[spec.name] * correction, root))
+            value.sub_((m * step).div_(size.mul_(slow).add_(EPS)))
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
         """Follow a change of population: keep ``rows`` (in their new order); where ``fresh`` is set, start again from nothing."""

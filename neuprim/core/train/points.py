@@ -58,11 +58,12 @@ def point_step(
     check_samples(samples, dataset)
     colour = samples.source is not None and settings.voxel_colour > 0
     found = values_at(model, samples.conditions, samples.points, colour, threads)
-    wrong = (found.sigma - samples.sigma) / samples.sigma_scale
+    where = found.sigma.device
+    wrong = (found.sigma - samples.sigma.to(where)) / samples.sigma_scale
     loss = wrong.square().mean()
     parts = {"voxel_sigma": loss.item()}
     if found.source is not None and samples.source is not None:
-        light = ((found.source - samples.source) / samples.source_scale).square().mean()
+        light = ((found.source - samples.source.to(where)) / samples.source_scale).square().mean()
         parts["voxel_source"] = light.item()
         loss = loss + settings.voxel_colour * light
     peak = max(float(samples.sigma.max()), 1e-30) / samples.sigma_scale

@@ -30,8 +30,8 @@ from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.render.backends import run_device
 from neuprim.core.render.output import Tally
+from neuprim.core.render.place import device_of
 from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.ahead import Ahead
 from neuprim.core.train.losses import scale_anisotropy
@@ -42,8 +42,6 @@ from neuprim.core.train.settings import ModelSettings, TrainSettings
 
 __all__ = ["StepReport", "Trainer", "initial_model"]
 
-
-_FEW = 64  # primitives that stand for a model where only its forms count
 
 _USUAL_OPACITY = 0.5
 """Of Gaussians that say how large they are, but not how opaque."""
@@ -150,8 +148,7 @@ class Trainer:
         self.model, self.dataset, self.loss = model, dataset, loss
         self.settings, self.renderer = settings, replace(renderer, depth=False)
         first = dataset.train.view(0)
-        few = Primitives(model.density, model.colour, model.rows(torch.arange(min(model.count, _FEW), device=model.device)))
-        self.device = run_device(self.renderer, lambda: few.forms(first.camera, first.conditions), first.camera)
+        self.device = device_of(model, self.renderer, first.camera, first.conditions)
         model.params = model.to(self.device).params
         self.optimizer = RowAdam(model.specs, model.params, settings.adam_beta2)
         self._ahead = Ahead(self._pixels) if self.device.type == device.CARD else None

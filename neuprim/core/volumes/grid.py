@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import ConfigError
@@ -89,6 +90,7 @@ def density_grid(
         raise ConfigError(f"scene_from_index {forward.tolist()}: expected a finite, invertible affine map")
     back = np.linalg.inv(forward)
     grid = np.zeros(shape, np.float32)
+    model = model.to(device.HOST)
     with torch.no_grad():
         geometry, form = model.lower_density(conditions)
         wide = [x.detach().double().numpy() for x in (geometry.means, geometry.scales, geometry.rotations)]
@@ -104,7 +106,7 @@ def density_grid(
 def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Tensor:
     """(M,) float64 extinction, 1/scene unit, at (M, 3) points: every primitive at every point, in float64. Slow, short, and the oracle."""
     with torch.no_grad():
-        living = model.living(conditions, torch.float64)
+        living = model.to(device.HOST).living(conditions, torch.float64)
         geometry = living.geometry
         total = torch.zeros(len(points), dtype=torch.float64)
         whiten = geometry.rotations / geometry.scales[:, None, :]

@@ -16,14 +16,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.colours.sh import C0
-from neuprim.core.model.fields import ColourField, Conditions, Cosine
+from neuprim.core.model.fields import ColourField, Conditions, Cosine, LoweredDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Living, Primitives
 from neuprim.core.volumes.points_cpu import add_values, count_pairs, fill_pairs, pull_values
 from neuprim.core.volumes.points_prepare import merge_parts, prepare_axes, prepare_values, pull_parameters, sort_points
+from neuprim.core.volumes.points_torch import cosine_values, numbers_finite, pairs_on, summed
 
 __all__ = ["PointValues", "Shares", "cells_of", "pairs_of", "values_at"]
 
@@ -44,9 +46,9 @@ class Shares:
         weight, error_weight: (N,) sums over points of sigma_i, and of sigma_i x error, of the primitives of the frame.
     """
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, device: torch.device | None = None) -> None:
         self.error: Tensor | None = None
-        self.weight, self.error_weight = torch.zeros(count), torch.zeros(count)
+        self.weight, self.error_weight = (torch.zeros(count, device=device) for _ in range(2))
 
 
 class PointValues(NamedTuple):
@@ -84,9 +86,14 @@ def values_at(model: Primitives, conditions: Conditions, points: Tensor, colour:
     living = model.living(conditions)
     colors = _flat_colours(model.colour, living, conditions) if colour else None
     form = model.density.lower(living.own, living.geometry, conditions)
-    shares = Shares(living.geometry.count)
-    places = points.detach().double().contiguous().numpy()
-    if isinstance(form, Cosine):
+    shares = Shares(living.geometry.count, living.geometry.means.device)
+    places = points.detach().double().cpu().contiguous().numpy()
+    if not device.fused(living.geometry.means):
+        if not numbers_finite(living.geometry, form):
+            model.check_finite()
+            raise NonFiniteError("extinction at points: a product of finite parameters is not finite")
+        sigma, source = _elsewhere(living, form, places, colors, shares)
+    elif isinstance(form, Cosine):
         g, shown = living.geometry, torch.zeros(living.geometry.count, 0) if colors is None else colors
         given = (g.means, g.log_scales, g.quats, form.W1, form.b1, form.w2, form.b2.reshape(-1), shown)
         try:
@@ -223,6 +230,29 @@ def pairs_of(geometry: Geometry, points: np.ndarray) -> tuple[Tensor, Tensor]:
     parallel_for(fill_pairs, geometry.count, _ROWS, 0, *given, starts, point)
     prim = torch.repeat_interleave(torch.arange(geometry.count), torch.from_numpy(counts))
     return torch.from_numpy(cells.order[point]), prim
+
+
+def _elsewhere(
+    living: Living, form: LoweredDensity, places: np.ndarray, colors: Tensor | None, shares: Shares
+) -> tuple[Tensor, Tensor | None]:
+    """The same of a model that compiled code cannot read."""
+    g = living.geometry
+    point, prim = pairs_on(g, cells_of(places))
+    x = torch.from_numpy(places).to(g.means.device)[point]
+    values = cosine_values(form, g, prim, x) if isinstance(form, Cosine) else living.sigma(prim, x.to(g.means)).double()
+    sigma = values.clamp_min(0)
+    columns = [sigma[:, None]] if colors is None else [sigma[:, None], sigma[:, None] * colors.double()[prim]]
+    whole = summed(len(places), point, torch.cat(columns, 1)).float()
+
+    def fill(gradient: Tensor) -> None:
+        own = sigma.detach()
+        shares.weight = summed(g.count, prim, own).float()
+        if shares.error is not None:
+            shares.error_weight = summed(g.count, prim, own * shares.error.double()[point]).float()
+
+    if whole.requires_grad:
+        whole.register_hook(fill)
+    return whole[:, 0], (None if colors is None else whole[:, 1:])
 
 
 def _asked(living: Living, places: np.ndarray, colors: Tensor | None, shares: Shares) -> tuple[Tensor, Tensor | None]:

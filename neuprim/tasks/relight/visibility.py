@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
+from neuprim.core.compute import device
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.fields import Constant, LoweredDensity, Shade
@@ -28,6 +29,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.refusals import refuse_non_finite
+from neuprim.tasks.relight.visibility_torch import arriving
 
 __all__ = ["BIAS", "SIZE", "SOFTNESS", "light_visibility"]
 
@@ -58,11 +60,14 @@ def light_visibility(
     with torch.no_grad():
         means = geometry.means.detach().double()
         light = light.detach().double()
-        center = (means.amin(0) + means.amax(0)) / 2
-        radius = float((means - center).norm(dim=-1).max()) + float(geometry.scales.detach().max())
+        middle = (means.amin(0) + means.amax(0)) / 2
+        far, largest = (means - middle).norm(dim=-1).max(), geometry.scales.detach().max()
+        *place, far_away, size = torch.cat([middle, far[None], largest.double()[None]]).tolist()  # one wait for a card
+        center, light = torch.tensor(place, dtype=torch.float64), light.cpu()
+        radius = far_away + size
         distance = float((light - center).norm())
         if distance < 1e-9 * max(radius, 1e-30):
-            return lambda points: torch.ones(len(points))
+            return lambda points: torch.ones(len(points), device=points.device)
         if distance > _FAR * radius:  # from there all rays are parallel, and a float32 depth image keeps no digits
             light, distance = center + (light - center) * (_FAR * radius / distance), _FAR * radius
         half = math.asin(min(radius / distance, 0.94))
@@ -71,13 +76,13 @@ def light_visibility(
         camera = Camera(look_at(light, center, up), focal, focal, SIZE / 2, SIZE / 2, SIZE, SIZE)
         near = max(1e-4 * radius, distance - 1.5 * radius, 1e-6)
         own = replace(settings, depth=True, near=near, samples=1)
-        depths = means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
-        edges = torch.linspace(float(depths.min()), float(depths.max()), LAYERS + 1, dtype=torch.float64)
-        slabs = torch.bucketize(depths, edges[1:-1])
+        depths = means @ camera.viewmat[2, :3].to(means) + camera.viewmat[2, 3]
+        edges = torch.linspace(*torch.stack([depths.min(), depths.max()]).tolist(), LAYERS + 1, dtype=torch.float64)
+        slabs = torch.bucketize(depths, edges[1:-1].to(means))
         order = torch.argsort(slabs, stable=True)
         geometry_by_slab, density_by_slab = geometry[order], density.rows(order)
         ends = torch.bincount(slabs, minlength=LAYERS).cumsum(0).tolist()
-        black = torch.zeros(geometry.count, 1)
+        black = torch.zeros(geometry.count, 1, device=means.device)
         layers = []
         for first, end in zip([0, *ends], ends, strict=False):
             if first == end:
@@ -91,16 +96,18 @@ def light_visibility(
                 raise
             assert output.depth is not None
             layers.append((output.alpha, output.depth))
-        opacities, distances = (torch.stack(images).numpy() for images in zip(*layers, strict=True))
-        view, diameter = camera.viewmat[:3].contiguous().numpy(), 2.0 * radius
+        opacities, distances = (torch.stack(images) for images in zip(*layers, strict=True))
+        view, diameter = camera.viewmat[:3].contiguous(), 2.0 * radius
 
     def visibility(points: Tensor) -> Tensor:
+        points, limits = points.detach().double().contiguous(), (bias * diameter, softness * diameter)
+        if not device.fused(points, opacities):
+            return arriving(points, view.to(points.device), near, focal, opacities, distances, *limits)
         from neuprim.tasks.relight.visibility_cpu import arriving_light  # numba, loaded when first needed
 
-        x = points.detach().double().contiguous().numpy()
-        found = np.empty(len(x), np.float32)
-        limits = (bias * diameter, softness * diameter)
-        parallel_for(arriving_light, len(x), _CHUNK, settings.threads, x, view, near, focal, opacities, distances, *limits, found)
+        found = np.empty(len(points), np.float32)
+        arrays = [x.numpy() for x in (points, view, opacities, distances)]
+        parallel_for(arriving_light, len(found), _CHUNK, settings.threads, *arrays[:2], near, focal, *arrays[2:], *limits, found)
         return torch.from_numpy(found)
 
     return visibility

@@ -8,6 +8,8 @@ from torch import Tensor
 
 from neuprim.core.model.densities.cosine import GAIN_LIMIT, amplified
 
+pytestmark = pytest.mark.usefixtures("either_way")
+
 
 def formula(w2: Tensor, b2: Tensor, log_gain: Tensor) -> tuple[Tensor, Tensor]:
     g = log_gain.reshape(-1, 1).clamp(-GAIN_LIMIT, GAIN_LIMIT).exp()

@@ -8,6 +8,8 @@ from torch import Tensor
 
 from neuprim.core.model.rows import take_rows
 
+pytestmark = pytest.mark.usefixtures("either_way")
+
 ROWS = {
     "some": [1, 2, 5, 8],
     "all": list(range(9)),

@@ -16,6 +16,8 @@ from neuprim.core.model.schema import InitContext
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
 
+pytestmark = pytest.mark.usefixtures("either_way")
+
 
 def sphere(polar: int = 12, around: int = 24) -> tuple[torch.Tensor, torch.Tensor]:
     """Directions and weights of a product rule that is exact for polynomials of degree < 2 polar."""

@@ -14,6 +14,8 @@ from neuprim.core.metrics import ssim
 from neuprim.core.task import Supervision
 from neuprim.core.train.losses import photometric, photometric_reference, scale_anisotropy
 
+pytestmark = pytest.mark.usefixtures("either_way")
+
 FRAME = Supervision(View("v", Camera(torch.eye(4), 1.0, 1.0, 0.5, 0.5, 1, 1)))
 SIZES = [(11, 11), (12, 40), (64, 77), (11, 200), (45, 13)]
 

@@ -31,6 +31,7 @@ def set_grads(p: dict[str, Tensor], seed: int) -> None:
         v.grad = torch.where(torch.rand(v.shape, generator=g) < 0.2, torch.zeros_like(grad), grad).to(v.dtype)
 
 
+@pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("beta2", [0.999, 0.99])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
 def test_equals_torch_adam(dtype: torch.dtype, tolerance: float, beta2: float) -> None:
@@ -52,7 +53,8 @@ def test_equals_torch_adam(dtype: torch.dtype, tolerance: float, beta2: float) -
     assert optimizer.age.tolist() == [20] * 7
 
 
-def test_numba_path_equals_the_reference_step() -> None:
+@pytest.mark.usefixtures("either_way")
+def test_it_equals_the_reference_step() -> None:
     """More rows than one chunk, rows of different ages, decaying rates."""
     p, q = params(9000, 1), params(9000, 1)
     optimizer = RowAdam(SPECS, p)
@@ -76,6 +78,7 @@ def test_numba_path_equals_the_reference_step() -> None:
         assert bool(((optimizer.v[n].double() - v[n]).abs() <= 1e-6 * peak[n] ** 2 + 1e-37).all())
 
 
+@pytest.mark.usefixtures("either_way")
 def test_first_step_is_one_rate_whatever_the_gradient() -> None:
     p = params()
     before = {n: v.detach().clone() for n, v in p.items()}
@@ -87,6 +90,7 @@ def test_first_step_is_one_rate_whatever_the_gradient() -> None:
         assert torch.allclose(p[n].detach() - before[n], torch.tensor(RATES[n]), rtol=1e-3, atol=3e-7)
 
 
+@pytest.mark.usefixtures("either_way")
 def test_fresh_rows_start_anew_and_the_others_go_on() -> None:
     p = params(5)
     optimizer = RowAdam(SPECS, p)
@@ -131,6 +135,7 @@ def test_an_old_count_would_have_been_wrong() -> None:
     assert torch.allclose((before - p["means"].detach()) / RATES["means"], torch.tensor(3.162), atol=1e-2)
 
 
+@pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 @pytest.mark.parametrize("name", ["means", "W1", "b2"])
 def test_a_non_finite_gradient_is_named_and_changes_nothing(name: str, value: float) -> None:
@@ -148,6 +153,7 @@ def test_a_non_finite_gradient_is_named_and_changes_nothing(name: str, value: fl
     assert all(torch.equal(a, b) for a, b in zip(before, (*p.values(), *optimizer.state().values()), strict=True))
 
 
+@pytest.mark.usefixtures("either_way")
 def test_large_finite_gradients_are_allowed() -> None:
     p = params()
     for v in p.values():
@@ -157,6 +163,7 @@ def test_large_finite_gradients_are_allowed() -> None:
     assert all(bool(torch.isfinite(v).all()) for v in p.values())
 
 
+@pytest.mark.usefixtures("either_way")
 def test_parameters_without_a_gradient_stay() -> None:
     p = params()
     optimizer = RowAdam(SPECS, p)
@@ -168,6 +175,7 @@ def test_parameters_without_a_gradient_stay() -> None:
     assert optimizer.m["W1"].abs().max() == 0
 
 
+@pytest.mark.usefixtures("either_way")
 def test_state_goes_on_exactly() -> None:
     p = params()
     first = RowAdam(SPECS, p)
@@ -201,6 +209,7 @@ def test_it_does_not_depend_on_the_number_of_threads() -> None:
     assert all(torch.equal(a, b) for state in states[1:] for a, b in zip(states[0], state, strict=True))
 
 
+@pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("beta2", [0.0, 0.9, 0.99, 0.99999])
 def test_corrections_are_those_of_every_age(beta2: float) -> None:
     """From the first step to ages beyond the budget of any run, rows side by side."""

@@ -21,6 +21,8 @@ from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
 
+pytestmark = pytest.mark.usefixtures("either_way")
+
 
 def static(neurons: int, edge: int, seed: int = 2, count: int = 40) -> Primitives:
     """Parameters in float64, so that only the arithmetic is compared."""

@@ -13,6 +13,8 @@ from neuprim.core.model.schema import InitContext
 from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.dynamic.frame_cpu import fused_move, fused_window
 
+pytestmark = pytest.mark.usefixtures("either_way")
+
 
 def windowed(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor) -> tuple[Tensor, Tensor]:
     u = (xi.to(b2) - center) / log_window.exp()

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.tasks.relight.visibility_cpu import arriving_light
+from neuprim.tasks.relight.visibility_torch import arriving
 
 
 def camera(x: float = 1.0, y: float = 2.0, z: float = -4.0, dtype: torch.dtype = torch.float64) -> Camera:
@@ -49,7 +50,9 @@ def test_depth_images_are_read_as_torch_reads_them(slabs: int) -> None:
     found = np.full(len(points), -1.0, np.float32)
     arriving_light(0, len(points), points.numpy(), view.numpy(), near, focal, alphas.numpy(), depths.numpy(), 0.2, 0.3, found)
     wanted = read(points, view, near, focal, alphas, depths, 0.2, 0.3).float()
+    twin = arriving(points, view, near, focal, alphas, depths, 0.2, 0.3)
     assert torch.allclose(torch.from_numpy(found), wanted, rtol=0, atol=1e-6)
+    assert twin.dtype == torch.float32 and torch.allclose(twin, wanted, rtol=0, atol=1e-6)
     assert 0.1 < float((wanted < 0.99).float().mean()) and float(wanted.min()) < 0.3
     assert found[50] == 1.0
 
@@ -60,3 +63,5 @@ def test_points_that_are_not_finite_are_lit() -> None:
     ones = np.ones((1, 8, 8), np.float32)
     arriving_light(0, 3, points, camera().viewmat[:3].contiguous().numpy(), 0.05, 20.0, ones, ones, 0.1, 0.1, found)
     assert found.tolist() == [1.0, 1.0, 1.0]
+    images = torch.ones(1, 8, 8), torch.ones(1, 8, 8)
+    assert arriving(torch.from_numpy(points), camera().viewmat[:3], 0.05, 20.0, *images, 0.1, 0.1).tolist() == [1.0, 1.0, 1.0]

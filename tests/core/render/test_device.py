@@ -1,0 +1,171 @@
+"""Which device draws: what the setting says, what is there, and where the tensors are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import neuprim
+from neuprim.config import compose
+from neuprim.core.compute import device
+from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, FormError
+from neuprim.core.model.fields import Opaque
+from neuprim.core.render import RenderSettings, backends, render_lowered
+from neuprim.core.render.backends import Backend
+from neuprim.core.render.place import device_of
+from neuprim.runs.fit import start
+from tests import scenes
+from tests.core import tiny
+from tests.pretend_card import CARD, Card, pretended
+from tests.short_runs import words
+
+
+@pytest.fixture
+def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Card]:
+    with pretended(monkeypatch) as made:
+        yield made
+
+
+def setting(kind: str, **more: Any) -> RenderSettings:
+    """As on a machine with a card: there, what the setting calls cuda is the pretended one."""
+    settings = RenderSettings(**more)
+    object.__setattr__(settings, "device", kind)
+    return settings
+
+
+def frame(seed: int = 0) -> Any:
+    return scenes.lowered(scenes.tensors(5, seed=seed)), scenes.camera(12, 10)
+
+
+def test_without_a_card_auto_is_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device, "card_missing", lambda: "torch finds no CUDA device")
+    trainer = tiny.trainer(tiny.two_primitives(), 1)
+    assert trainer.device == torch.device("cpu") and trainer._ahead is None
+
+
+def test_a_card_that_is_asked_for_and_not_there_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before anything is loaded, and in Python code too."""
+    monkeypatch.setattr(device, "card_missing", lambda: "torch finds no CUDA device")
+    line = r"^renderer\.device=cuda: torch finds no CUDA device; expected cpu or auto$"
+    monkeypatch.setattr("neuprim.runs.fit.load_dataset", lambda *_, **__: pytest.fail("loaded"))
+    with pytest.raises(BackendUnavailable, match=line):
+        start(compose(words(tmp_path, tmp_path / "run", 3, "renderer.device=cuda")))
+    low, camera = frame()
+    with pytest.raises(BackendUnavailable, match=line):
+        render_lowered(low, camera, RenderSettings(device="cuda"))
+
+
+def test_a_card_that_nothing_draws_on_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device, "card_missing", lambda: None)
+    monkeypatch.setattr(backends, "TABLE", tuple(b for b in backends.TABLE if b.devices[0] == "cpu"))
+    assert backends.no_card() == "no backend draws there"
+    assert tiny.trainer(tiny.two_primitives(), 1).device == torch.device("cpu")
+    broken = Backend("card", lambda: pytest.fail("loaded"), missing=lambda: "its package is not installed", devices=("cuda",))
+    monkeypatch.setattr(backends, "TABLE", (broken, *backends.TABLE))
+    assert backends.no_card() == "its package is not installed"
+    assert tiny.trainer(tiny.two_primitives(), 1).device == torch.device("cpu")
+    with pytest.raises(BackendUnavailable, match=r"^renderer\.device=cuda: its package is not installed; expected cpu or auto$"):
+        backends.check_device(RenderSettings(device="cuda"))
+
+
+def test_a_backend_and_a_device_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
+    line = r"^renderer\.device=cuda: renderer\.backend=reference does not draw there; expected cpu or auto$"
+    with pytest.raises(ConfigError, match=line):
+        compose(words(tmp_path, tmp_path / "run", 3, "renderer.device=cuda", "renderer.backend=reference"))
+    with pytest.raises(ConfigError, match=r"^renderer\.device=gpu: expected auto, cpu or cuda$"):
+        RenderSettings(device="gpu")  # type: ignore[arg-type]
+
+
+def test_a_run_of_a_card_is_opened_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device, "card_missing", lambda: "torch finds no CUDA device")
+    assert backends.at_hand(RenderSettings(device="cuda", near=0.5)) == RenderSettings(near=0.5)
+    monkeypatch.setattr(device, "card_missing", lambda: None)
+    row = Backend("card", lambda: pytest.fail("loaded"), devices=("cuda",))
+    monkeypatch.setattr(backends, "TABLE", (row, *backends.TABLE))
+    assert backends.at_hand(RenderSettings(device="cuda")) == RenderSettings(device="cuda")
+
+
+def test_tensors_say_where_a_frame_is_drawn(card: Card) -> None:
+    low, camera = frame()
+    wanted = render_lowered(low, camera, RenderSettings())
+    found = render_lowered(low.to(CARD), camera, RenderSettings(depth=True), torch.ones(3))
+    assert wanted.stats.backend == found.stats.backend == "cpu" and found.rgb.device == found.depth.device == CARD  # type: ignore[union-attr]
+    assert (
+        backends.choose(low, RenderSettings(), camera).name == "cpu"
+        and backends.choose(low.to(CARD), RenderSettings(), camera).name == "card"
+    )
+    assert torch.equal(found.alpha.cpu(), wanted.alpha)
+
+
+def test_the_setting_says_it_too(card: Card) -> None:
+    """Then tensors are moved there and the image back; gradients go the same way, and so do sums that are watched."""
+    for own, kind, name in (("cpu", CARD.type, "card"), (CARD.type, "cpu", "cpu"), ("cpu", "auto", "cpu"), (CARD.type, "auto", "card")):
+        low, camera = frame()
+        low = low.to(torch.device(own))
+        low.geometry.means.requires_grad_()
+        assert backends.choose(low, setting(kind), camera).name == name
+        output = render_lowered(low, camera, setting(kind))
+        tally = output.watch(torch.ones_like(output.alpha))
+        output.rgb.sum().backward()
+        grad = low.geometry.means.grad
+        assert grad is not None and output.rgb.device.type == grad.device.type == tally.weight.device.type == own
+        assert bool((tally.weight > 0).any()) and torch.allclose(tally.weight, tally.error_weight)
+
+
+def test_a_backend_of_the_card_by_name_takes_tensors_there(card: Card) -> None:
+    low, camera = frame()
+    assert render_lowered(low, camera, RenderSettings(backend="card")).rgb.device.type == "cpu"
+    assert render_lowered(low.to(CARD), camera, RenderSettings(backend="reference")).rgb.device == CARD
+
+
+def test_code_of_a_model_stays_where_it_is(card: Card) -> None:
+    """What only the reference draws is not moved to it; a run keeps such a model on the processor in the first place."""
+    low, camera = frame()
+    own = replace(low, density=Opaque(lambda prim, o, d, t0, t1: t1 - t0))
+    assert render_lowered(own, camera, RenderSettings()).stats.backend == "reference"
+    away = replace(low.to(CARD), density=own.density)
+    with pytest.raises(
+        BackendUnavailable,
+        match="reference cannot draw code of the model's own that works on the meta; it draws on the cpu",
+    ):
+        render_lowered(away, camera, RenderSettings())
+
+
+def test_a_run_keeps_a_model_where_it_is_drawn(card: Card, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, camera = tiny.trainer(tiny.two_primitives(), 1).model.to(torch.device("cpu")), scenes.camera(12, 10)
+    assert device_of(model, RenderSettings(), camera, {}) == CARD
+    assert (
+        device_of(model, setting("cpu"), camera, {}) == device_of(model, RenderSettings(backend="cpu"), camera, {}) == torch.device("cpu")
+    )
+    assert device_of(model, RenderSettings(backend="card"), camera, {}) == device_of(model, setting(CARD.type), camera, {}) == CARD
+    monkeypatch.setattr(backends.TABLE[0].__class__, "refuses", lambda self, low, camera: "this", raising=False)
+    object.__setattr__(backends.TABLE[0], "refuses", lambda low, camera: "this model")
+    assert device_of(model, RenderSettings(), camera, {}) == torch.device("cpu")
+
+
+def test_tensors_of_two_devices_are_refused_by_name(card: Card) -> None:
+    low, camera = frame()
+    mixed = replace(low, density=low.density.to(CARD))
+    with pytest.raises(FormError, match=r"^density lowered to Cosine: W1 has device meta; expected cpu, as means has$"):
+        render_lowered(mixed, camera, RenderSettings())
+    with pytest.raises(FormError, match=r"^viewmat has device meta; expected cpu, as means has, or cpu$"):
+        render_lowered(low, replace(camera, viewmat=camera.viewmat.to(CARD)), RenderSettings())
+
+
+def test_rasterize_takes_tensors_of_a_card(card: Card) -> None:
+    t = scenes.tensors(4)
+    camera = scenes.camera(8, 6)
+    K = torch.tensor([[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]], dtype=torch.float64)
+    wanted = neuprim.rasterize(**t, viewmats=camera.viewmat[None], Ks=K, width=8, height=6)
+    away = {name: value.to(CARD).requires_grad_() for name, value in t.items()}
+    found = neuprim.rasterize(**away, viewmats=camera.viewmat[None].to(CARD), Ks=K.to(CARD), width=8, height=6)
+    assert found.rgb.device == CARD and torch.equal(found.rgb.detach().cpu(), wanted.rgb)
+    found.rgb.sum().backward()
+    assert away["means"].grad is not None and away["means"].grad.device == CARD
+    with pytest.raises(DataError, match=r"^rasterize: W1 has device cpu; expected meta, as means has$"):
+        neuprim.rasterize(**{**away, "W1": t["W1"]}, viewmats=camera.viewmat[None], Ks=K, width=8, height=6)

@@ -90,6 +90,11 @@ class Backend:
     differentiates_intrinsics: bool = False
     devices: tuple[str, ...] = (hardware.PROCESSOR,)
 
+    @property
+    def lacking(self) -> str | None:
+        """Why this machine cannot run it on its own device; None if it can."""
+        return (hardware.card_missing() if self.devices[0] == hardware.CARD else None) or self.missing()
+
     def place(self, settings: RenderSettings) -> str:
         """The kind of device that it draws on under these settings."""
         return self.devices[0] if settings.device == AUTO else settings.device
@@ -168,7 +173,7 @@ def names() -> tuple[str, ...]:
 
 def available() -> tuple[Backend, ...]:
     """Those that this machine can run."""
-    return tuple(backend for backend in TABLE if backend.missing() is None)
+    return tuple(backend for backend in TABLE if backend.lacking is None)
 
 
 def check_name(name: object) -> None:

@@ -7,11 +7,12 @@ what they are given; where they may not, a twin in torch code computes the same.
 from __future__ import annotations
 
 import functools
+import importlib.util
 
 import torch
 from torch import Tensor
 
-__all__ = ["CARD", "HOST", "KINDS", "PROCESSOR", "card_missing", "from_host", "fused", "of_kind"]
+__all__ = ["CARD", "HOST", "KINDS", "PROCESSOR", "card_missing", "from_host", "fused", "kernels", "of_kind"]
 
 PROCESSOR, CARD = "cpu", "cuda"
 KINDS: tuple[str, ...] = (PROCESSOR, CARD)
@@ -23,6 +24,16 @@ HOST = torch.device(PROCESSOR)
 def fused(*tensors: Tensor) -> bool:
     """Whether operations that are compiled for the processor may read these tensors."""
     return all(tensor.is_cpu for tensor in tensors)
+
+
+@functools.cache
+def _warp() -> bool:
+    return importlib.util.find_spec("warp") is not None
+
+
+def kernels(*tensors: Tensor) -> bool:
+    """Whether operations that are compiled for a card may read these tensors."""
+    return all(tensor.is_cuda for tensor in tensors) and _warp()
 
 
 @functools.cache

@@ -97,8 +97,12 @@ class Backend:
         """Why it cannot draw on this kind of device here, as the rest of a sentence; None if it can."""
         if place not in self.devices:
             return f"draws on the {' or '.join(self.devices)}, but renderer.device is {place}"
-        missing = (hardware.card_missing() if place == hardware.CARD else None) or self.missing()
-        return None if missing is None else f"cannot run here: {missing}"
+        lacks = self.lacks(place)
+        return None if lacks is None else f"cannot run here: {lacks}"
+
+    def lacks(self, place: str | None = None) -> str | None:
+        """What this machine lacks for it to draw on this kind of device, its own by default; None if nothing."""
+        return (hardware.card_missing() if (place or self.devices[0]) == hardware.CARD else None) or self.missing()
 
     def fault(self, lowered: Lowered, camera: AnyCamera | None, place: str | None = None) -> str | None:
         """Why it does not draw this here, as the rest of a sentence; None if it does.
@@ -150,8 +154,8 @@ def names() -> tuple[str, ...]:
 
 
 def available() -> tuple[Backend, ...]:
-    """Those that this machine can run."""
-    return tuple(backend for backend in TABLE if backend.missing() is None)
+    """Those that this machine can run, each on its own kind of device."""
+    return tuple(backend for backend in TABLE if backend.lacks() is None)
 
 
 def check_name(name: object) -> None:

@@ -23,9 +23,9 @@ Draw = Callable[..., RenderOutput]
 def points_seen(depth: Tensor, camera: AnyCamera) -> Tensor:
     """(H, W, 3) float64 scene points at a depth image (H, W): camera-z, or distance for a ``RayCamera``; no gradient."""
     depth = depth.detach().double()
-    view = camera.viewmat.detach().double().to(depth.device)
+    view = camera.viewmat.detach().double().to(depth.device, non_blocking=True)
     if isinstance(camera, RayCamera):
-        local = camera.directions.detach().double().to(depth.device) * depth[..., None]
+        local = camera.directions.detach().double().to(depth.device, non_blocking=True) * depth[..., None]
     else:
         x = (torch.arange(camera.width, dtype=torch.float64, device=depth.device) + 0.5 - camera.cx) / camera.fx
         y = (torch.arange(camera.height, dtype=torch.float64, device=depth.device) + 0.5 - camera.cy) / camera.fy

@@ -242,7 +242,7 @@ class Trainer:
         index = self._next_view()
         view = self.dataset.train.view(index)
         pixels = self._pixels(index) if self._ahead is None else self._ahead.take(index, self.order)
-        background = self._background().to(self.device)
+        background = self._background().to(self.device, non_blocking=True)
         truth = pixels.over(background)
         output = render(self.model, view.camera, view.conditions, self.renderer, background)
         rgb = output.rgb if pixels.mask is None else torch.where(pixels.mask[..., None], output.rgb, truth)

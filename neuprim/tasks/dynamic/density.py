@@ -115,7 +115,13 @@ class TimeDensity(DensityField):
         if "offset" in self.parts:
             angle = math.pi * xi * torch.arange(1, OFFSET_TERMS + 1, dtype=torch.float64, device=xi.device)
             b2 = params["b2"]
-            own["b2"] = b2 + (params["offset_cos"] @ angle.cos().to(b2) + params["offset_sin"] @ angle.sin().to(b2))[:, None]
+            own["b2"] = (
+                b2
+                + (
+                    params["offset_cos"] @ angle.cos().to(b2, non_blocking=True)
+                    + params["offset_sin"] @ angle.sin().to(b2, non_blocking=True)
+                )[:, None]
+            )
         w2, b2 = amplified(own["w2"], own["b2"], own.get("log_gain"))
         if "window" in self.parts:
             from neuprim.tasks.dynamic.frame_cpu import fused_window  # numba, loaded when first needed

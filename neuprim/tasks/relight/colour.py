@@ -97,9 +97,9 @@ class LightNetwork(ColourField):
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> RayNet:
         means = geometry.means
-        view = unit(means - camera.position.to(means))
-        to_light = conditions["light"].to(means) - means
-        strength = conditions["light_intensity"].to(means).expand(self.channels) / self.typical
+        view = unit(means - camera.position.to(means, non_blocking=True))
+        to_light = conditions["light"].to(means, non_blocking=True) - means
+        strength = conditions["light_intensity"].to(means, non_blocking=True).expand(self.channels) / self.typical
         factor = strength.expand(means.shape[0], -1)
         if self.falloff:
             factor = factor / to_light.square().sum(-1, keepdim=True).clamp_min(1e-12)

@@ -115,13 +115,14 @@ def _held(value: Any) -> Any:
 
 
 @contextmanager
-def pretended(monkeypatch: pytest.MonkeyPatch) -> Iterator[Card]:
-    """Inside, this machine has a card, and a backend that draws on it: the processor's, with what it takes and makes moved."""
+def pretended(monkeypatch: pytest.MonkeyPatch, memory: int = 1 << 30) -> Iterator[Card]:
+    """Inside, this machine has a card with some bytes of memory, and a backend that draws on it: the processor's, with what it takes and makes moved."""
     with monkeypatch.context() as patch:
         patch.setattr(device, "CARD", CARD.type)
         patch.setattr(device, "KINDS", ("cpu", CARD.type))
         patch.setattr(device, "card_missing", lambda: None)
         patch.setattr(device, "of_kind", torch.device)
+        patch.setattr(device, "spare_memory", lambda where: memory)
         patch.setattr(
             device, "from_host", lambda tensor, where: tensor.to(where) if where != CARD else _OnCard(tensor.clone())
         )  # in any thread

@@ -11,7 +11,7 @@ import functools
 import torch
 from torch import Tensor
 
-__all__ = ["CARD", "HOST", "KINDS", "PROCESSOR", "card_missing", "from_host", "fused", "of_kind"]
+__all__ = ["CARD", "HOST", "KINDS", "PROCESSOR", "card_missing", "from_host", "fused", "of_kind", "spare_memory"]
 
 PROCESSOR, CARD = "cpu", "cuda"
 KINDS: tuple[str, ...] = (PROCESSOR, CARD)
@@ -45,3 +45,8 @@ def from_host(tensor: Tensor, device: torch.device) -> Tensor:
     if device.type != CARD or not tensor.is_cpu:
         return tensor.to(device)
     return tensor.pin_memory().to(device, non_blocking=True)
+
+
+def spare_memory(device: torch.device) -> int:
+    """Bytes of a card's memory that nothing uses."""
+    return int(torch.cuda.mem_get_info(device)[0])

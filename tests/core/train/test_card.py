@@ -185,21 +185,23 @@ def test_a_step_waits_for_the_card_as_seldom_as_it_did(
         assert own.total() == waits and not own["copy to the card"], own
 
 
-def test_views_are_read_one_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the order of the steps, each once, and none that no step looks at: where an epoch ends the next is not drawn yet."""
+@pytest.mark.parametrize("room", [0, 2, 6])
+def test_views_are_read_one_ahead_and_kept_while_there_is_room(room: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the order of the steps, and none that no step looks at: where an epoch ends the next is not drawn yet."""
     data = tiny.two_primitives()
     read: list[int] = []
-    pixels = data.train.pixels
+    pixels, size = data.train.pixels, 4 * tiny.SIZE**2 * 4
 
     def reading(index: int) -> Pixels:
         read.append(index)
         return pixels(index)
 
     monkeypatch.setattr(data.train, "pixels", reading)
-    with pretended(monkeypatch):
+    with pretended(monkeypatch, memory=4 * room * size):
         trainer = tiny.trainer(data, 12)
         seen = [trainer.train_step().view for _ in range(12)]
-    assert [f"v{i}" for i in read] == seen
+    assert [f"v{i}" for i in read] == seen[:6] + [name for name in seen[6:] if name not in seen[:room]]
+    assert [r.view for r in tiny.trainer(tiny.two_primitives(), 12).run()] == seen
 
 
 def test_what_goes_wrong_with_a_view_is_said_at_its_step(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -94,7 +94,7 @@ def probe(name: str) -> str | None:
     from neuprim.core.model.geometry import Geometry
 
     try:
-        missing = find(name).lacks()
+        missing = find(name).lacking
         if missing is not None:
             return missing
         view = torch.eye(4, dtype=torch.float64)

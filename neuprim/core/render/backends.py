@@ -6,6 +6,7 @@ Importing this loads none of them: a row knows where its ``render`` is.
 from __future__ import annotations
 
 import functools
+import importlib.util
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -89,6 +90,11 @@ class Backend:
     differentiates_intrinsics: bool = False
     devices: tuple[str, ...] = (hardware.PROCESSOR,)
 
+    @property
+    def lacking(self) -> str | None:
+        """Why this machine cannot run it on its own device; None if it can."""
+        return (hardware.card_missing() if self.devices[0] == hardware.CARD else None) or self.missing()
+
     def place(self, settings: RenderSettings) -> str:
         """The kind of device that it draws on under these settings."""
         return self.devices[0] if settings.device == AUTO else settings.device
@@ -97,12 +103,8 @@ class Backend:
         """Why it cannot draw on this kind of device here, as the rest of a sentence; None if it can."""
         if place not in self.devices:
             return f"draws on the {' or '.join(self.devices)}, but renderer.device is {place}"
-        lacks = self.lacks(place)
-        return None if lacks is None else f"cannot run here: {lacks}"
-
-    def lacks(self, place: str | None = None) -> str | None:
-        """What this machine lacks for it to draw on this kind of device, its own by default; None if nothing."""
-        return (hardware.card_missing() if (place or self.devices[0]) == hardware.CARD else None) or self.missing()
+        missing = (hardware.card_missing() if place == hardware.CARD else None) or self.missing()
+        return None if missing is None else f"cannot run here: {missing}"
 
     def fault(self, lowered: Lowered, camera: AnyCamera | None, place: str | None = None) -> str | None:
         """Why it does not draw this here, as the rest of a sentence; None if it does.
@@ -135,6 +137,21 @@ def _cpu() -> Draw:
     return render
 
 
+def _cuda() -> Draw:
+    from neuprim.core.render.cuda.backend import render
+
+    return render
+
+
+@functools.cache
+def _no_warp() -> str | None:
+    return None if importlib.util.find_spec("warp") else "Warp is not installed: pip install 'neuprim[cuda]'"
+
+
+def _card() -> str:
+    return "cuda (no card)" if hardware.card_missing() else f"cuda ({torch.cuda.get_device_name()})"
+
+
 def _reference() -> Draw:
     from neuprim.core.render.reference.backend import render
 
@@ -142,6 +159,7 @@ def _reference() -> Draw:
 
 
 TABLE: tuple[Backend, ...] = (
+    Backend("cuda", _cuda, kernels_refuse, _card, _no_warp, checks=True, devices=(hardware.CARD, hardware.PROCESSOR)),
     Backend("cpu", _cpu, kernels_refuse, compiles=True, checks=True),
     Backend(ORACLE, _reference, differentiates_intrinsics=True),
 )
@@ -154,8 +172,8 @@ def names() -> tuple[str, ...]:
 
 
 def available() -> tuple[Backend, ...]:
-    """Those that this machine can run, each on its own kind of device."""
-    return tuple(backend for backend in TABLE if backend.lacks() is None)
+    """Those that this machine can run."""
+    return tuple(backend for backend in TABLE if backend.lacking is None)
 
 
 def check_name(name: object) -> None:

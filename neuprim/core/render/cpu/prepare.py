@@ -14,6 +14,20 @@ import numpy as np
 from neuprim.core.compute.kernels import exact_kernel, strict
 from neuprim.core.model.rotation import rotation, rotation_backward
 from neuprim.core.render.cpu import layout as L
+from neuprim.core.render.cpu.limits import (
+    ANCHOR_RADII,
+    CULLED,
+    CUT,
+    FLOAT32_MAX,
+    FLOAT64_ANCHOR,
+    FLOAT64_PIXELS,
+    FLOAT64_RADII,
+    FLOAT64_RATIO,
+    FLOAT64_RATIO_NEAR,
+    FLOAT64_TURNS,
+    NON_FINITE,
+    VISIBLE,
+)
 
 __all__ = [
     "CULLED",
@@ -24,19 +38,6 @@ __all__ = [
     "prepare_backward",
     "prepare_wide",
 ]
-
-VISIBLE, CULLED, NON_FINITE = 0, 1, 2
-_FLOAT32_MAX = 3.0e38
-
-# Where the pixel stage leaves float32 (bounds found with benchmarks/numerics.py).
-_FLOAT64_RADII = 8.0  # terms of a point on the ray this many radii of the thinnest axis long: they cancel
-_FLOAT64_ANCHOR = 1.25  # the same of the centre seen from an anchor at the camera: most cameras outside, but near
-FLOAT64_TURNS = 4.0  # of a neuron, or a unit of a colour network, over half a chord
-_ANCHOR_RADII = 1.5  # a centre at least so many radii in front of the camera is its own anchor, also where the near plane cuts it
-_CUT = 1e-3  # of the reach: float32 may find a chord cut that float64 does not
-_FLOAT64_PIXELS = 16384.0  # from the corner of the image to the anchor
-_FLOAT64_RATIO = 256.0  # of the axes; for the gradients
-_FLOAT64_RATIO_NEAR = 16.0  # of the axes of a primitive anchored at the camera, which its chords pass closely
 
 
 @strict
@@ -66,7 +67,7 @@ def _frame(mean, log_scale, quat, R, t, cam, near, local, B, axes, c, anchor):  
         for j in range(3):
             B[i, j] = R[i, 0] * local[0, j] + R[i, 1] * local[1, j] + R[i, 2] * local[2, j]
     fx, fy, cx, cy = cam[0], cam[1], cam[2], cam[3]
-    if c[2] > _ANCHOR_RADII * m and c[2] + m > near:
+    if c[2] > ANCHOR_RADII * m and c[2] + m > near:
         anchor[0] = m * np.float64(np.float32(c[2] / m))
         anchor[1] = np.float64(np.float32(fx * c[0] / c[2] + cx))
         anchor[2] = np.float64(np.float32(fy * c[1] / c[2] + cy))
@@ -157,10 +158,10 @@ def prepare(  # type: ignore[no-untyped-def]
         for j in range(row.shape[0]):
             rows[i, j] = row[j]
         tc = row[L.TC]
-        in_float64[i] = (K > 0 and rate[K - 1] > FLOAT64_TURNS) or max(abs(row[L.UX]), abs(row[L.UY])) > _FLOAT64_PIXELS
-        in_float64[i] |= _dot(xa, xa) > _FLOAT64_ANCHOR**2  # centre far from the anchor, in the thinnest axis
+        in_float64[i] = (K > 0 and rate[K - 1] > FLOAT64_TURNS) or max(abs(row[L.UX]), abs(row[L.UY])) > FLOAT64_PIXELS
+        in_float64[i] |= _dot(xa, xa) > FLOAT64_ANCHOR**2  # centre far from the anchor, in the thinnest axis
         thinnest = min(axes[0], axes[1], axes[2])
-        in_float64[i] |= thinnest * (_FLOAT64_RATIO_NEAR if tc == 0.0 else _FLOAT64_RATIO) < 1.0
+        in_float64[i] |= thinnest * (FLOAT64_RATIO_NEAR if tc == 0.0 else FLOAT64_RATIO) < 1.0
         depth[i] = c[2]
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
         if not finite:
@@ -169,10 +170,10 @@ def prepare(  # type: ignore[no-untyped-def]
         status[i] = CULLED
         szz = m * m * ((B[2, 0] * axes[0]) ** 2 + (B[2, 1] * axes[1]) ** 2 + (B[2, 2] * axes[2]) ** 2)
         reach = np.sqrt(szz)
-        in_float64[i] |= edge > 0 and c[2] - reach < near + _CUT * reach  # only there are integrals of cut chords with a soft edge
+        in_float64[i] |= edge > 0 and c[2] - reach < near + CUT * reach  # only there are integrals of cut chords with a soft edge
         if c[2] + reach <= near:
             continue
-        if biggest > _FLOAT32_MAX:
+        if biggest > FLOAT32_MAX:
             if m > 1.0:
                 status[i] = NON_FINITE  # a scale or weight beyond float32
             continue  # so small against its distance that no pixel centre can hit it
@@ -219,9 +220,9 @@ def prepare(  # type: ignore[no-untyped-def]
                     # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted needle
                     # each is many radii of its thin axis, and they cancel
                     slide = abs(row[L.TU]) * broad + abs(row[L.TV]) * tall
-                    in_float64[i] |= slide * (np.sqrt(_dot(ex, ex)) * broad + np.sqrt(_dot(ey, ey)) * tall) > _FLOAT64_RADII
+                    in_float64[i] |= slide * (np.sqrt(_dot(ex, ex)) * broad + np.sqrt(_dot(ey, ey)) * tall) > FLOAT64_RADII
                     for a in range(3):
-                        in_float64[i] |= abs(row[L.XU + a]) * broad + abs(row[L.XV + a]) * tall > _FLOAT64_RADII
+                        in_float64[i] |= abs(row[L.XU + a]) * broad + abs(row[L.XV + a]) * tall > FLOAT64_RADII
         if in_float64[i]:  # the float64 rows do not slide
             for a in range(3):
                 rows[i, L.XU + a], rows[i, L.XV + a] = tc * ex[a], tc * ey[a]

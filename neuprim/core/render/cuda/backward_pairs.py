@@ -1,0 +1,194 @@
+"""Backward, second pass: a warp a (tile, primitive) pair over its hits: chord and neurons again, sums in registers, one row for the pair.
+
+The rows of a primitive are then added in the order of its pairs: no sum depends on which block came first, and reruns are the same bits.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+from neuprim.core.compute.warp import FAST, wp
+from neuprim.core.model.edge import NORMS
+from neuprim.core.render.cuda import layout as L
+from neuprim.core.render.cuda.chord import chord, ray_of, through_chord, xyz
+from neuprim.core.render.cuda.forms import Form
+from neuprim.core.render.cuda.functions import TAU, band_of, cos_turns, sin_turns
+from neuprim.core.render.cuda.together import row_sums, row_type
+
+__all__ = ["pairs_kernel", "pixel_of_slot", "sum_pairs"]
+
+
+@wp.func
+def pixel_of_slot(spans: wp.array2d(dtype=wp.uint16), n: int, s: int):  # type: ignore
+    """(x, y) in the tile of pixel ``s`` of pair ``n``: the last row that starts at or before it."""
+    y = int(0)
+    for b in range(4):
+        if int(spans[n, y + (8 >> b)]) >> 8 <= s:
+            y += 8 >> b
+    row = int(spans[n, y])
+    return wp.vec2i((row & 15) + s - (row >> 8), y)
+
+
+@functools.cache
+def pairs_kernel(form: Form, depth: bool) -> Any:
+    """Of a form; ``depth``: a gradient of the sum of w z arrives, too."""
+    K, P, C = form.neurons, form.edge, form.channels
+    W, width = L.columns(K, C), L.gradient_width(K, C)
+    row_of, add_lanes = row_type(width), row_sums(width)
+    _, pair = band_of(P)
+    amplitudes = L.amplitudes(K)
+    vecK = wp.types.vector(length=max(K, 1), dtype=wp.float32)
+    vecC = wp.types.vector(length=C, dtype=wp.float32)
+    mean = float(NORMS[P])
+    by_rate = -TAU * TAU / (2.0 * P + 3.0)  # B' = -z B_(p+1)/(2p + 3), and z = 2 pi v
+
+    # 128 registers: 16 warps a multiprocessor instead of 12. A seventh of the time with 5 to 8 neurons on an H100; fewer neurons need no cap
+    bounds = (L.WARP, 16) if 4 < K <= 8 else None
+
+    @wp.kernel(  # type: ignore[untyped-decorator]
+        enable_backward=False, module="unique", module_options=FAST, grid_stride=False, launch_bounds=bounds
+    )
+    def backward_pairs(
+        rows: wp.array2d(dtype=wp.vec4),  # type: ignore[valid-type]
+        ids: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        tiles: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        spans: wp.array2d(dtype=wp.uint16),  # type: ignore[valid-type]
+        offsets: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        lens: wp.vec4,
+        depth_floor: float,
+        size: wp.vec2i,
+        reached: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        hits: wp.array(dtype=wp.vec2),  # type: ignore[valid-type]
+        g_rgb: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+        g_z: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+        error: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+        out: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    ):  # type: ignore[no-untyped-def]
+        n, lane = wp.tid()
+        tile = tiles[n]
+        across = (size[0] + L.TILE - 1) // L.TILE
+        i = ids[n]
+        if rows[i, L.REST][3] == 0.0:  # the others' rows come from a kernel in float64
+            total = row_of()
+            if n < reached[tile]:
+                which = wp.tile_load(ids, shape=1, offset=n, storage="shared")
+                row = wp.tile_load_indexed(rows, indices=which, shape=(1, W), axis=0, storage="shared")
+                gE0 = wp.vec3()
+                gEX = wp.vec3()
+                gEY = wp.vec3()
+                gXA = wp.vec3()
+                g_colour = vecC()
+                g_offset = float(0.0)
+                g_mass = float(0.0)
+                g_weight = float(0.0)
+                g_error = float(0.0)
+                gx = vecK()
+                gy = vecK()
+                gz = vecK()
+                gp = vecK()
+                ga = vecK()
+                begin = offsets[n]
+                count = offsets[n + 1] - begin
+                for s in range(lane, count, wp.static(L.WARP)):
+                    hit = hits[begin + s]
+                    if hit[1] > 0.0:
+                        at = pixel_of_slot(spans, n, s)
+                        X = (tile % across) * L.TILE + at[0]
+                        Y = (tile // across) * L.TILE + at[1]
+                        pixel = Y * size[0] + X
+                        px = float(X) + 0.5
+                        py = float(Y) + 0.5
+                        norm = mean * wp.length(wp.vec3((px - lens[2]) / lens[0], (py - lens[3]) / lens[1], 1.0))
+                        g_weight += hit[1]
+                        g_error += hit[1] * error[pixel]
+                        for k in range(wp.static(C)):
+                            g_colour[k] += hit[1] * g_rgb[pixel, k]
+                        c = chord(ray_of(row, 0), px, py)
+                        D = wp.max(c.D, 1.0e-12)
+                        q = c.x + (c.mid - c.tm) * c.e
+                        v = c.half * c.e
+                        scale = float(norm)  # I = scale half field
+                        if wp.static(P == 1):
+                            scale *= D
+                        if wp.static(P == 2):
+                            scale *= D * D
+                        gf = hit[0] * scale * c.half
+                        field = float(row[0, L.XA][3])
+                        gq = wp.vec3()
+                        gv = wp.vec3()
+                        w2 = wp.vec4()
+                        for k in range(wp.static(K)):
+                            if wp.static(k % 4 == 0):
+                                w2 = row[0, wp.static(amplitudes + k // 4)]
+                            amplitude = w2[wp.static(k % 4)]
+                            w = row[0, wp.static(L.NEURONS + k)]
+                            u = wp.dot(q, xyz(w)) + w[3]
+                            z = wp.dot(v, xyz(w))
+                            r = u - wp.rint(u)
+                            cosine = cos_turns(r * r)
+                            band = pair(z)
+                            one = cosine * band[0]
+                            field += amplitude * one
+                            ga[k] += gf * one
+                            gu = gf * amplitude * band[0] * (-TAU) * sin_turns(r)
+                            gw = gf * amplitude * cosine * band[1] * by_rate * z
+                            gp[k] += gu
+                            gx[k] += gu * q[0] + gw * v[0]
+                            gy[k] += gu * q[1] + gw * v[1]
+                            gz[k] += gu * q[2] + gw * v[2]
+                            gq += gu * xyz(w)
+                            gv += gw * xyz(w)
+                        g_offset += gf
+                        g_mass += gf * field
+                        g_half = wp.dot(gv, c.e) + hit[0] * scale * field
+                        g_mid = wp.dot(gq, c.e)
+                        if wp.static(depth):
+                            g_mid += hit[1] * g_z[pixel] * row[0, L.REST][1]
+                        gD = float(0.0)
+                        by_depth = 0.5 * c.h / D
+                        if wp.static(P == 0):
+                            by_depth = 0.5 * c.ia / wp.sqrt(wp.max(D, depth_floor) * c.ia)
+                        else:
+                            gD = float(P) * gf * field / D
+                        pull = through_chord(c, g_half, g_mid, gD, by_depth, gq, gv)
+                        gG = pull.e + (row[0, L.REST][0] + c.slide) * pull.m
+                        gE0 += pull.e + c.slide * pull.m
+                        gEX += c.du * gG
+                        gEY += c.dv * gG
+                        gXA += pull.m
+                for k in range(3):
+                    total[k] = gE0[k]
+                    total[3 + k] = gEX[k]
+                    total[6 + k] = gEY[k]
+                    total[9 + k] = gXA[k]
+                total[L.G_OFFSET] = g_offset
+                total[L.G_LOG_M] = g_mass
+                total[L.G_WEIGHT] = g_weight
+                total[L.G_ERROR] = g_error
+                for k in range(wp.static(K)):
+                    total[wp.static(L.G_NEURONS + 5 * k)] = gx[k]
+                    total[wp.static(L.G_NEURONS + 5 * k + 1)] = gy[k]
+                    total[wp.static(L.G_NEURONS + 5 * k + 2)] = gz[k]
+                    total[wp.static(L.G_NEURONS + 5 * k + 3)] = gp[k]
+                    total[wp.static(L.G_NEURONS + 5 * k + 4)] = ga[k]
+                for k in range(wp.static(C)):
+                    total[wp.static(L.G_NEURONS + 5 * K + k)] = g_colour[k]
+            add_lanes(total, lane, out, n * width)
+
+    return backward_pairs
+
+
+@wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)  # type: ignore[untyped-decorator]
+def sum_pairs(
+    first: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+    slots: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+    pair_rows: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+    grads: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+):  # type: ignore[no-untyped-def]
+    """Thread (i, c): column c of primitive i's pair rows, in the order of its pairs."""
+    i, c = wp.tid()
+    total = float(0.0)
+    for k in range(first[i], first[i + 1]):
+        total += pair_rows[slots[k], c]
+    grads[i, c] = total

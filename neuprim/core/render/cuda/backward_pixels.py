@@ -1,0 +1,80 @@
+"""Backward, first pass: a thread a pixel walks its hits back to front and leaves dL/dI and the weight in each slot. No neurons, no sums."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+from neuprim.core.compute.warp import FAST, wp
+from neuprim.core.render.cuda import layout as L
+from neuprim.core.render.cuda.chord import pixel, place
+from neuprim.core.render.cuda.forms import Form
+
+__all__ = ["pixels_kernel"]
+
+
+@functools.cache
+def pixels_kernel(form: Form, depth: bool) -> Any:
+    """Of a form; ``depth``: a gradient of the sum of w z arrives, too."""
+    C, H = form.channels, form.hidden
+    colours = L.colours(form.neurons)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)  # type: ignore[untyped-decorator]
+    def backward_pixels(
+        rows: wp.array2d(dtype=wp.vec4),  # type: ignore[valid-type]
+        starts: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        ids: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        spans: wp.array2d(dtype=wp.uint16),  # type: ignore[valid-type]
+        offsets: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        limits: wp.vec4,
+        size: wp.vec2i,
+        transmittance: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+        reached: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        g_rgb: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+        g_transmittance: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+        g_z: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+        depths: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+        hues: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+        hits: wp.array(dtype=wp.vec2),  # type: ignore[valid-type]
+    ):  # type: ignore[no-untyped-def]
+        """``g_transmittance`` already holds the background's share. With b what lies behind a hit, sum of w (dL/dw) and the rest of the light:
+        dL/dI = (1 - alpha) T dL/dw - b, and 0 where the opacity was clamped."""
+        tile, lane = wp.tid()
+        across = (size[0] + L.TILE - 1) // L.TILE
+        at = pixel(lane)
+        X = (tile % across) * L.TILE + at[0]
+        Y = (tile // across) * L.TILE + at[1]
+        if X < size[0] and Y < size[1]:
+            n = Y * size[0] + X
+            behind = transmittance[n] * g_transmittance[n]
+            first = starts[tile]
+            count = reached[tile] - first
+            for back in range(count):
+                p = first + count - 1 - back
+                slot = place(int(spans[p, at[1]]), offsets[p], at[0])
+                if slot >= 0:
+                    hit = hits[slot]
+                    alpha = hit[0]
+                    out = wp.vec2()
+                    if alpha > 0.0:
+                        i = ids[p]
+                        weight = alpha * hit[1]
+                        by_weight = float(0.0)
+                        hue = wp.vec4()
+                        for k in range(wp.static(C)):
+                            if wp.static(H >= 0):
+                                by_weight += wp.max(hues[slot, k], 0.0) * g_rgb[n, k]
+                            else:
+                                if wp.static(k % 4 == 0):
+                                    hue = rows[i, wp.static(colours + k // 4)]
+                                by_weight += hue[wp.static(k % 4)] * g_rgb[n, k]
+                        if wp.static(depth):
+                            by_weight += g_z[n] * depths[slot]
+                        slope = float(0.0)
+                        if alpha < limits[1]:
+                            slope = (1.0 - alpha) * hit[1] * by_weight - behind
+                        behind += weight * by_weight
+                        out = wp.vec2(slope, weight)
+                    hits[slot] = out
+
+    return backward_pixels

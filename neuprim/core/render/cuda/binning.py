@@ -1,0 +1,159 @@
+# mypy: disable-error-code="valid-type, no-untyped-def"
+"""Tile lists on the device: which primitives reach which 16 x 16 tile, front to back; the twin of :mod:`neuprim.core.render.cpu.binning`.
+
+Everything is counted before it is written, and sorted by integers, so that a rerun gives the same bits. The host waits once, for how many
+pairs there are.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.core.compute.warp import array, launch, wp
+from neuprim.core.errors import BackendUnavailable
+from neuprim.core.render.cuda.layout import E0, EX, TILE
+from neuprim.core.render.cuda.placement import EXACT, PER_BLOCK
+from neuprim.core.render.cuda.silhouette import ellipse, tile_range
+
+__all__ = ["Counted", "TileLists", "bin_primitives", "count"]
+
+_E0, _EX, _TILE = E0, EX, TILE
+_MOST = 2**31  # indices of pairs are int32
+
+
+@dataclass(frozen=True)
+class Counted:
+    """What the host learns of a frame.
+
+    Attributes:
+        pairs: (tile, primitive) pairs.
+        delicate: primitives that are drawn in float64.
+        bad: the first primitive that is not finite, or -1.
+        ends: (2, N) int64 on the device, running sums of tiles and of delicate primitives.
+    """
+
+    pairs: int
+    delicate: int
+    bad: int
+    ends: Tensor
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """Pairs sorted by tile, then by depth, then by index.
+
+    Attributes:
+        starts: (tiles + 1,) int32, first pair of each tile.
+        ids: (pairs,) int32, primitive of each pair.
+        tile_of: (pairs,) int32, its tile.
+        first: (N + 1,) int32, first entry of each primitive in ``slots_of``.
+        slots_of: (pairs,) int32, where each primitive's pairs lie in ``ids``.
+    """
+
+    starts: Tensor
+    ids: Tensor
+    tile_of: Tensor
+    first: Tensor
+    slots_of: Tensor
+
+    @property
+    def pairs(self) -> int:
+        return int(self.ids.shape[0])
+
+
+def count(counts: Tensor, bad: Tensor) -> Counted:
+    """Running sums of what ``prepare`` counted, see there; here the host waits for the device, once a frame.
+
+    Raises:
+        BackendUnavailable: too many pairs for int32.
+    """
+    ends = torch.stack([torch.cumsum(row, 0, dtype=torch.int64) for row in counts])  # along one row torch's scan is ten times faster
+    if counts.shape[1] == 0:
+        return Counted(0, 0, -1, ends)
+    pairs, delicate, first_bad = torch.cat((ends[:, -1], bad.long())).tolist()
+    if pairs >= _MOST:
+        raise BackendUnavailable(f"primitives reach {pairs} tiles in all; the cuda backend counts to {_MOST - 1}: render a smaller image")
+    return Counted(pairs, delicate, first_bad if first_bad < counts.shape[1] else -1, ends)
+
+
+@functools.cache
+def _kernels() -> tuple[Any, Any]:
+    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
+    def emit(
+        rows: wp.array2d(dtype=wp.vec4), spans: wp.array2d(dtype=wp.vec4), boxes: wp.array(dtype=wp.vec4i), order: wp.array(dtype=wp.int64),
+        counts: wp.array2d(dtype=wp.int32), ends: wp.array2d(dtype=wp.int64), across: int,
+        first: wp.array(dtype=wp.int32), keys: wp.array(dtype=wp.int64), slots: wp.array(dtype=wp.int32), which: wp.array(dtype=wp.int32),
+    ):  # fmt: skip
+        """A key tile << 32 | rank for every tile that the primitive of depth rank ``tid`` reaches; dim (N,)."""
+        rank = wp.tid()
+        i = int(order[rank])
+        last = int(ends[0, i])
+        first[i + 1] = last
+        slots[i] = -1
+        if counts[1, i] > 0:
+            slots[i] = int(ends[1, i]) - 1
+            which[slots[i]] = i
+        if counts[0, i] > 0:
+            box, at = boxes[i], last - counts[0, i]
+            e = ellipse(spans[i, 0], spans[i, 1][0], rows[i, _E0][3], rows[i, _EX][3], box)
+            for ty in range(box[1] // _TILE, (box[3] - 1) // _TILE + 1):
+                lo_hi = tile_range(e, ty)
+                for tx in range(lo_hi[0], lo_hi[1]):
+                    keys[at] = wp.int64(ty * across + tx) << wp.int64(32) | wp.int64(rank)
+                    at += 1
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
+    def list_pairs(
+        keys: wp.array(dtype=wp.int64), came_from: wp.array(dtype=wp.int64), order: wp.array(dtype=wp.int64), pairs: int, tiles: int,
+        starts: wp.array(dtype=wp.int32), ids: wp.array(dtype=wp.int32), tile_of: wp.array(dtype=wp.int32), slots_of: wp.array(dtype=wp.int32),
+    ):  # fmt: skip
+        """From sorted keys to lists; dim (pairs,)."""
+        k = wp.tid()
+        key = keys[k]
+        tile, rank = int(key >> wp.int64(32)), int(key & wp.int64(0xFFFFFFFF))
+        ids[k] = int(order[rank])
+        tile_of[k] = tile
+        slots_of[int(came_from[k])] = k
+        before = wp.int32(-1)
+        if k > 0:
+            before = int(keys[k - 1] >> wp.int64(32))
+        for t in range(before + 1, tile + 1):
+            starts[t] = k
+        if k == pairs - 1:
+            for t in range(tile + 1, tiles + 1):
+                starts[t] = pairs
+
+    return emit, list_pairs
+
+
+def bin_primitives(
+    rows: Tensor, spans: Tensor, boxes: Tensor, depth: Tensor, counts: Tensor, counted: Counted, width: int, height: int
+) -> tuple[TileLists, Tensor, Tensor]:
+    """Tile lists of one frame, ``slots`` and ``which``; every argument as ``prepare`` and :func:`count` filled it, no primitive bad."""
+    device, N, pairs = rows.device, depth.shape[0], counted.pairs
+    across, down = -(-width // TILE), -(-height // TILE)
+
+    def integers(n: int) -> Tensor:
+        return torch.empty(n, dtype=torch.int32, device=device)
+
+    emit, list_pairs = _kernels()
+    order = torch.argsort(depth, stable=True)
+    first = torch.zeros(N + 1, dtype=torch.int32, device=device)
+    slots, which, keys = integers(N), integers(counted.delicate), torch.empty(pairs, dtype=torch.int64, device=device)
+    reached = (
+        array(rows, wp.vec4), array(spans.view(N, 2, 4), wp.vec4), array(boxes, wp.vec4i), array(order, wp.int64), array(counts, wp.int32),
+        array(counted.ends, wp.int64), across, array(first, wp.int32), array(keys, wp.int64), array(slots, wp.int32), array(which, wp.int32),
+    )  # fmt: skip
+    launch(emit, N, reached, device, PER_BLOCK)
+    keys, came_from = torch.sort(keys)
+    starts = torch.zeros(across * down + 1, dtype=torch.int32, device=device)
+    ids, tile_of, slots_of = integers(pairs), integers(pairs), integers(pairs)
+    found = (
+        array(keys, wp.int64), array(came_from, wp.int64), array(order, wp.int64), pairs, across * down,
+        array(starts, wp.int32), array(ids, wp.int32), array(tile_of, wp.int32), array(slots_of, wp.int32),
+    )  # fmt: skip
+    launch(list_pairs, pairs, found, device)
+    return TileLists(starts, ids, tile_of, first, slots_of), slots, which

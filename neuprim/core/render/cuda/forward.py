@@ -1,0 +1,207 @@
+"""Compositing, forward: a block a tile, a thread a pixel.
+
+Rows of primitives come to shared memory in batches; a tile ends when no pixel sees light through it any more. What the backward pass needs
+goes to the pixels' slots (:mod:`~neuprim.core.render.cuda.spans`): (alpha, transmittance before) of every hit. Pairs of primitives that float32
+cannot follow have their opacities there beforehand (:mod:`~neuprim.core.render.cuda.delicate`).
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+from neuprim.core.compute.warp import FAST, wp
+from neuprim.core.model.edge import NORMS
+from neuprim.core.render.cuda import layout as L
+from neuprim.core.render.cuda.chord import chord, pixel, place, ray_of, xyz
+from neuprim.core.render.cuda.forms import Form
+from neuprim.core.render.cuda.functions import band_of, cos_turns
+from neuprim.core.render.cuda.together import any_thread
+
+__all__ = ["BATCH", "CUT_AT", "forward_kernel"]
+
+CUT_AT = -1e30
+"""Entry of every chord that the near plane cuts: in front of all others, and equal."""
+
+
+@wp.func
+def key_of(pixel: int, entry: float):  # type: ignore[no-untyped-def]
+    """Sorts by pixel, then by entry: floats in the order of integers."""
+    bits = wp.int64(wp.cast(entry, wp.int32))
+    if bits < wp.int64(0):
+        bits = wp.int64(-1) - bits  # negative floats: larger ones have more bits
+    else:
+        bits = bits + (wp.int64(1) << wp.int64(31))
+    return (wp.int64(pixel) << wp.int64(32)) | bits
+
+
+BATCH = 16
+"""Rows in shared memory at a time."""
+
+
+@functools.cache
+def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False) -> Any:
+    """Of a form; ``keep``: fill the slots, and take delicate primitives from there; ``depth``: also the sum of w z.
+
+    ``listing``: composite nothing, but list every hit for :mod:`~neuprim.core.render.cuda.by_entry`, with its sorting key and its pair.
+    """
+    assert keep or not listing
+    K, P, C = form.neurons, form.edge, form.channels
+    width = L.columns(K, C)
+    amplitudes, colours = L.amplitudes(K), L.colours(K)
+    value, _ = band_of(P)
+    H = form.hidden
+    each = L.net_columns(C)
+    net_width = max(H * each, 1)
+    colour_type = wp.types.vector(length=C, dtype=wp.float32)
+    mean = float(NORMS[P])
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)  # type: ignore[untyped-decorator]
+    def forward(
+        rows: wp.array2d(dtype=wp.vec4),  # type: ignore[valid-type]
+        net: wp.array2d(dtype=wp.vec4),  # type: ignore[valid-type]
+        starts: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        ids: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        spans: wp.array2d(dtype=wp.uint16),  # type: ignore[valid-type]
+        offsets: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        lens: wp.vec4,
+        limits: wp.vec4,
+        background: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+        size: wp.vec2i,
+        rgb: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+        transmittance: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+        zsum: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+        hits: wp.array(dtype=wp.vec2),  # type: ignore[valid-type]
+        depths: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+        hues: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+        reached: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        keys: wp.array(dtype=wp.int64),  # type: ignore[valid-type]
+        owners: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+    ):  # type: ignore[no-untyped-def]
+        """limits = (alpha_min, alpha_max, transmittance_min, -); ``net``, ``hues``: of colour networks; ``reached[tile]``: the pairs before it
+        were composited."""
+        tile, lane = wp.tid()
+        across = (size[0] + L.TILE - 1) // L.TILE
+        at = pixel(lane)
+        X = (tile % across) * L.TILE + at[0]
+        Y = (tile // across) * L.TILE + at[1]
+        px = float(X) + 0.5
+        py = float(Y) + 0.5
+        norm = mean * wp.length(wp.vec3((px - lens[2]) / lens[0], (py - lens[3]) / lens[1], 1.0))
+        T = float(1.0)
+        if X >= size[0] or Y >= size[1]:
+            T = -1.0
+        color = colour_type()
+        z = float(0.0)
+        first = starts[tile]
+        end = starts[tile + 1]
+        done = int(first)
+        for base in range(first, end, BATCH):
+            which = wp.tile_load(ids, shape=BATCH, offset=base, storage="shared")
+            staged = wp.tile_load_indexed(rows, indices=which, shape=(BATCH, width), axis=0, storage="shared")
+            if wp.static(H > 0):
+                units = wp.tile_load_indexed(net, indices=which, shape=(BATCH, net_width), axis=0, storage="shared")
+            count = wp.min(BATCH, end - base)
+            for j in range(count):
+                slot = place(int(spans[base + j, at[1]]), offsets[base + j], at[0])
+                if slot >= 0:
+                    alpha = float(0.0)
+                    before = float(T)
+                    if T >= limits[2]:
+                        mid = float(0.0)
+                        entry = float(CUT_AT)
+                        known = float(0.0)
+                        hue = wp.vec4()
+                        tint = colour_type()
+                        if wp.static(H >= 0):
+                            for k in range(wp.static(C)):
+                                if wp.static(k % 4 == 0):
+                                    hue = staged[j, wp.static(colours + k // 4)]
+                                tint[k] = hue[wp.static(k % 4)]
+                        if wp.static(keep):
+                            known = staged[j, L.REST][3]
+                        if known > 0.0:
+                            alpha = hits[slot][0]
+                            if wp.static(depth):
+                                mid = depths[slot]
+                            if wp.static(listing):
+                                entry = hits[slot][1]
+                            if wp.static(H > 0):
+                                for k in range(wp.static(C)):
+                                    tint[k] = hues[slot, k]
+                        else:
+                            c = chord(ray_of(staged, j), px, py)
+                            if c.half > 0.0:
+                                q = c.x + (c.mid - c.tm) * c.e
+                                v = c.half * c.e
+                                field = float(staged[j, L.XA][3])
+                                w2 = wp.vec4()
+                                for k in range(wp.static(K)):
+                                    if wp.static(k % 4 == 0):
+                                        w2 = staged[j, wp.static(amplitudes + k // 4)]
+                                    w = staged[j, wp.static(L.NEURONS + k)]
+                                    u = wp.dot(q, xyz(w)) + w[3]
+                                    r = u - wp.rint(u)
+                                    field += w2[wp.static(k % 4)] * cos_turns(r * r) * value(wp.dot(v, xyz(w)))
+                                I = field * c.half * norm
+                                if wp.static(P == 1):
+                                    I *= c.D
+                                if wp.static(P == 2):
+                                    I *= c.D * c.D
+                                if I > 0.0:
+                                    alpha = wp.min(1.0 - wp.exp(-I), limits[1])
+                                    if alpha < limits[0]:
+                                        alpha = 0.0
+                                if wp.static(H > 0):
+                                    for h in range(wp.static(H)):
+                                        w = units[j, wp.static(each * h)]
+                                        u = wp.dot(q, xyz(w)) + w[3]
+                                        r = u - wp.rint(u)
+                                        wave = cos_turns(r * r)
+                                        for k in range(wp.static(C)):
+                                            if wp.static(k % 4 == 0):
+                                                hue = units[j, wp.static(each * h + 1 + k // 4)]
+                                            tint[k] += wave * hue[wp.static(k % 4)]
+                                if wp.static(depth):
+                                    rest = staged[j, L.REST]
+                                    mid = rest[2] + rest[1] * (c.mid + c.slide)
+                                if wp.static(listing):
+                                    if c.uncut > 0.0:
+                                        rest = staged[j, L.REST]
+                                        entry = rest[2] + rest[1] * (c.mid + c.slide - c.half)
+                        weight = alpha * T
+                        if wp.static(listing):
+                            weight = 0.0
+                            before = 0.0  # of slots that are no hits, which nothing else will touch
+                            keys[slot] = key_of(wp.where(alpha > 0.0, Y * size[0] + X, size[0] * size[1]), entry)
+                            owners[slot] = base + j
+                        for k in range(wp.static(C)):
+                            if wp.static(H >= 0):
+                                color[k] += weight * wp.max(tint[k], 0.0)
+                                if wp.static(keep):
+                                    hues[slot, k] = tint[k]
+                            else:
+                                if wp.static(k % 4 == 0):
+                                    hue = staged[j, wp.static(colours + k // 4)]
+                                color[k] += weight * hue[wp.static(k % 4)]
+                        if wp.static(depth):
+                            z += weight * mid
+                            if wp.static(keep):
+                                depths[slot] = mid
+                        T -= weight
+                    if wp.static(keep):
+                        hits[slot] = wp.vec2(alpha, before)
+            done = base + count
+            if any_thread(int(T >= limits[2])) == 0:
+                break
+        if X < size[0] and Y < size[1]:
+            n = Y * size[0] + X
+            for k in range(wp.static(C)):
+                rgb[n, k] = color[k] + T * background[k]
+            transmittance[n] = T
+            if wp.static(depth):
+                zsum[n] = z
+        if lane == 0:
+            reached[tile] = done
+
+    return forward

@@ -1,0 +1,70 @@
+"""Names for the columns of the kernels' arrays on the device.
+
+A primitive's row is a whole number of float4, so that one load of 16 bytes brings a vector and a scalar. The numbers are those of
+:mod:`neuprim.core.render.cpu.layout`, which says what they mean; only their places differ. Gradient rows are the CPU's, column for column.
+"""
+
+from __future__ import annotations
+
+from neuprim.core.render.cpu.layout import (
+    ANCHOR_Z,
+    G_ERROR,
+    G_LOG_M,
+    G_NEURONS,
+    G_OFFSET,
+    G_WEIGHT,
+    PER_NEURON,
+    PIXELS,
+    TILE,
+    UNIT,
+)
+
+__all__ = [
+    "AMPLITUDE", "ANCHOR_Z", "E0", "EX", "EY", "G_ERROR", "G_LOG_M", "G_NEURONS", "G_OFFSET", "G_WEIGHT", "NEURONS", "PER_NEURON", "PIXELS", "REST",
+    "SCALARS", "TILE", "UNIT", "WARP", "XA", "XU", "XV", "amplitudes", "colours", "columns", "gradient_width", "net_columns", "wide_width",
+]  # fmt: skip
+
+E0, EX, EY, XA, XU, XV, REST, NEURONS = 0, 1, 2, 3, 4, 5, 6, 7
+"""float4 columns: a vector each, and beside it a scalar, see :data:`SCALARS`; REST holds four scalars, then come the neurons."""
+
+SCALARS = {E0: "UX", EX: "UY", EY: "NEAR", XA: "OFFSET", XU: "TU", XV: "TV"}
+"""The fourth number of each column. Those of REST are TC, UNIT, ANCHOR_Z and whether float32 is too coarse (0 or 1); of a neuron
+(WX, WY, WZ, PHASE)."""
+
+AMPLITUDE = 4
+"""Place of the amplitude among the five numbers of a neuron in a gradient row."""
+
+WARP = 32
+
+
+def amplitudes(neurons: int) -> int:
+    """First column of the neurons' amplitudes, four in each."""
+    return NEURONS + neurons
+
+
+def colours(neurons: int) -> int:
+    """First column of the colours, four channels in each."""
+    return amplitudes(neurons) + -(-neurons // 4)
+
+
+def columns(neurons: int, channels: int) -> int:
+    """float4 columns of a primitive's row."""
+    return colours(neurons) + -(-channels // 4)
+
+
+def wide_width(neurons: int) -> int:
+    """Numbers in the float64 row of a primitive: the CPU's columns without padding."""
+    from neuprim.core.render.cpu.layout import NEURONS as FIRST
+
+    return FIRST + PER_NEURON * neurons
+
+
+def net_columns(channels: int) -> int:
+    """float4 columns per unit of a colour network: (WX, WY, WZ, PHASE), then its output weights, four in each."""
+    return 1 + -(-channels // 4)
+
+
+def gradient_width(neurons: int, channels: int, hidden: int = 0) -> int:
+    """Columns of a gradient row with H units of a colour network, a multiple of a warp's lanes."""
+    used = G_NEURONS + PER_NEURON * neurons + channels + (4 + channels) * hidden
+    return -(-used // WARP) * WARP

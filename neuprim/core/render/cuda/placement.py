@@ -1,0 +1,129 @@
+# mypy: disable-error-code="valid-type, no-untyped-def"
+"""Where a primitive lies before the camera, in float64: what the per-primitive kernels and their backward pass share.
+
+The twin of ``_frame`` and of the geometry in ``_wide_row`` of :mod:`neuprim.core.render.cpu.prepare`, which say what the numbers are.
+"""
+
+from neuprim.core.compute.warp import OPTIONS, wp
+from neuprim.core.render.cpu.limits import ANCHOR_RADII
+
+__all__ = ["EXACT", "PER_BLOCK", "Placed", "Ray", "View", "place", "rounded", "view_of", "whiten"]
+
+EXACT = {**OPTIONS, "fuse_fp": False}
+"""Options of the per-primitive kernels: every product is rounded, so that two kernels that count the same tiles, and the CPU, agree."""
+
+PER_BLOCK = 64
+"""Primitives of a block: float64 takes 160 registers, and a few more small blocks lie on a processor than large ones."""
+
+d = wp.float64
+_ANCHOR_RADII = wp.constant(d(ANCHOR_RADII))
+
+
+@wp.struct
+class View:
+    """Camera axes, centre and intrinsics (fx, fy, cx, cy), and the near plane."""
+
+    R: wp.mat33d
+    t: wp.vec3d
+    focal: wp.vec2d
+    centre: wp.vec2d
+    near: wp.float64
+
+
+@wp.struct
+class Placed:
+    """Orientation in camera axes, rotation, axes s/m, centre in camera axes, anchor (depth, pixel x, pixel y), m and 1/|q|."""
+
+    B: wp.mat33d
+    local: wp.mat33d
+    axes: wp.vec3d
+    centre: wp.vec3d
+    anchor: wp.vec3d
+    m: wp.float64
+    inverse: wp.float64
+
+
+@wp.struct
+class Ray:
+    """A = m S^-1 B^T, and rays in whitened space: x(t) = (xa + du xu + dv xv + s G) + t (e0 + G), G = du ex + dv ey, s = du tu + dv tv."""
+
+    A: wp.mat33d
+    ref: wp.vec3d
+    w: wp.vec3d
+    e0: wp.vec3d
+    ex: wp.vec3d
+    ey: wp.vec3d
+    xa: wp.vec3d
+    tc: wp.float64
+    tu: wp.float64
+    tv: wp.float64
+    near: wp.float64
+
+
+@wp.func
+def rounded(x: wp.float64):
+    """The nearest float32."""
+    return wp.float64(wp.float32(x))
+
+
+@wp.func
+def view_of(matrix: wp.array(dtype=wp.float64), intrinsics: wp.vec4d, near: wp.float64):
+    """``matrix``: the 16 numbers of a world-to-camera matrix, on the device."""
+    v = View()
+    v.R = wp.mat33d(matrix[0], matrix[1], matrix[2], matrix[4], matrix[5], matrix[6], matrix[8], matrix[9], matrix[10])
+    v.t = wp.vec3d(matrix[3], matrix[7], matrix[11])
+    v.focal = wp.vec2d(intrinsics[0], intrinsics[1])
+    v.centre = wp.vec2d(intrinsics[2], intrinsics[3])
+    v.near = near
+    return v
+
+
+@wp.func
+def place(mean: wp.vec3d, log_scale: wp.vec3d, quat: wp.vec4d, v: View):
+    """The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same number."""
+    one, two = d(1.0), d(2.0)
+    p = Placed()
+    n = one / wp.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
+    w, x, y, z = quat[0] * n, quat[1] * n, quat[2] * n, quat[3] * n
+    p.local = wp.mat33d(
+        one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y),
+        two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x),
+        two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y),
+    )  # fmt: skip
+    p.inverse = n
+    top = wp.max(wp.max(log_scale[0], log_scale[1]), log_scale[2])
+    m = wp.exp(top)
+    p.m = m
+    p.axes = wp.vec3d(wp.exp(log_scale[0] - top), wp.exp(log_scale[1] - top), wp.exp(log_scale[2] - top))
+    c = v.R * mean + v.t
+    p.centre = c
+    p.B = v.R * p.local
+    p.anchor = wp.vec3d(d(0.0), rounded(v.centre[0]), rounded(v.centre[1]))  # near or behind the camera, or nothing is seen of it
+    if c[2] > _ANCHOR_RADII * m and c[2] + m > v.near:
+        p.anchor = wp.vec3d(
+            m * rounded(c[2] / m), rounded(v.focal[0] * c[0] / c[2] + v.centre[0]), rounded(v.focal[1] * c[1] / c[2] + v.centre[1])
+        )
+    return p
+
+
+@wp.func
+def whiten(p: Placed, v: View):
+    r = Ray()
+    r.tc = p.anchor[0] / p.m
+    r.ref = wp.vec3d((p.anchor[1] - v.centre[0]) / v.focal[0], (p.anchor[2] - v.centre[1]) / v.focal[1], d(1.0))
+    r.w = r.tc * r.ref - p.centre / p.m
+    x, y, z = p.axes[0], p.axes[1], p.axes[2]
+    r.A = wp.mat33d(
+        p.B[0, 0] / x, p.B[1, 0] / x, p.B[2, 0] / x,
+        p.B[0, 1] / y, p.B[1, 1] / y, p.B[2, 1] / y,
+        p.B[0, 2] / z, p.B[1, 2] / z, p.B[2, 2] / z,
+    )  # fmt: skip
+    r.e0 = r.A * r.ref
+    r.ex = wp.vec3d(r.A[0, 0], r.A[1, 0], r.A[2, 0]) / v.focal[0]
+    r.ey = wp.vec3d(r.A[0, 1], r.A[1, 1], r.A[2, 1]) / v.focal[1]
+    r.xa = r.A * r.w
+    aa = wp.dot(r.e0, r.e0)
+    r.tu = -r.tc * wp.dot(r.ex, r.e0) / aa
+    r.tv = -r.tc * wp.dot(r.ey, r.e0) / aa
+    r.near = (v.near - p.anchor[0]) / p.m
+    return r

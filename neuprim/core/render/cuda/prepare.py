@@ -1,0 +1,306 @@
+# mypy: disable-error-code="valid-type, no-untyped-def"
+"""The per-primitive stage on the device, one thread a primitive, float64 inside: the twin of :mod:`neuprim.core.render.cpu.prepare`.
+
+Three differences of form: rows are float4 with the colours in them, neurons stay in the model's order, and TU and TV are 0 where a caller's
+``forced`` asks for float64, not only where this stage does. It also counts each primitive's tiles, see
+:mod:`neuprim.core.render.cuda.binning`.
+"""
+
+import functools
+from typing import Any
+
+from neuprim.core.compute.warp import wp
+from neuprim.core.render.cpu import layout as wide_layout
+from neuprim.core.render.cpu.limits import (
+    CULLED,
+    CUT,
+    FLOAT32_MAX,
+    FLOAT64_ANCHOR,
+    FLOAT64_PIXELS,
+    FLOAT64_RADII,
+    FLOAT64_RATIO,
+    FLOAT64_RATIO_NEAR,
+    FLOAT64_TURNS,
+    NON_FINITE,
+    VISIBLE,
+)
+from neuprim.core.render.cuda import layout as L
+from neuprim.core.render.cuda.placement import EXACT, Placed, Ray, View, place, rounded, view_of, whiten
+from neuprim.core.render.cuda.silhouette import ellipse, tile_range
+
+__all__ = ["prepare_kernel", "wide_kernel"]
+
+d, f = wp.float64, wp.float32
+_VISIBLE, _CULLED, _NON_FINITE = wp.constant(wp.uint8(VISIBLE)), wp.constant(wp.uint8(CULLED)), wp.constant(wp.uint8(NON_FINITE))
+_FLOAT32_MAX, _CUT = wp.constant(d(FLOAT32_MAX)), wp.constant(d(CUT))
+_RADII, _TURNS = wp.constant(d(FLOAT64_RADII)), wp.constant(d(FLOAT64_TURNS))
+_ANCHOR, _PIXELS = wp.constant(d(FLOAT64_ANCHOR**2)), wp.constant(d(FLOAT64_PIXELS))
+_RATIO, _RATIO_NEAR = wp.constant(d(FLOAT64_RATIO)), wp.constant(d(FLOAT64_RATIO_NEAR))
+_UNBOUNDED = wp.constant(d(wide_layout.UNBOUNDED))
+_E0, _EX, _EY, _XA, _XU, _XV, _REST, _NEURONS = L.E0, L.EX, L.EY, L.XA, L.XU, L.XV, L.REST, L.NEURONS
+_TILE = L.TILE
+
+_STORE = """
+#if defined(__CUDA_ARCH__)
+    *reinterpret_cast<float4*>(wp::address(rows, i, j)) = make_float4(x, y, z, w);
+#else
+    *wp::address(rows, i, j) = wp::vec_t<4, float>(x, y, z, w);
+#endif
+"""
+
+
+@wp.func_native(_STORE)
+def store(rows: wp.array2d(dtype=wp.vec4), i: int, j: int, x: float, y: float, z: float, w: float): ...
+
+
+@wp.func
+def _put(rows: wp.array2d(dtype=wp.vec4), i: int, j: int, v: wp.vec3d, scalar: wp.float64):
+    """16 bytes at once: Warp's own store of a vector is four."""
+    store(rows, i, j, f(v[0]), f(v[1]), f(v[2]), f(scalar))
+
+
+@wp.func
+def _largest(v: wp.vec3d):
+    return wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))
+
+
+@wp.func
+def _spread(p: Placed, i: int, j: int):
+    """Entry (i, j) of the covariance in camera axes, in units of m^2."""
+    return wp.dot(wp.cw_mul(p.B[i], p.B[j]), wp.cw_mul(p.axes, p.axes))
+
+
+@wp.func
+def _extent(p: Placed, v: View, axis: int, s22: wp.float64):
+    """Where the silhouette begins and ends on the screen along one axis, in pixels; all of it lies before the camera plane."""
+    z, ci = p.centre[2] / p.m, p.centre[axis] / p.m
+    sii, siz = _spread(p, axis, axis), _spread(p, axis, 2)
+    D = z * z * sii - d(2.0) * ci * z * siz + ci * ci * s22 - (sii * s22 - siz * siz)
+    root, mid, den = wp.sqrt(wp.max(D, d(0.0))), ci * z - siz, z * z - s22
+    return wp.vec2d(v.focal[axis] * (mid - root) / den + v.centre[axis], v.focal[axis] * (mid + root) / den + v.centre[axis])
+
+
+@wp.struct
+class Outline:
+    """A silhouette's row spans, see :mod:`neuprim.core.render.cpu.layout`; whether it is an ellipse, and float32 too coarse for it."""
+
+    skew: wp.float64
+    xc: wp.float64
+    yc: wp.float64
+    hx: wp.float64
+    hy: wp.float64
+    delicate: wp.int32
+
+
+@wp.func
+def _outline(p: Placed, r: Ray, width: int, height: int):
+    """|e|^2 - |x x e|^2 > 0 is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half width from (HX, HY)."""
+    o = Outline()
+    o.hx = _UNBOUNDED
+    o.hy = _UNBOUNDED
+    k0 = wp.cross(r.xa, r.e0)
+    ka = wp.cross(r.xa, r.ex) + r.tc * wp.cross(r.ex, r.e0)
+    kb = wp.cross(r.xa, r.ey) + r.tc * wp.cross(r.ey, r.e0)
+    q0, q1, q2 = wp.dot(r.e0, r.e0) - wp.dot(k0, k0), wp.dot(r.e0, r.ex) - wp.dot(k0, ka), wp.dot(r.e0, r.ey) - wp.dot(k0, kb)
+    q3, q4, q5 = wp.dot(r.ex, r.ex) - wp.dot(ka, ka), wp.dot(r.ex, r.ey) - wp.dot(ka, kb), wp.dot(r.ey, r.ey) - wp.dot(kb, kb)
+    d0, d1, d2 = q1 * q1 - q3 * q0, q1 * q4 - q3 * q2, q4 * q4 - q3 * q5
+    if q3 < d(0.0) and d2 < d(0.0):
+        yc = -d1 / d2
+        peak = d0 + d1 * yc
+        if peak > d(0.0):
+            o.skew = rounded(-q4 / q3)
+            o.xc = rounded(-(q1 + q4 * yc) / q3)
+            o.yc = rounded(yc)
+            o.hx = rounded(wp.sqrt(peak) / -q3)
+            o.hy = rounded(wp.sqrt(-peak / d2))
+            # the pixel offsets that meet the silhouette on the screen
+            ux, uy, half = p.anchor[1], p.anchor[2], d(0.5)
+            tall = wp.min(wp.abs(yc) + o.hy, wp.max(wp.abs(half - uy), wp.abs(d(height) - half - uy)))
+            broad = wp.abs(o.xc) + wp.abs(o.skew) * (wp.abs(yc) + o.hy) + o.hx
+            broad = wp.min(broad, wp.max(wp.abs(half - ux), wp.abs(d(width) - half - ux)))
+            # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted needle each is many radii
+            # of its thin axis, and they cancel
+            slide = wp.abs(r.tu) * broad + wp.abs(r.tv) * tall
+            if slide * (wp.sqrt(wp.dot(r.ex, r.ex)) * broad + wp.sqrt(wp.dot(r.ey, r.ey)) * tall) > _RADII:
+                o.delicate = 1
+            xu, xv = r.tc * r.ex + r.tu * r.e0, r.tc * r.ey + r.tv * r.e0
+            for a in range(3):
+                if wp.abs(xu[a]) * broad + wp.abs(xv[a]) * tall > _RADII:
+                    o.delicate = 1
+    return o
+
+
+@wp.func
+def _wave(w: wp.vec3d, p: Placed, turns: wp.float64):
+    """A neuron's frequencies on whitened axes, in turns."""
+    t = wp.transpose(p.local) * w
+    return wp.vec3d(turns * p.axes[0] * t[0], turns * p.axes[1] * t[1], turns * p.axes[2] * t[2])
+
+
+@functools.cache
+def prepare_kernel(double: bool) -> Any:
+    """Fills rows, spans, boxes, depth, status and counts of every primitive from float32 or float64 parameters; dim (N,).
+
+    ``counts`` (2, N): tiles reached, and 1 where float32 is too coarse and something is seen. ``bad`` (1,): the first primitive that is not
+    finite, its colours included; otherwise left as it is.
+    """
+    real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
+    def prepare(
+        means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4),
+        W1: wp.array2d(dtype=vec3), b1: wp.array2d(dtype=real), w2: wp.array2d(dtype=real), b2: wp.array(dtype=real),
+        palette: wp.array2d(dtype=wp.float32), forced: wp.array(dtype=wp.bool),
+        matrix: wp.array(dtype=wp.float64), intrinsics: wp.vec4d, width: int, height: int, near: wp.float64, turns: wp.float64, edge: int,
+        neurons: int, channels: int,
+        rows: wp.array2d(dtype=wp.vec4), spans: wp.array2d(dtype=wp.vec4), boxes: wp.array(dtype=wp.vec4i), depth: wp.array(dtype=wp.float64),
+        status: wp.array(dtype=wp.uint8), counts: wp.array2d(dtype=wp.int32), bad: wp.array(dtype=wp.int32),
+    ):  # fmt: skip
+        i = wp.tid()
+        v = view_of(matrix, intrinsics, near)
+        p = place(wp.vec3d(means[i]), wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), v)
+        r = whiten(p, v)
+        m, z, ux, uy = p.m, p.centre[2], p.anchor[1], p.anchor[2]
+        offset = d(b2[i])
+        biggest = wp.max(wp.max(_largest(r.xa), _largest(r.e0)), wp.max(wp.max(r.tc, wp.abs(r.near)), wp.max(m, wp.abs(offset))))
+        total = r.tc + r.near + m + offset
+        for a in range(3):
+            total += r.e0[a] + r.ex[a] + r.ey[a] + r.xa[a]
+        fastest = d(0.0)
+        for k in range(neurons):
+            wave, phase, amplitude = _wave(wp.vec3d(W1[i, k]), p, turns), turns * d(b1[i, k]), d(w2[i, k])
+            speed = wp.sqrt(wp.dot(wave, wave))
+            fastest = wp.max(fastest, speed)
+            biggest = wp.max(biggest, wp.max(speed, wp.abs(amplitude)))
+            total += speed + phase + amplitude
+            _put(rows, i, _NEURONS + k, wave, phase - wp.rint(phase))
+        column = _NEURONS + neurons
+        for q in range((neurons + 3) // 4):
+            four = wp.vec4()
+            for j in range(4):
+                if 4 * q + j < neurons:
+                    four[j] = f(w2[i, 4 * q + j])
+            store(rows, i, column + q, four[0], four[1], four[2], four[3])
+        column += (neurons + 3) // 4
+        for q in range((channels + 3) // 4):
+            four = wp.vec4()
+            for j in range(4):
+                if 4 * q + j < channels:
+                    four[j] = palette[i, 4 * q + j]
+                    total += d(four[j])
+            store(rows, i, column + q, four[0], four[1], four[2], four[3])
+
+        delicate = wp.int32(0)
+        thinnest, ratio = wp.min(wp.min(p.axes[0], p.axes[1]), p.axes[2]), _RATIO
+        if r.tc == d(0.0):
+            ratio = _RATIO_NEAR
+        # a centre far from the anchor, in the thinnest axis, among them
+        if fastest > _TURNS or wp.max(wp.abs(ux), wp.abs(uy)) > _PIXELS or wp.dot(r.xa, r.xa) > _ANCHOR or thinnest * ratio < d(1.0):
+            delicate = 1
+        if forced:
+            if forced[i]:
+                delicate = 1
+        s22 = _spread(p, 2, 2)
+        reach = wp.sqrt(m * m * s22)
+        if edge > 0 and z - reach < near + _CUT * reach:  # only there are integrals of cut chords with a soft edge
+            delicate = 1
+
+        state, box, tiles = int(_CULLED), wp.vec4i(), wp.int32(0)
+        o = Outline()
+        if not wp.isfinite(total):
+            state = int(_NON_FINITE)
+        elif z + reach > near:
+            if biggest > _FLOAT32_MAX:  # so small against its distance that no pixel centre can hit it, or a scale or weight beyond float32
+                if m > d(1.0):
+                    state = int(_NON_FINITE)
+            else:
+                x0, x1, y0, y1 = d(0.0), d(width), d(0.0), d(height)
+                o.hx = _UNBOUNDED
+                o.hy = _UNBOUNDED
+                if z - reach > d(1e-3) * reach:  # wholly in front of the camera plane: the silhouette is an ellipse
+                    half, one = d(0.5), d(1.0)
+                    across, down = _extent(p, v, 0, s22), _extent(p, v, 1, s22)
+                    x0, x1 = wp.max(x0, wp.ceil(across[0] - half)), wp.min(x1, wp.floor(across[1] - half) + one)
+                    y0, y1 = wp.max(y0, wp.ceil(down[0] - half)), wp.min(y1, wp.floor(down[1] - half) + one)
+                    o = _outline(p, r, width, height)
+                    if o.delicate > 0:
+                        delicate = 1
+                if x1 > x0 and y1 > y0:
+                    box = wp.vec4i(int(x0), int(y0), int(x1), int(y1))
+                    state = int(_VISIBLE)
+
+        xu, xv, tu, tv = r.tc * r.ex, r.tc * r.ey, d(0.0), d(0.0)
+        if delicate == 0:  # float64 does not slide
+            xu, xv, tu, tv = xu + r.tu * r.e0, xv + r.tv * r.e0, d(r.tu), d(r.tv)
+        if state != int(_VISIBLE):
+            delicate = 0
+        _put(rows, i, _E0, r.e0, ux)
+        _put(rows, i, _EX, r.ex, uy)
+        _put(rows, i, _EY, r.ey, r.near)
+        _put(rows, i, _XA, r.xa, offset)
+        _put(rows, i, _XU, xu, tu)
+        _put(rows, i, _XV, xv, tv)
+        store(rows, i, _REST, f(r.tc), f(m), f(p.anchor[0]), f(delicate))
+        store(spans, i, 0, f(o.skew), f(o.xc), f(o.yc), f(o.hx))
+        store(spans, i, 1, f(o.hy), f(0.0), f(0.0), f(0.0))
+        boxes[i] = box
+        depth[i] = z
+        status[i] = wp.uint8(state)
+        if state == int(_VISIBLE):
+            e = ellipse(spans[i, 0], spans[i, 1][0], f(ux), f(uy), box)
+            for ty in range(box[1] // _TILE, (box[3] - 1) // _TILE + 1):
+                lo_hi = tile_range(e, ty)
+                tiles += wp.max(lo_hi[1] - lo_hi[0], 0)
+        if state == int(_NON_FINITE):
+            wp.atomic_min(bad, 0, i)
+        counts[0, i] = tiles
+        counts[1, i] = delicate
+
+    return prepare
+
+
+@wp.func
+def _put_wide(wide: wp.array2d(dtype=wp.float64), n: int, column: int, v: wp.vec3d):
+    for a in range(3):
+        wide[n, column + a] = v[a]
+
+
+@functools.cache
+def wide_kernel(double: bool) -> Any:
+    """Fills ``wide``, the float64 rows of primitives ``which``, which the pixel stage draws in float64; dim (M,)."""
+    real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
+    def prepare_wide(
+        which: wp.array(dtype=wp.int32), means: wp.array(dtype=vec3), log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4),
+        W1: wp.array2d(dtype=vec3), b1: wp.array2d(dtype=real), w2: wp.array2d(dtype=real), b2: wp.array(dtype=real),
+        matrix: wp.array(dtype=wp.float64), intrinsics: wp.vec4d, near: wp.float64, turns: wp.float64, neurons: int,
+        wide: wp.array2d(dtype=wp.float64),
+    ):  # fmt: skip
+        n = wp.tid()
+        i = which[n]
+        v = view_of(matrix, intrinsics, near)
+        p = place(wp.vec3d(means[i]), wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), v)
+        r = whiten(p, v)
+        _put_wide(wide, n, wide_layout.E0, r.e0)
+        _put_wide(wide, n, wide_layout.EX, r.ex)
+        _put_wide(wide, n, wide_layout.EY, r.ey)
+        _put_wide(wide, n, wide_layout.XA, r.xa)
+        _put_wide(wide, n, wide_layout.XU, r.tc * r.ex + r.tu * r.e0)
+        _put_wide(wide, n, wide_layout.XV, r.tc * r.ey + r.tv * r.e0)
+        wide[n, wide_layout.TC] = r.tc
+        wide[n, wide_layout.TU] = r.tu
+        wide[n, wide_layout.TV] = r.tv
+        wide[n, wide_layout.UX] = p.anchor[1]
+        wide[n, wide_layout.UY] = p.anchor[2]
+        wide[n, wide_layout.NEAR] = r.near
+        wide[n, wide_layout.OFFSET] = d(b2[i])
+        wide[n, wide_layout.UNIT] = p.m
+        wide[n, wide_layout.ANCHOR_Z] = p.anchor[0]
+        for k in range(neurons):
+            column, phase = wide_layout.NEURONS + wide_layout.PER_NEURON * k, turns * d(b1[i, k])
+            _put_wide(wide, n, column, _wave(wp.vec3d(W1[i, k]), p, turns))
+            wide[n, column + wide_layout.PHASE] = phase - wp.rint(phase)
+            wide[n, column + wide_layout.AMPLITUDE] = d(w2[i, k])
+
+    return prepare_wide

@@ -1,0 +1,89 @@
+"""What the threads of a block do together, on the device and, in the same words, on Warp's CPU blocks.
+
+Every thread of the block has to call them. On the CPU a static buffer takes the place of the hardware: its threads take turns between two
+``WP_TILE_SYNC``.
+"""
+
+# annotations are values here: Warp reads them, and cannot find what a function's own scope names in a text
+import functools
+from collections.abc import Callable
+from typing import Any
+
+from neuprim.core.compute.warp import wp
+from neuprim.core.render.cuda.layout import WARP
+
+__all__ = ["any_thread", "row_sums", "row_type"]
+
+_ANY = """
+#if defined(__CUDA_ARCH__)
+    return __syncthreads_or(yes);
+#else
+    static int answer;
+    WP_TILE_SYNC();
+    answer = 0;
+    WP_TILE_SYNC();
+    if (yes) answer = 1;
+    WP_TILE_SYNC();
+    return answer;
+#endif
+"""
+
+
+@wp.func_native(_ANY)  # type: ignore[untyped-decorator]
+def any_thread(yes: int) -> int:
+    """Whether any thread of the block says so."""
+    ...
+
+
+def _halving(width: int) -> str:
+    """Every step keeps half of the values and adds those of a lane's partner: 31 shuffles per 32 values instead of 160.
+
+    Lane l ends with values l m to l m + m - 1, m = width/32. Loops run over constants alone: over two counters they would not be unrolled,
+    and the values would go to memory.
+    """
+    steps = ""
+    for bit in (16, 8, 4, 2, 1):
+        half = width * bit // WARP
+        steps += f"""
+    #pragma unroll
+    for (int i = 0; i < {half}; ++i) {{
+        const float low = x[i], high = x[i + {half}];
+        x[i] = (lane & {bit} ? high : low) + __shfl_xor_sync(0xffffffffu, lane & {bit} ? low : high, {bit});
+    }}"""
+    each = width // WARP
+    return f"""
+#if defined(__CUDA_ARCH__)
+{steps}
+    #pragma unroll
+    for (int i = 0; i < {each}; ++i) out.data[at + {each} * lane + i] = x[i];
+#else
+    static float every[{WARP}][{width}];
+    for (int c = 0; c < {width}; ++c) every[lane][c] = x[c];
+    WP_TILE_SYNC();
+    float a[{WARP}];
+    for (int c = {each} * lane; c < {each} * lane + {each}; ++c) {{
+        for (int l = 0; l < {WARP}; ++l) a[l] = every[l][c];
+        for (int bit = {WARP // 2}; bit > 0; bit >>= 1)
+            for (int l = 0; l < bit; ++l) a[l] += a[l + bit];
+        out.data[at + c] = a[0];
+    }}
+    WP_TILE_SYNC();
+#endif
+"""
+
+
+@functools.cache
+def row_type(width: int) -> Any:
+    """A gradient row in registers."""
+    return wp.types.vector(length=width, dtype=wp.float32)
+
+
+@functools.cache
+def row_sums(width: int) -> Callable[..., Any]:
+    """A function (x, lane, out, at) that writes the sums of ``width`` values over a warp's lanes to ``out[at:]``; a multiple of 32."""
+    row = row_type(width)
+
+    @wp.func_native(_halving(width))  # type: ignore[untyped-decorator]
+    def sums(x: row, lane: int, out: wp.array(dtype=wp.float32), at: int): ...  # type: ignore
+
+    return sums  # type: ignore[no-any-return]

@@ -1,0 +1,211 @@
+"""The per-primitive stage in Warp makes what numba makes, and so does its chain rule; on Warp's CPU blocks, and on a card where there is one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
+
+from neuprim.core.render.cpu import layout as P
+from neuprim.core.render.cpu.limits import CULLED
+from neuprim.core.render.cuda import layout as L
+from neuprim.core.render.cuda.frame import NAMES, Frame, NotFinite
+from neuprim.core.render.cuda.prepare_backward import prepare_backward
+from tests.core.render.cuda.twin import CASES, DEVICES, Array, Case, both, frame_of, numba_frame, numpy, ulps
+
+PLACES = {
+    P.E0: (L.E0, 0), P.EX: (L.EX, 0), P.EY: (L.EY, 0), P.XA: (L.XA, 0), P.XU: (L.XU, 0), P.XV: (L.XV, 0),
+    P.TC: (L.REST, 0), P.TU: (L.XU, 3), P.TV: (L.XV, 3), P.UX: (L.E0, 3), P.UY: (L.EX, 3), P.NEAR: (L.EY, 3),
+    P.OFFSET: (L.XA, 3), P.UNIT: (L.REST, 1), P.ANCHOR_Z: (L.REST, 2),
+}  # fmt: skip
+"""Column of a number of the numba backend's rows -> its float4 and place in it; vectors have three."""
+
+
+def geometry(frame: Frame) -> Array:
+    """The numbers of the rows before the neurons, as the numba backend orders them."""
+    rows = numpy(frame.rows)
+    out = np.empty((len(rows), P.NEURONS), np.float32)
+    for column, (four, place) in PLACES.items():
+        width = 3 if place == 0 and column < P.TC else 1
+        out[:, column : column + width] = rows[:, four, place : place + width]
+    return out
+
+
+def neurons(frame: Frame) -> Array:
+    """(N, K, 5)."""
+    rows, K = numpy(frame.rows), frame.neurons
+    amplitudes = rows[:, L.amplitudes(K) : L.colours(K)].reshape(len(rows), -1)[:, :K, None]
+    return np.concatenate([rows[:, L.NEURONS : L.NEURONS + K], amplitudes], 2)
+
+
+def norm(rows: Array) -> Array:
+    """(n,) length of each row."""
+    length: Array = np.linalg.norm(rows, axis=1)
+    return length
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("name", CASES)
+def test_rows_are_numbas(name: str, device: str) -> None:
+    numba, frame = both(name, device)
+    seen = numba.visible
+    assert seen.sum() > 10
+    assert (numpy(frame.status) == numba.status).all()
+    assert (numpy(frame.boxes) == numba.boxes).all()
+    assert np.abs(numpy(frame.depth) - numba.depth).max() < 1e-12 * np.abs(numba.depth).max()
+    assert ulps(numpy(frame.spans)[seen], numba.spans[seen]).max() <= 1
+    assert ulps(geometry(frame)[seen], numba.rows[seen, : P.NEURONS]).max() <= 1
+    assert ulps(neurons(frame)[seen], numba.neurons(numba.rows, np.arange(len(seen)))[seen]).max(initial=0) <= 1
+    painted = numpy(frame.rows)[:, L.colours(frame.neurons) :].reshape(len(seen), -1)
+    palette = CASES[name].tensors()["colors"].float().numpy()
+    assert len(painted) < len(palette) or (painted[:, : frame.channels] == palette).all()
+    assert (painted[:, frame.channels :] == 0).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("name", CASES)
+def test_delicate_primitives_are_numbas(name: str, device: str) -> None:
+    numba, frame = both(name, device)
+    assert numpy(frame.which).tolist() == numba.which.tolist()
+    slots = np.full(len(numba.status), -1)
+    slots[numba.which] = np.arange(len(numba.which))
+    assert (numpy(frame.slots) == slots).all()
+    assert (numpy(frame.rows)[:, L.REST, 3] == (slots >= 0)).all()
+    wide = numpy(frame.wide)
+    assert wide.shape == (len(numba.which), L.wide_width(frame.neurons))
+    # what float64 leaves of differences: of points at the anchor's depth, of the steps between them, of directions nearly orthogonal
+    tc, e0, step = numba.wide[:, P.TC], norm(numba.wide[:, P.E0 : P.EX]), norm(numba.wide[:, P.EX : P.XA])
+    cancels = {P.XA: tc * e0, P.XU: tc * step, P.XV: tc * step, P.TU: tc * step / e0, P.TV: tc * step / e0}
+    for column in PLACES:
+        columns = slice(column, column + (3 if column < P.TC else 1))
+        own, theirs = wide[:, columns], numba.wide[:, columns]
+        scale = norm(theirs) + cancels.get(column, 0.0)
+        assert (np.abs(own - theirs) <= 1e-14 * scale[:, None]).all(), column
+    ordered = numba.neurons(numba.wide, numba.which).reshape(len(wide), L.PER_NEURON * frame.neurons)
+    assert np.abs(wide[:, P.NEURONS :] - ordered).max(initial=0) <= 1e-14 * np.abs(ordered).max(initial=0)
+
+
+def test_the_cases_have_delicate_primitives_and_others() -> None:
+    """Of each kind, and silhouettes of each kind, somewhere."""
+    found = np.zeros((2, 2), np.int64)
+    for name in CASES:
+        numba, _ = both(name, "cpu")
+        for delicate in (False, True):
+            bounded = numba.spans[numba.visible & (numba.delicate == delicate), P.HY] < P.UNBOUNDED
+            found[int(delicate)] += bounded.sum(), (~bounded).sum()
+    assert (found[1] > 100).all() and found[0, 0] > 100
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_forced_primitives_are_drawn_in_float64(device: str) -> None:
+    case = CASES["K=8"]
+    t = case.tensors()
+    forced = torch.arange(case.count, device=device) % 3 == 0
+    free, frame = frame_of(case, t, device), frame_of(case, t, device, forced)
+    assert free.which.numel() == 0
+    wanted = (forced & (free.boxes[:, 2] > 0)).nonzero()[:, 0]
+    assert frame.which.tolist() == wanted.tolist() and wanted.numel() > 100
+    assert (frame.rows[wanted][:, [L.XU, L.XV], 3] == 0).all(), "float64 does not slide"
+    assert torch.equal(frame.rows[~forced], free.rows[~forced])
+    assert torch.equal(frame.lists.ids, free.lists.ids)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(
+    ("name", "value"), [(n, math.nan) for n in (*NAMES, "colors")] + [("log_scales", 95.0), ("w2", -math.inf), ("quats", 0.0)]
+)
+def test_the_first_primitive_that_is_not_finite_is_named(name: str, value: float, device: str) -> None:
+    case = CASES["K=8"]
+    t = case.tensors()
+    t[name][[77, 310]] = value
+    with pytest.raises(NotFinite) as error:
+        frame_of(case, t, device)
+    assert error.value.row == 77
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_small_discs_beyond_float32_are_not_seen(device: str) -> None:
+    """So thin and small that float32 has no number for a ray in their axes, which is no error."""
+    case = CASES["K=8"]
+    t = case.tensors()
+    t["log_scales"][::2] = torch.tensor([-129.5, -40.0, -40.0])
+    numba, frame = numba_frame(case, t), frame_of(case, t, device)
+    assert (numpy(frame.status) == numba.status).all() and (numba.status[::2] == CULLED).all() and not numpy(frame.boxes)[::2].any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("name", CASES)
+def test_gradients_are_numbas(name: str, device: str) -> None:
+    numba, frame = both(name, device)
+    seen = numba.visible
+    g = torch.Generator().manual_seed(5)
+    grads = torch.randn(len(seen), L.gradient_width(frame.neurons, frame.channels), generator=g)
+    grads[:, L.G_WEIGHT] = (torch.rand(len(seen), generator=g) - 0.3).clamp(min=0)
+    grads[torch.from_numpy(~seen)] = 0.0
+    expected, view = numba.backward(grads.numpy())
+    found, found_view = prepare_backward(frame, grads.to(device), True)
+    for parameter, own, theirs in zip(NAMES, found, expected, strict=True):
+        assert own.dtype == torch.float32 and own.shape == theirs.shape
+        a, b = numpy(own).reshape(len(seen), -1).astype(np.float64), theirs.reshape(len(seen), -1).astype(np.float64)
+        if parameter == "log_scales":  # numba takes its frequencies from the float32 row, and the longest axis is a sum that cancels
+            W = numba.neurons(numba.rows, np.arange(len(seen)))[:, :, :3]
+            gw = grads.numpy()[:, L.G_NEURONS : L.G_NEURONS + L.PER_NEURON * frame.neurons].reshape(len(seen), frame.neurons, L.PER_NEURON)
+            scale = np.abs(b).max(1) + np.abs(W * gw[:, :, :3]).sum((1, 2))
+        else:
+            scale = np.abs(b).max(1, initial=0)
+        assert (np.abs(a - b).max(1, initial=0) <= 1e-6 * scale).all(), parameter
+        assert b.size == 0 or np.abs(b).max() > 0
+    assert found_view is not None and found_view.dtype == torch.float64
+    assert (np.abs(numpy(found_view) - view.sum(0)) <= 1e-12 * np.abs(view).sum(0)).all()
+    assert prepare_backward(frame, grads.to(device))[1] is None
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_rows_that_nothing_was_seen_of_give_zeros(device: str) -> None:
+    case = Case(3)
+    frame = frame_of(case, case.tensors(), device)
+    grads = torch.full((case.count, L.gradient_width(3, 3)), math.nan, device=device)
+    grads[:, L.G_WEIGHT] = 0.0
+    grads[7] = 1.0
+    found, view = prepare_backward(frame, grads, True)
+    assert view is not None and torch.isfinite(view).all() and view.abs().max() > 0
+    for own in found:
+        assert own[7].abs().max() > 0
+        assert (own[torch.arange(case.count, device=device) != 7] == 0).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_rerun_gives_the_same_bits(device: str) -> None:
+    case = CASES["inside"]
+    t = case.tensors()
+    one, two = frame_of(case, t, device), frame_of(case, t, device)
+    for name in ("rows", "wide", "slots", "which", "spans", "boxes", "depth", "status"):
+        assert torch.equal(getattr(one, name), getattr(two, name)), name
+    for name in ("starts", "ids", "tile_of", "first", "slots_of"):
+        assert torch.equal(getattr(one.lists, name), getattr(two.lists, name)), name
+    grads = torch.rand(case.count, L.gradient_width(8, 3), device=device)
+    assert all(torch.equal(a, b) for a, b in zip(prepare_backward(one, grads)[0], prepare_backward(two, grads)[0], strict=True))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_float64_parameters_are_not_rounded(device: str) -> None:
+    """A mix of dtypes is computed as float64 throughout."""
+    case = CASES["K=8"]
+    t = case.tensors()
+    mixed = t | {"means": t["means"].double() + 1e-9}
+    numba = numba_frame(case, {key: value.double() for key, value in mixed.items()})
+    frame = frame_of(case, mixed, device)
+    assert frame.double and np.abs(numpy(frame.depth) - numba.depth).max() < 1e-13
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_no_primitives(device: str) -> None:
+    case = Case(2, count=0)
+    frame = frame_of(case, case.tensors(), device)
+    assert frame.lists.pairs == 0 and frame.lists.first.tolist() == [0] and not frame.lists.starts.any()
+    found, view = prepare_backward(frame, torch.empty(0, L.gradient_width(2, 3), device=device), True)
+    assert all(len(own) == 0 for own in found) and view is not None and not view.any()

@@ -1,0 +1,182 @@
+"""One frame's arrays from the numba backend, in the cuda backend's form, and the scenes on which the two are compared."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.render.cpu import layout as P
+from neuprim.core.render.cpu.binning import TileLists, bin_primitives
+from neuprim.core.render.cpu.limits import NON_FINITE, VISIBLE
+from neuprim.core.render.cpu.prepare import prepare, prepare_backward, prepare_wide
+from neuprim.core.render.cuda import layout as L
+from neuprim.core.render.cuda.frame import NAMES, Frame, prepared
+from tests import scenes
+
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+Array = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene and how it is looked at."""
+
+    neurons: int
+    channels: int = 3
+    edge: int = 0
+    near: float = 0.01
+    dtype: torch.dtype = torch.float32
+    wild: bool = False
+    count: int = 500
+    scene: dict[str, Any] = field(default_factory=dict)
+    view: dict[str, Any] = field(default_factory=dict)
+    omega0: float = 30.0
+
+    @property
+    def turns(self) -> float:
+        return self.omega0 / (2 * math.pi)
+
+    @property
+    def camera(self) -> Camera:
+        return scenes.camera(**{"width": 150, "height": 110, **self.view})
+
+    def tensors(self) -> dict[str, Tensor]:
+        t = scenes.tensors(self.count, self.neurons, self.channels, seed=11, dtype=torch.float64, **self.scene)
+        if self.wild:
+            widen(t)
+        t["b2"] = t["b2"].reshape(-1)
+        return {name: value.to(self.dtype) for name, value in t.items()}
+
+
+def widen(t: dict[str, Tensor]) -> None:
+    """Needles, discs, specks and giants, before, around and behind the camera, some with fast neurons, some smaller than float32 can tell."""
+    g = torch.Generator().manual_seed(3)
+    count = len(t["means"])
+    t["means"] *= 5.0
+    t["log_scales"] = 9.0 * torch.rand(count, 3, generator=g, dtype=torch.float64) - 8.0
+    t["log_scales"][: count // 20] -= 75.0 * torch.rand(count // 20, 1, generator=g, dtype=torch.float64)
+    t["log_scales"][count // 20 : count // 10] += 3.0
+    t["W1"] *= (6.0 * torch.rand(count, 1, 1, generator=g, dtype=torch.float64) - 2.0).exp()
+
+
+CASES = {
+    "K=8": Case(8),
+    "K=0 C=1": Case(0, channels=1),
+    "K=3 C=5, float64": Case(3, channels=5, dtype=torch.float64),
+    "K=16 C=4": Case(16, channels=4, count=100),
+    "many small": Case(2, count=1500, scene={"radius": 0.03}),
+    "soft edge before the near plane": Case(2, edge=2, near=2.9),
+    "fast neurons": Case(8, omega0=300.0),
+    "inside": Case(8, view={"distance": 0.15, "fov": 70.0}),
+    "wild": Case(8, wild=True, count=2000, view={"distance": 2.0, "fov": 70.0}),
+    "wild, no neurons, soft edge": Case(0, edge=2, wild=True, count=2000, near=0.3),
+    "wild, principal point far off": Case(2, wild=True, count=2000, view={"shift": (-30000.0, 40.0), "fov": 0.5}),
+    "wild, principal point off": Case(2, edge=1, wild=True, count=2000, dtype=torch.float64, view={"shift": (60.0, -90.0)}),
+    "one pixel": Case(2, view={"width": 1, "height": 1, "fov": 5.0}),
+}
+
+
+@dataclass
+class Numba:
+    """What the numba backend makes of a frame; neurons by ``order``."""
+
+    case: Case
+    parameters: list[Array]
+    rows: Array
+    spans: Array
+    order: Array
+    boxes: Array
+    depth: Array
+    status: Array
+    delicate: Array
+    which: Array
+    wide: Array
+    lists: TileLists
+    R: Array
+    t: Array
+
+    @property
+    def visible(self) -> Array:
+        return self.status == VISIBLE
+
+    def neurons(self, rows: Array, which: Array) -> Array:
+        """(n, K, 5) neurons in the model's order, from rows of primitives ``which``."""
+        K = self.order.shape[1]
+        given = rows[:, P.NEURONS : P.NEURONS + P.PER_NEURON * K].reshape(len(rows), K, P.PER_NEURON)
+        out = np.empty_like(given)
+        np.put_along_axis(out, np.repeat(self.order[which].astype(np.int64)[:, :, None], P.PER_NEURON, 2), given, 1)
+        return out
+
+    def backward(self, grads: Array) -> tuple[list[Array], Array]:
+        """Gradients of the parameters, and (N, 3, 4) of the view, from the cuda backend's gradient rows."""
+        count, K = self.order.shape
+        own = np.zeros((count, P.gradient_width(K + K % 2, self.case.channels)), np.float32)
+        own[:, : P.G_NEURONS] = grads[:, : L.G_NEURONS]
+        given = grads[:, L.G_NEURONS : L.G_NEURONS + L.PER_NEURON * K].reshape(count, K, L.PER_NEURON)
+        ordered = np.take_along_axis(given, np.repeat(self.order.astype(np.int64)[:, :, None], L.PER_NEURON, 2), 1)
+        own[:, P.G_NEURONS : P.G_NEURONS + P.PER_NEURON * K] = ordered.reshape(count, -1)
+        out, view = [np.zeros(x.shape, np.float32) for x in self.parameters], np.zeros((count, 3, 4))
+        prepare_backward(
+            0, count, *self.parameters[:4], self.R, self.t, _intrinsics(self.case), self.case.near, self.case.turns, self.rows, self.order,
+            own, own[:, P.G_WEIGHT] > 0, *out, view, True,
+        )  # fmt: skip
+        return out, view
+
+
+def _intrinsics(case: Case) -> Array:
+    c = case.camera
+    return np.array([c.fx, c.fy, c.cx, c.cy])
+
+
+def numba_frame(case: Case, t: dict[str, Tensor]) -> Numba:
+    given = [t[name].numpy() for name in NAMES]
+    count, K = given[3].shape[:2]
+    neurons = K + K % 2
+    rows, spans = np.empty((count, P.row_width(neurons)), np.float32), np.zeros((count, P.SPAN_WIDTH), np.float32)
+    kinds, order = np.empty((count, neurons // 2), np.uint8), np.empty((count, K), np.uint8)
+    boxes, depth, status = np.empty((count, 4), np.int32), np.empty(count), np.empty(count, np.uint8)
+    delicate = np.empty(count, np.bool_)
+    camera, cam, view = case.camera, _intrinsics(case), case.camera.viewmat.double().numpy()
+    R, origin = np.ascontiguousarray(view[:3, :3]), np.ascontiguousarray(view[:3, 3])
+    prepare(
+        0, count, *given, R, origin, cam, np.array([camera.width, camera.height]), case.near, case.turns, case.edge,
+        rows, spans, kinds, order, boxes, depth, status, delicate,
+    )  # fmt: skip
+    which = np.flatnonzero(delicate & (status == VISIBLE))
+    wide = np.empty((len(which), rows.shape[1]))
+    prepare_wide(0, len(which), which, *given, R, origin, cam, case.near, case.turns, order, wide)
+    lists = bin_primitives(rows, spans, boxes, depth, status, camera.width, camera.height, 1)
+    return Numba(case, given, rows, spans, order, boxes, depth, status, delicate, which, wide, lists, R, origin)
+
+
+def both(name: str, device: str) -> tuple[Numba, Frame]:
+    """The same frame of both backends, of those primitives of a case that are finite."""
+    case = CASES[name]
+    t = case.tensors()
+    finite = torch.from_numpy(numba_frame(case, t).status != NON_FINITE)
+    t = {key: value[finite] for key, value in t.items()}
+    return numba_frame(case, t), frame_of(case, t, device)
+
+
+def frame_of(case: Case, t: dict[str, Tensor], device: str, forced: Tensor | None = None) -> Frame:
+    t = {key: value.to(device) for key, value in t.items()}
+    return prepared(t, t["colors"], case.camera, case.camera.viewmat, case.near, case.turns, case.edge, forced)
+
+
+def numpy(tensor: Tensor) -> Array:
+    array: Array = tensor.cpu().numpy()
+    return array
+
+
+def ulps(a: Array, b: Array) -> Array:
+    """Distance in units of the last place of float32."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        unit = np.spacing(np.maximum(np.abs(a), np.abs(b)).astype(np.float32)).astype(np.float64)
+        distance: Array = np.where(a == b, 0.0, np.abs(a.astype(np.float64) - b) / unit)
+    return distance

@@ -6,6 +6,7 @@ blurs.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -23,10 +24,15 @@ WINDOW = (np.exp(-(_x**2) / (2 * 1.5**2)) / np.exp(-(_x**2) / (2 * 1.5**2)).sum(
 _C1, _C2 = 0.01**2, 0.03**2
 
 
+@functools.cache
+def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.tensor(WINDOW, dtype=dtype, device=device)
+
+
 def _blurred(maps: Tensor) -> Tensor:
     """(M, H - 10, W - 10) of (M, H, W)."""
     M = len(maps)
-    window = torch.tensor(WINDOW, dtype=maps.dtype, device=maps.device).expand(M, 1, TAPS)
+    window = _window(maps.dtype, maps.device).expand(M, 1, TAPS)
     with torch.backends.cudnn.flags(enabled=False):
         down = conv2d(maps[None], window[..., None], groups=M)
         return conv2d(down, window[:, :, None], groups=M)[0]

@@ -8,7 +8,7 @@ from rich.console import Console
 
 import neuprim.core.render as rendering
 from neuprim.cli import doctor
-from tests.backends import BACKENDS
+from neuprim.core.render.backends import available
 
 
 def report() -> tuple[int, str]:
@@ -76,7 +76,7 @@ def test_the_oracle_works_here() -> None:
     assert doctor._probe("reference") is None
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", [backend.name for backend in available()])
 def test_a_backend_that_is_a_thousandth_off_does_not_work(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert doctor._probe(backend) is None
     genuine = rendering.render_lowered

@@ -18,6 +18,7 @@ from neuprim.core.cameras.rays import AnyCamera, RayCamera
 from neuprim.core.compute import device as hardware
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.model.forms import Constant, Cosine, RayNet
+from neuprim.core.notices import warn_once
 
 if TYPE_CHECKING:
     from neuprim.core.model.primitives import Lowered
@@ -291,8 +292,12 @@ def choose(lowered: Lowered, settings: RenderSettings, camera: AnyCamera | None 
     check_device(settings)
     faults = []
     for backend in candidates(settings, lowered.kind):
-        fault = backend.fault(lowered, camera, backend.place(settings))
+        place = backend.place(settings)
+        fault = backend.fault(lowered, camera, place)
         if fault is None:
+            if place != backend.devices[0]:
+                own = next((f"; renderer.backend={b.name} is made for it" for b in TABLE if b.devices[0] == place), "")
+                warn_once(f"renderer.backend={backend.name} is slow on the {place}, where only its tests draw{own}")
             return backend
         faults.append(f"renderer.backend={backend.name} {fault}")
     other = next((b for b in TABLE if b.fault(lowered, camera) is None), None)

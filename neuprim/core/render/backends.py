@@ -100,6 +100,10 @@ class Backend:
         """The kind of device that it draws on under these settings."""
         return self.devices[0] if settings.device == AUTO else settings.device
 
+    def computer(self, settings: RenderSettings) -> str:
+        """What it computes on under these settings, for a run's numbers."""
+        return self.device() if self.place(settings) == self.devices[0] else _processor()
+
     def absent(self, place: str) -> str | None:
         """Why it cannot draw on this kind of device here, as the rest of a sentence; None if it can."""
         if place not in self.devices:

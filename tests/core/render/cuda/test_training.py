@@ -75,7 +75,7 @@ def test_a_run_is_the_cpu_backends(task: str, tmp_path: Path, monkeypatch: pytes
             numbers.append(read_metrics(run(compose([*config, *more]))))
     one, other = numbers
     assert (one["backend"], other["backend"]) == ("cpu", "cuda")
-    assert one["primitives"] == other["primitives"]
+    assert one["primitives"] == other["primitives"] and one["device"] == other["device"]
     assert other["psnr"] == pytest.approx(one["psnr"], abs=0.2) and other["psnr"] > 5
 
 

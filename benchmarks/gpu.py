@@ -1,6 +1,7 @@
 """The CUDA backend on a card: parity with the float64 reference, times, frames per second, peak memory.
 
-    python benchmarks/gpu.py [--parts parity times kernels] [--scenes 5000 20000 100000 300000 1000000] [--sizes 800x800 1920x1080] [--record]
+    python benchmarks/gpu.py [--parts parity times kernels train] [--scenes 5000 20000 100000 300000 1000000] [--sizes 800x800 1920x1080]
+        [--chair DIR] [--fire DIR] [--trained chair fire lit_solids] [--record]
 
     parity    images and all gradients of small scenes (thin, deep, around the camera) for several forms against the reference, and reruns bit
               for bit; needs no card with --device cpu, on Warp's CPU blocks
@@ -8,6 +9,7 @@
               forward and backward pass, and a whole training step (L1 loss, Adam on every parameter), medians by CUDA events; frames per second, peak
               memory, primitive-pixel hits
     kernels   where a training step's time goes, kernel by kernel, of the scene with the most primitives up to 100,000
+    train     preset quick of each task with its usual steps on the card: ms a step, PSNR on the test views
 
 --record writes benchmarks/results/gpu/DEVICE.json. Times are absolute, of the device named there.
 """
@@ -138,12 +140,41 @@ def kernels(count: int, width: int, height: int) -> dict[str, dict[str, float]]:
     return found
 
 
+STEPS = {"chair": 2500, "fire": 4000, "smoke_fire": 4000, "lit_solids": 2600}
+"""Those of the recorded rows of the other benchmarks."""
+
+
+def train(names: list[str], folders: dict[str, Any]) -> list[dict[str, Any]]:
+    from shared.forms import SCENES
+    from shared.trials import Trial, begin
+
+    from neuprim.runs.fit import complete
+
+    table, rows = Table("scene", "primitives", "steps", "ms a step", "PSNR", "of it"), []
+    for name in names:
+        scene = SCENES[name]
+        words = (*scene.all_words(folders, name), "renderer.device=cuda")
+        fitted = begin(Trial(name, words, STEPS[name]))
+        for _ in range(20):  # kernels are compiled in the first steps
+            fitted.trainer.train_step()
+        before = fitted.trainer.elapsed
+        fitted = complete(fitted)
+        ms = 1e3 * (fitted.trainer.elapsed - before) / (STEPS[name] - 20)
+        metrics = fitted.metrics()
+        rows.append({"scene": name, "primitives": fitted.model.count, "steps": STEPS[name], "step_ms": ms, "psnr": metrics[scene.judged], "of": scene.judged})
+        table.row(name, fitted.model.count, STEPS[name], f"{ms:.2f}", f"{metrics[scene.judged]:.2f}", scene.judged)
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--parts", nargs="*", default=["parity", "times", "kernels"], choices=("parity", "times", "kernels"))
+    parser.add_argument("--parts", nargs="*", default=["parity", "times", "kernels", "train"], choices=("parity", "times", "kernels", "train"))
     parser.add_argument("--scenes", nargs="*", type=int, default=[5_000, 20_000, 100_000, 300_000, 1_000_000])
     parser.add_argument("--sizes", nargs="*", default=["800x800", "1920x1080"])
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"), help="of the part parity")
+    parser.add_argument("--chair", type=Path, help="a NeRF-synthetic folder")
+    parser.add_argument("--fire", type=Path, help="a folder of EmberGen's .vdb files")
+    parser.add_argument("--trained", nargs="*", default=["chair", "fire", "lit_solids"], choices=list(STEPS))
     parser.add_argument("--record", action="store_true")
     args = parser.parse_args()
     sizes = [tuple(int(x) for x in size.split("x")) for size in args.sizes]
@@ -154,6 +185,8 @@ def main() -> None:
         result["times"] = times(args.scenes, sizes)
     if "kernels" in args.parts:
         result["kernels"] = kernels(max((c for c in args.scenes if c <= 100_000), default=args.scenes[0]), *sizes[0])
+    if "train" in args.parts:
+        result["train"] = train(args.trained, vars(args))
     if args.record:
         RESULTS.mkdir(parents=True, exist_ok=True)
         path = RESULTS / (re.sub(r"[^a-z0-9]+", "_", result["device"].lower()).strip("_") + ".json")

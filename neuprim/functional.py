@@ -113,7 +113,8 @@ def rasterize(
         **settings: fields of :class:`neuprim.core.settings.RenderSettings`: ``backend``, ``near``, ``depth``, ``alpha_min``, …
 
     The primitive tensors share one dtype, float32 or float64; images have that dtype too. The cpu backend computes
-    pixels in float32 even so, the reference everything in float64. All tensors live on the CPU.
+    pixels in float32 even so, the reference everything in float64. They share one device, which images are on too; cameras and
+    backgrounds may be on the processor all the same.
 
     Returns:
         :class:`Rasterized`; no cameras (C = 0) and no primitives (N = 0) are fine.

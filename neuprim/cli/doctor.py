@@ -142,11 +142,15 @@ def _version_or(name: str, otherwise: str) -> str:
 def _cuda() -> Rows:
     import torch
 
+    from neuprim.core.render.backends import no_card
+
+    missing = no_card()
+    used = ("used by runs", "yes" if missing is None else f"no: {missing}")
     if torch.version.cuda is None:
-        return [("none", f"torch {torch.__version__} is a CPU build")]
+        return [("none", f"torch {torch.__version__} is a CPU build"), used]
     if not torch.cuda.is_available():
-        return [("none", f"torch {torch.__version__} has CUDA {torch.version.cuda}, but no device or driver is usable")]
-    rows: Rows = []
+        return [("none", f"torch {torch.__version__} has CUDA {torch.version.cuda}, but no device or driver is usable"), used]
+    rows: Rows = [used]
     for i in range(torch.cuda.device_count()):
         p = torch.cuda.get_device_properties(i)
         rows.append((f"cuda:{i}", f"{p.name}, {p.total_memory / 2**30:.1f} GiB, compute capability {p.major}.{p.minor}"))

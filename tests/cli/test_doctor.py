@@ -8,7 +8,9 @@ from rich.console import Console
 
 import neuprim.core.render as rendering
 from neuprim.cli import doctor
-from neuprim.core.render.backends import available
+from neuprim.core.compute import device
+from neuprim.core.render import backends
+from neuprim.core.render.backends import Backend
 
 
 def report() -> tuple[int, str]:
@@ -76,7 +78,7 @@ def test_the_oracle_works_here() -> None:
     assert doctor._probe("reference") is None
 
 
-@pytest.mark.parametrize("backend", [backend.name for backend in available()])
+@pytest.mark.parametrize("backend", [backend.name for backend in backends.available()])
 def test_a_backend_that_is_a_thousandth_off_does_not_work(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert doctor._probe(backend) is None
     genuine = rendering.render_lowered
@@ -88,3 +90,15 @@ def test_a_backend_that_is_a_thousandth_off_does_not_work(backend: str, monkeypa
     monkeypatch.setattr(rendering, "render_lowered", dimmer)
     reason = doctor._probe(backend)
     assert reason is not None and reason.startswith("drew 0.86")
+
+
+def test_it_says_whether_runs_use_a_card_and_why_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_probe", lambda name: None)
+    monkeypatch.setattr(device, "card_missing", lambda: "torch finds no CUDA device")
+    assert dict(doctor._cuda())["used by runs"] == "no: torch finds no CUDA device" and "used by runs" in report()[1]
+    monkeypatch.setattr(device, "card_missing", lambda: None)
+    row = Backend("card", lambda: pytest.fail("loaded"), missing=lambda: "pip install 'neuprim[cuda]'", devices=("cuda",))
+    monkeypatch.setattr(backends, "TABLE", (row, *backends.TABLE[-1:]))
+    assert dict(doctor._cuda())["used by runs"] == "no: pip install 'neuprim[cuda]'"
+    monkeypatch.setattr(backends, "TABLE", (replace(row, missing=lambda: None), *backends.TABLE[-1:]))
+    assert dict(doctor._cuda())["used by runs"] == "yes"

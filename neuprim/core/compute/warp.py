@@ -1,11 +1,12 @@
 """Warp, started as the kernels of :mod:`neuprim.core.render.cuda` need it, and the only place that launches one of them.
 
 A frame is a dozen launches with a hundred arrays. Warp's own way to make an array of a tensor and to pack it for a launch takes longer than
-the kernels of a small frame, so arrays are bare descriptors here, and on a card a kernel's launch is recorded once and given new arguments.
+the kernels of a small frame, so a kernel's launch is recorded once on each device, and its arguments are written over.
 """
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import os
 import threading
@@ -18,13 +19,18 @@ from torch import Tensor
 
 from neuprim.core.io import files
 
-__all__ = ["BLOCK", "OPTIONS", "array", "launch", "wp"]
+__all__ = ["BLOCK", "FAST", "OPTIONS", "array", "launch", "wp"]
 
 BLOCK = 256
 """Threads of a block where a kernel asks for nothing else."""
 
 OPTIONS = {"enable_backward": False, "fast_math": False, "max_unroll": 16}
 """Of every kernel's module: adjoints are written by hand, and divisions and roots are rounded properly."""
+
+FAST = {**OPTIONS, "fast_math": True}
+"""Of the pixel kernels in float32: approximate division, root and exponential, which a card computes to one or two units in the last place. Errors
+on an H100 were the same with and without (``benchmarks/gpu.py --parts parity``), and a third of the time of small forms goes. The processor
+ignores it."""
 
 
 def _start() -> None:
@@ -42,10 +48,18 @@ _start()
 _Bare: Any = type(wp.from_torch(torch.empty(1), return_ctype=True))
 
 
-class _Array(_Bare):  # type: ignore[misc]
-    """A descriptor of a tensor's memory, which it keeps alive."""
+class _Array:
+    """A tensor that a kernel takes as an array of ``dtype``, which may hold several numbers, those of the last dimension."""
 
-    tensor: Tensor
+    __slots__ = ("dtype", "tensor")
+
+    def __init__(self, tensor: Tensor, dtype: Any) -> None:
+        self.tensor, self.dtype = tensor, dtype
+
+
+def array(tensor: Tensor, dtype: Any) -> Any:
+    """A contiguous tensor as an argument of a kernel; ``dtype`` may take several numbers together, those of the last dimension."""
+    return _Array(tensor, dtype)
 
 
 @functools.cache
@@ -53,35 +67,69 @@ def _bytes(dtype: Any) -> int:
     return int(wp.types.type_size_in_bytes(dtype))
 
 
-def array(tensor: Tensor, dtype: Any) -> Any:
-    """A contiguous tensor as a Warp array of its memory; ``dtype`` may take several numbers together, those of the last dimension."""
+def _describe(given: _Array, into: Any) -> None:
+    """Write a tensor's address, shape and strides into a descriptor."""
+    tensor, whole = given.tensor, _bytes(given.dtype)
     assert tensor.is_contiguous(), "arrays of kernels are contiguous"
-    size, shape = tensor.element_size(), tensor.shape
-    whole = _bytes(dtype)
-    if whole != size:
-        assert shape[-1] * size == whole, f"{shape[-1]} numbers of {size} bytes; expected {whole} bytes together"
-        shape = shape[:-1]
+    shape, size = tensor.shape, tensor.element_size()
     ndim = len(shape)
-    strides, step = [0] * ndim, whole
-    for i in range(ndim - 1, -1, -1):
-        strides[i] = step
-        step *= shape[i]
-    made = _Array(tensor.data_ptr(), 0, ndim, shape, strides)
-    made.tensor = tensor
-    return made
+    if whole != size:
+        ndim -= 1
+        assert shape[ndim] * size == whole, f"{shape[ndim]} numbers of {size} bytes; expected {whole} bytes together"
+    into.data, into.ndim = tensor.data_ptr(), ndim
+    own, strides, step = into.shape, into.strides, whole
+    for k in range(ndim - 1, -1, -1):
+        own[k], strides[k] = shape[k], step
+        step *= shape[k]
 
 
-_recorded: dict[tuple[Any, int, int], Any] = {}
+def _packed(value: Any) -> Any:
+    """An argument as Warp takes it, of its own memory."""
+    if value is None:
+        return _Bare()
+    if isinstance(value, _Array):
+        made = _Bare()
+        _describe(value, made)
+        return made
+    return type(value)(*value) if isinstance(value, ctypes.Array) else value
+
+
+class _Recorded:
+    """A kernel's launch on one device, whose arguments are written over."""
+
+    def __init__(self, kernel: Any, dims: tuple[int, ...], inputs: Sequence[Any], device: Any, block: int) -> None:
+        packed = [_packed(value) for value in inputs]
+        self.command = wp.launch(kernel, dim=dims, inputs=packed, device=device, block_dim=block, record_cmd=True)
+        self.dims, self.packed = dims, packed
+        self.arguments = list(self.command.params[1:])
+
+    def launch(self, dims: tuple[int, ...], inputs: Sequence[Any], stream: Any) -> None:
+        if dims != self.dims:
+            self.command.set_dim(dims)
+            self.dims = dims
+        for value, own in zip(inputs, self.arguments, strict=True):
+            if type(value) is _Array:
+                _describe(value, own)
+            elif value is None:
+                own.data = 0
+            elif isinstance(value, ctypes.Array):
+                ctypes.memmove(own, value, ctypes.sizeof(own))
+            else:
+                own.value = value
+        self.command.launch(stream)
+
+
+_recorded: dict[tuple[Any, int, int], _Recorded] = {}
 _streams: dict[tuple[int, int], Any] = {}
 _turn = threading.Lock()  # a recorded launch has one set of arguments
 
 
 def _stream(device: torch.device) -> Any:
     """The caller's stream."""
-    current = torch.cuda.current_stream(device)
-    key = (current.device_index, current.cuda_stream)
+    index = torch.cuda.current_device() if device.index is None else device.index
+    key = (index, torch._C._cuda_getCurrentRawStream(index))
     if key not in _streams:
-        _streams[key] = wp.stream_from_torch(current)
+        _streams[key] = wp.stream_from_torch(torch.cuda.current_stream(device))
     return _streams[key]
 
 
@@ -96,21 +144,10 @@ def launch(kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], device:
     dims = (dim,) if isinstance(dim, int) else tuple(dim)
     if 0 in dims:
         return
-    if device.type != "cuda":
-        wp.launch(kernel, dim=dims, inputs=list(inputs), device="cpu", block_dim=block)
-        return
-    stream = _stream(device)
-    key = (kernel, stream.device.ordinal, block)
+    stream = _stream(device) if device.type == "cuda" else None
+    key = (kernel, -1 if stream is None else stream.device.ordinal, block)
     with _turn:
-        command = _recorded.get(key)
-        if command is None:
-            command = wp.launch(kernel, dim=dims, inputs=list(inputs), device=stream.device, block_dim=block, record_cmd=True)
-            _recorded[key] = command
-        else:
-            command.set_dim(dims)
-            for i, value in enumerate(inputs):
-                if isinstance(value, int | float | _Bare):
-                    command.set_param_at_index_from_ctype(i, value)
-                else:
-                    command.set_param_at_index(i, value)
-        command.launch(stream)
+        recorded = _recorded.get(key)
+        if recorded is None:
+            recorded = _recorded[key] = _Recorded(kernel, dims, inputs, "cpu" if stream is None else stream.device, block)
+        recorded.launch(dims, inputs, stream)

@@ -253,7 +253,7 @@ def check_device(settings: RenderSettings) -> None:
 def at_hand(settings: RenderSettings) -> RenderSettings:
     """The same for what is drawn again later, perhaps on another machine: a card that is not there is not insisted on."""
     gone = settings.device == hardware.CARD and no_card() is not None and settings.backend == AUTO
-    return replace(settings, device=AUTO) if gone else settings
+    return replace(settings, device="auto") if gone else settings
 
 
 def compiled_ahead(settings: RenderSettings) -> Backend | None:
@@ -272,7 +272,7 @@ def run_device(settings: RenderSettings, forms: Callable[[], Lowered], camera: A
         BackendUnavailable, ConfigError: see :func:`check_device`.
     """
     check_device(settings)
-    kind = settings.device
+    kind: str = settings.device
     if kind == AUTO and settings.backend != AUTO:
         kind = find(settings.backend).devices[0]
         if kind == hardware.CARD and hardware.card_missing() is not None:

@@ -52,7 +52,8 @@ class Watch:
     def add(self, rows: Tensor, weight: Tensor, error_weight: Tensor) -> None:
         """Sums of some primitives ``rows`` (R,) over some of the rays, for backends that draw in blocks."""
         if self.sums is None:
-            self.sums = tuple(torch.zeros_like(x, device=rows.device) for x in (self.tally.weight, self.tally.error_weight))
+            blank = torch.zeros_like(self.tally.weight, device=rows.device)
+            self.sums = blank, blank.clone()
         for total, part in zip(self.sums, (weight, error_weight), strict=True):
             total.index_add_(0, rows, part.to(total))
         self.fill(*self.sums)
@@ -90,7 +91,8 @@ class RenderStats:
     def watch(self, error: Tensor) -> Tally:
         """See :meth:`RenderOutput.watch`; ``error`` fits."""
         n, error = self.samples, error.detach()
-        tally = Tally(*(torch.zeros(self.count, device=error.device) for _ in range(2)), self.rows)
+        blank = torch.zeros(self.count, device=error.device)
+        tally = Tally(blank, blank.clone(), self.rows)
         rays = error if n == 1 else error.repeat_interleave(n, 0).repeat_interleave(n, 1)
         self.watched = Watch(rays if self.drawn_on is None else rays.to(self.drawn_on), tally, n * n)
         return tally

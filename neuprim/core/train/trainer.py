@@ -218,9 +218,9 @@ class Trainer:
                 loss, parts = loss + self.settings.voxel_weight * known.loss, {**parts, **known.parts}
         if self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from:
             loss = loss + self.settings.anisotropy_weight * scale_anisotropy(model.params["log_scales"])
-        value = loss.item()
-        if not math.isfinite(value):
-            self._refuse(value, seen, known)
+        cost = loss.item()
+        if not math.isfinite(cost):
+            self._refuse(cost, seen, known)
         loss.backward()
 
         tally = seen.tally if seen is not None else known.tally() if known is not None else None
@@ -235,7 +235,7 @@ class Trainer:
                 self._apply(change)
         self.elapsed += time.perf_counter() - start
         psnr, name = (seen.psnr, seen.name) if seen is not None else (known.psnr, known.name) if known is not None else (0.0, "")
-        return StepReport(self.step, self.elapsed, value, parts, psnr, model.count, name, change.text if change else None)
+        return StepReport(self.step, self.elapsed, cost, parts, psnr, model.count, name, change.text if change else None)
 
     def _look(self, progress: float) -> _ImageStep:
         """Draw the next view and compare."""

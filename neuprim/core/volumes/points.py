@@ -237,7 +237,8 @@ def _elsewhere(
 ) -> tuple[Tensor, Tensor | None]:
     """The same of a model that compiled code cannot read."""
     g = living.geometry
-    point, prim = pairs_on(g, cells_of(places))
+    cells = cells_of(places)
+    point, prim = pairs_on(g, cells.order, cells.grid, cells.placed)
     x = torch.from_numpy(places).to(g.means.device)[point]
     values = cosine_values(form, g, prim, x) if isinstance(form, Cosine) else living.sigma(prim, x.to(g.means)).double()
     sigma = values.clamp_min(0)

@@ -3,8 +3,7 @@ cannot read. Sums go by :func:`summed`, in an order that does not change from on
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,21 +11,22 @@ from neuprim.core.model.densities.cosine import cosine_density
 from neuprim.core.model.forms import Cosine, LoweredDensity
 from neuprim.core.model.geometry import Geometry
 
-if TYPE_CHECKING:
-    from neuprim.core.volumes.points import Cells
-
 __all__ = ["cosine_values", "numbers_finite", "pairs_on", "summed"]
 
 
-def pairs_on(geometry: Geometry, cells: Cells) -> tuple[Tensor, Tensor]:
-    """As :func:`neuprim.core.volumes.points.pairs_of`, on the device of the geometry; three waits for it."""
+Grid = tuple[np.ndarray, np.ndarray, float, np.ndarray]
+
+
+def pairs_on(geometry: Geometry, sorted_by: np.ndarray, grid: Grid, sorted_points: np.ndarray) -> tuple[Tensor, Tensor]:
+    """(P,) int64 rows of points and of primitives that contain them, primitive by primitive, on the device of the geometry; three waits for it.
+
+    The points are those of :class:`~neuprim.core.volumes.points.Cells`: their ``order``, ``grid`` and ``placed``.
+    """
     means, scales, axes = (x.detach().double() for x in (geometry.means, geometry.scales, geometry.rotations.double()))
-    order, starts, low, counts, placed = (
-        torch.from_numpy(x).to(means.device) for x in (cells.order, cells.starts, cells.low, cells.counts, cells.placed)
-    )
+    order, starts, low, counts, placed = (torch.from_numpy(x).to(means.device) for x in (sorted_by, *grid[:2], grid[3], sorted_points))
     reach = (axes * scales[:, None, :]).norm(dim=2)
-    first = ((means - reach - low) / cells.step).clamp_min(0.0).floor().minimum(counts).long()
-    last = ((means + reach - low) / cells.step).clamp_min(-1.0).minimum(counts - 1.0).floor().long()
+    first = ((means - reach - low) / grid[2]).clamp_min(0.0).floor().minimum(counts).long()
+    last = ((means + reach - low) / grid[2]).clamp_min(-1.0).minimum(counts - 1.0).floor().long()
     wide = (last - first + 1).clamp_min(0)  # cells along each axis
     columns = wide[:, 0] * wide[:, 1] * (wide[:, 2] > 0)
     prim = torch.repeat_interleave(columns)  # a row for each primitive and column of cells along z
@@ -51,9 +51,9 @@ def numbers_finite(geometry: Geometry, form: LoweredDensity) -> bool:
 
 def cosine_values(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) -> Tensor:
     """(P,) float64 world density, unclamped, of primitives ``prim`` at points ``x`` (P, 3) inside them; differentiable."""
-    wide = (value.double() for value in (form.W1, form.b1, form.w2, form.b2))
+    W1, b1, w2, b2 = (value.double() for value in (form.W1, form.b1, form.w2, form.b2))
     place = Geometry(*(value.double() for value in (geometry.means, geometry.log_scales, geometry.quats)))
-    return cosine_density(Cosine(*wide, form.omega0, form.edge), place, prim, x.double())
+    return cosine_density(Cosine(W1, b1, w2, b2, form.omega0, form.edge), place, prim, x.double())
 
 
 def summed(count: int, rows: Tensor, values: Tensor) -> Tensor:

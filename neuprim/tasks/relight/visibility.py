@@ -77,7 +77,8 @@ def light_visibility(
         near = max(1e-4 * radius, distance - 1.5 * radius, 1e-6)
         own = replace(settings, depth=True, near=near, samples=1)
         depths = means @ camera.viewmat[2, :3].to(means) + camera.viewmat[2, 3]
-        edges = torch.linspace(*torch.stack([depths.min(), depths.max()]).tolist(), LAYERS + 1, dtype=torch.float64)
+        low, high = torch.stack([depths.min(), depths.max()]).tolist()
+        edges = torch.linspace(low, high, LAYERS + 1, dtype=torch.float64)
         slabs = torch.bucketize(depths, edges[1:-1].to(means))
         order = torch.argsort(slabs, stable=True)
         geometry_by_slab, density_by_slab = geometry[order], density.rows(order)

@@ -140,3 +140,24 @@ def test_without_a_schedule_all_bands_are_open_at_once() -> None:
 def test_settings_rebuild_the_field() -> None:
     again = SphericalHarmonics(**SphericalHarmonics(2, 4, 0.1).settings())
     assert (again.degree, again.channels, again.active) == (2, 4, 2)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_values_and_gradients_are_those_of_float64(degree: int) -> None:
+    """Also of the camera's position, and for colours that are cut off at zero."""
+    g = torch.Generator().manual_seed(degree)
+    shapes = {"means": (50, 3), "dc": (50, 4), "rest": (50, 15, 4), "origin": (3,)}
+    exact = {name: torch.randn(shape, generator=g, dtype=torch.float64).requires_grad_() for name, shape in shapes.items()}
+    mine = {name: value.detach().to(torch.float64 if name == "origin" else torch.float32).requires_grad_() for name, value in exact.items()}
+    with torch.no_grad():
+        for name, value in exact.items():
+            value.copy_(mine[name])
+    pull = torch.randn(50, 4, generator=g)
+    found, wanted = sh.colors(**mine, degree=degree), sh.colors(**exact, degree=degree)
+    assert bool((wanted == 0).any()) and torch.allclose(found.double(), wanted, rtol=1e-5, atol=1e-5)
+    (found * pull).sum().backward()
+    (wanted * pull.double()).sum().backward()
+    for name, value in exact.items():
+        made, expected = mine[name].grad, value.grad
+        assert made is not None and expected is not None
+        assert torch.allclose(made.double(), expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max())), name

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from neuprim.core.compute.warp import OPTIONS, wp
+from neuprim.core.compute.warp import FAST, wp
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.chord import pixel, place
 from neuprim.core.render.cuda.forms import Form
@@ -19,7 +19,7 @@ def pixels_kernel(form: Form, depth: bool) -> Any:
     C, H = form.channels, form.hidden
     colours = L.colours(form.neurons)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)  # type: ignore[untyped-decorator]
+    @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)  # type: ignore[untyped-decorator]
     def backward_pixels(
         rows: wp.array2d(dtype=wp.vec4),  # type: ignore[valid-type]
         starts: wp.array(dtype=wp.int32),  # type: ignore[valid-type]

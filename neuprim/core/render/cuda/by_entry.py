@@ -9,7 +9,7 @@ the sort is stable. Nothing can stop early before the list is complete, so hidde
 import functools
 from typing import Any
 
-from neuprim.core.compute.warp import OPTIONS, wp
+from neuprim.core.compute.warp import FAST, wp
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.forms import Form
 
@@ -36,7 +36,7 @@ def composite_kernel(form: Form, depth: bool) -> Any:
     colours = L.colours(form.neurons)
     colour_type = wp.types.vector(length=C, dtype=wp.float32)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
     def composite(
         rows: wp.array2d(dtype=wp.vec4), ids: wp.array(dtype=wp.int32), keys: wp.array(dtype=wp.int64), order: wp.array(dtype=wp.int64), count: int,
         owners: wp.array(dtype=wp.int32), limits: wp.vec4, background: wp.array(dtype=wp.float32), hues: wp.array2d(dtype=wp.float32),
@@ -82,7 +82,7 @@ def uncomposite_kernel(form: Form, depth: bool) -> Any:
     C, H = form.channels, form.hidden
     colours = L.colours(form.neurons)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
     def uncomposite(
         rows: wp.array2d(dtype=wp.vec4), ids: wp.array(dtype=wp.int32), order: wp.array(dtype=wp.int64), begins: wp.array(dtype=wp.int32),
         owners: wp.array(dtype=wp.int32), limits: wp.vec4, transmittance: wp.array(dtype=wp.float32), g_rgb: wp.array2d(dtype=wp.float32),

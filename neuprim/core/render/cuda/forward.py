@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from neuprim.core.compute.warp import OPTIONS, wp
+from neuprim.core.compute.warp import FAST, wp
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.chord import chord, pixel, place, ray_of, xyz
@@ -56,7 +56,7 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False) -
     colour_type = wp.types.vector(length=C, dtype=wp.float32)
     mean = float(NORMS[P])
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)  # type: ignore[untyped-decorator]
+    @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)  # type: ignore[untyped-decorator]
     def forward(
         rows: wp.array2d(dtype=wp.vec4),  # type: ignore[valid-type]
         net: wp.array2d(dtype=wp.vec4),  # type: ignore[valid-type]

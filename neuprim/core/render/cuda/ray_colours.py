@@ -8,7 +8,7 @@ chord's middle alone; it is linear, so that it is added to the density's row by 
 import functools
 from typing import Any
 
-from neuprim.core.compute.warp import OPTIONS, wp
+from neuprim.core.compute.warp import FAST, OPTIONS, wp
 from neuprim.core.render.cpu import layout as W
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.backward_pairs import pixel_of_slot
@@ -41,7 +41,7 @@ def net_pairs_kernel(form: Form) -> Any:
     row_of, add_lanes = row_type(width), row_sums(width)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
     def net_pairs(
         rows: wp.array2d(dtype=wp.vec4), net: wp.array2d(dtype=wp.vec4), ids: wp.array(dtype=wp.int32), tiles: wp.array(dtype=wp.int32),
         spans: wp.array2d(dtype=wp.uint16), offsets: wp.array(dtype=wp.int32), depth_floor: float, size: wp.vec2i,

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from neuprim.core.compute.warp import array
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.cuda import passes
 from tests import scenes
@@ -69,10 +70,7 @@ class Args:
         for name, tensor in tensors.items():
             at = self.names.index(name)
             assert tensor.is_contiguous() and tensor.shape == values[at].tensor.shape
-            old, n = values[at], values[at].ndim
-            made = type(old)(tensor.data_ptr(), 0, n, tuple(old.shape[:n]), tuple(old.strides[:n]))
-            made.tensor = tensor
-            values[at] = made
+            values[at] = array(tensor, values[at].dtype)
         return values
 
 

@@ -65,7 +65,9 @@ def _tile_by_tile(launch: Launch, kernel: Any, dim: Any, inputs: Sequence[Any], 
                 launch(kernel, dim, args.with_tensors(starts=_alone(starts, tile), **copies), device, block)
             else:
                 copies = {}
-                launch(kernel, dim, args.with_tensors(starts=_alone(starts, tile), reached=_only(args.tensor("reached"), tile)), device, block)
+                launch(
+                    kernel, dim, args.with_tensors(starts=_alone(starts, tile), reached=_only(args.tensor("reached"), tile)), device, block
+                )
             for name, copy in copies.items():
                 own = torch.arange(len(copy)) == tile if name == "reached" else tile_of == tile
                 if len(copy):

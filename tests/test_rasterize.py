@@ -19,7 +19,7 @@ from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, Neup
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.functional import Rasterized
 from tests import scenes
-from tests.backends import BACKENDS
+from tests.backends import BACKENDS, FAST, by
 
 WIDTH, HEIGHT = 40, 30
 CAMERAS = [
@@ -42,39 +42,39 @@ def arguments(count: int = 30, seed: int = 7, cameras: list[Camera] | None = Non
 def test_equals_the_renderer_camera_by_camera(backend: str, channels: int) -> None:
     a = arguments(channels=channels)
     backgrounds = torch.rand(3, channels, generator=torch.Generator().manual_seed(0))
-    out = neuprim.rasterize(**a, backgrounds=backgrounds, backend=backend, depth=True, near=0.05)
+    out = neuprim.rasterize(**a, backgrounds=backgrounds, **by(backend), depth=True, near=0.05)
     assert isinstance(out, Rasterized) and out.depth is not None
     assert out.rgb.shape == (3, HEIGHT, WIDTH, channels) and out.alpha.shape == out.depth.shape == (3, HEIGHT, WIDTH)
     assert out.rgb.dtype == torch.float32 and [s.backend for s in out.stats] == [backend] * 3
-    settings = RenderSettings(backend=backend, depth=True, near=0.05)
+    settings = RenderSettings(**by(backend), depth=True, near=0.05)
     for c, camera in enumerate(CAMERAS):
         one = render_lowered(scenes.lowered(a), camera, settings, backgrounds[c])
         assert one.alpha.max() > 0.3
         assert torch.equal(out.rgb[c], one.rgb) and torch.equal(out.alpha[c], one.alpha) and torch.equal(out.depth[c], one.depth)  # type: ignore[arg-type]
-    shared = neuprim.rasterize(**a, backgrounds=backgrounds[0], backend=backend, near=0.05)
+    shared = neuprim.rasterize(**a, backgrounds=backgrounds[0], **by(backend), near=0.05)
     assert torch.equal(shared.rgb[0], out.rgb[0]) and not torch.equal(shared.rgb[1], out.rgb[1]) and shared.depth is None
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_b2_may_be_flat_and_omega0_scales_the_phase(backend: str) -> None:
     a = arguments()
-    first = neuprim.rasterize(**a, backend=backend).rgb
-    assert torch.equal(neuprim.rasterize(**{**a, "b2": a["b2"][:, 0]}, backend=backend).rgb, first)
+    first = neuprim.rasterize(**a, **by(backend)).rgb
+    assert torch.equal(neuprim.rasterize(**{**a, "b2": a["b2"][:, 0]}, **by(backend)).rgb, first)
     rescaled = {**a, "W1": a["W1"] * 2, "b1": a["b1"] * 2}
-    assert torch.equal(neuprim.rasterize(**rescaled, omega0=15.0, backend=backend).rgb, first)
-    assert not torch.allclose(neuprim.rasterize(**a, omega0=15, backend=backend).rgb, first, atol=1e-2)
+    assert torch.equal(neuprim.rasterize(**rescaled, omega0=15.0, **by(backend)).rgb, first)
+    assert not torch.allclose(neuprim.rasterize(**a, omega0=15, **by(backend)).rgb, first, atol=1e-2)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_edges_and_gains_are_those_of_a_model(backend: str) -> None:
     a = arguments()
     log_gain = torch.linspace(-1, 1, 30)[:, None].requires_grad_()
-    hard = neuprim.rasterize(**a, backend=backend).rgb
+    hard = neuprim.rasterize(**a, **by(backend)).rgb
     for edge in (1, 2):
-        soft = neuprim.rasterize(**a, edge=edge, log_gain=log_gain, backend=backend)
+        soft = neuprim.rasterize(**a, edge=edge, log_gain=log_gain, **by(backend))
         by_hand = {**a, "w2": a["w2"] * log_gain.exp(), "b2": a["b2"] * log_gain.exp()}
-        assert torch.equal(neuprim.rasterize(**by_hand, edge=edge, backend=backend).rgb, soft.rgb)
-        assert torch.equal(neuprim.rasterize(**a, edge=edge, log_gain=log_gain[:, 0], backend=backend).rgb, soft.rgb)
+        assert torch.equal(neuprim.rasterize(**by_hand, edge=edge, **by(backend)).rgb, soft.rgb)
+        assert torch.equal(neuprim.rasterize(**a, edge=edge, log_gain=log_gain[:, 0], **by(backend)).rgb, soft.rgb)
         assert not torch.allclose(soft.rgb, hard, atol=1e-2)
         (grad,) = torch.autograd.grad(soft.rgb.sum(), log_gain)
         assert float(grad.abs().max()) > 1e-3
@@ -84,9 +84,9 @@ def test_edges_and_gains_are_those_of_a_model(backend: str) -> None:
 def test_colours_of_each_camera(backend: str) -> None:
     a = arguments()
     per_camera = torch.stack([a["colors"], 1 - a["colors"], 0.5 * a["colors"]]).requires_grad_()
-    out = neuprim.rasterize(**{**a, "colors": per_camera}, backend=backend)
+    out = neuprim.rasterize(**{**a, "colors": per_camera}, **by(backend))
     for c in range(3):
-        alone = neuprim.rasterize(**{**a, "colors": per_camera[c].detach()}, backend=backend)
+        alone = neuprim.rasterize(**{**a, "colors": per_camera[c].detach()}, **by(backend))
         assert torch.equal(out.rgb[c], alone.rgb[c])
     out.rgb[1].sum().backward()
     assert per_camera.grad is not None and per_camera.grad[1].abs().max() > 0
@@ -100,15 +100,16 @@ def grads(backend: str, names: list[str], dtype: torch.dtype) -> dict[str, Tenso
         a[k] = a[k].to(dtype)
     for k in names:
         a[k] = a[k].clone().requires_grad_()
-    out = neuprim.rasterize(**a, backend=backend, alpha_min=0.0, transmittance_min=0.0)
+    out = neuprim.rasterize(**a, **by(backend), alpha_min=0.0, transmittance_min=0.0)
     g = torch.Generator().manual_seed(1)
     (out.rgb * torch.randn(out.rgb.shape, generator=g).to(dtype)).sum().backward()
     return {k: a[k].grad for k in names}
 
 
-def test_gradients_to_everything_agree_between_the_backends() -> None:
+@pytest.mark.parametrize("backend", FAST)
+def test_gradients_to_everything_agree_between_the_backends(backend: str) -> None:
     names = [*scenes.tensors(1), "viewmats", "backgrounds"]
-    fast, slow = grads("cpu", names, torch.float32), grads("reference", names, torch.float64)
+    fast, slow = grads(backend, names, torch.float32), grads("reference", names, torch.float64)
     for name in names:
         assert slow[name].abs().max() > 0, name
         assert fast[name].shape == slow[name].shape
@@ -151,12 +152,12 @@ def test_intrinsics_have_no_silent_zero_gradient(backend: str) -> None:
 def test_no_cameras_and_no_primitives(backend: str) -> None:
     a = arguments(cameras=[])
     a["means"].requires_grad_()
-    none = neuprim.rasterize(**a, backend=backend, depth=True)
+    none = neuprim.rasterize(**a, **by(backend), depth=True)
     assert none.rgb.shape == (0, HEIGHT, WIDTH, 3) and none.alpha.shape == (0, HEIGHT, WIDTH) and none.stats == ()
     assert none.depth is not None and none.depth.shape == (0, HEIGHT, WIDTH)
     none.rgb.sum().backward()
     assert a["means"].grad is not None and a["means"].grad.abs().max() == 0
-    empty = neuprim.rasterize(**arguments(0), backend=backend, backgrounds=torch.tensor([0.5, 0.25, 1.0]))
+    empty = neuprim.rasterize(**arguments(0), **by(backend), backgrounds=torch.tensor([0.5, 0.25, 1.0]))
     assert torch.equal(empty.rgb, torch.tensor([0.5, 0.25, 1.0]).expand(3, HEIGHT, WIDTH, 3)) and empty.alpha.abs().max() == 0
 
 
@@ -252,7 +253,7 @@ def test_non_finite_primitives_are_named_by_both_backends(name: str) -> None:
         a = arguments()
         a[name][13].view(-1)[-1] = NAN
         with pytest.raises(NonFiniteError, match=rf"{name} of primitive 13 is not finite"):
-            neuprim.rasterize(**a, backend=backend)
+            neuprim.rasterize(**a, **by(backend))
     a = arguments()
     a["colors"] = a["colors"].repeat(3, 1, 1)
     a["colors"][2, 5, 0] = NAN

@@ -211,7 +211,7 @@ def summary(
         **training,
         "render_fps": 1.0 / max(seconds[len(seconds) // 2], 1e-9),
         "backend": backend.name,
-        "device": backend.device(),
+        "device": backend.computer(config.renderer),
         "checkpoint": "last",
         "downsampling": dataset.downsampling,
         "image_size": [camera.width, camera.height],

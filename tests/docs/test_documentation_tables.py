@@ -150,3 +150,27 @@ def test_forms_of_equal_bytes_are_counted_by_their_parameters(benchmark: Callabl
     assert (
         "train.supervision=images" in with_source.words and str(with_source) == "0:2@images" and with_source.label.endswith("images alone")
     )
+
+
+def test_tables_of_the_card_are_those_recorded(benchmark: Callable[[str], ModuleType]) -> None:
+    """Each stands where a record has its part; where none has, nothing does."""
+    script = benchmark("shared.gpu_tables")
+    records = script.recorded()
+    for name, table in script.TABLES.items():
+        assert between("docs/gpu.md", name) == table(records), name
+    assert "same bits" in between("docs/gpu.md", "gpu-parity")
+
+
+def test_tables_of_a_card_show_every_number(benchmark: Callable[[str], ModuleType]) -> None:
+    script = benchmark("shared.gpu_tables")
+    times = {
+        "form": "K=8 p=0", "primitives": 5000, "width": 800, "height": 600, "pairs": 12345, "slots": 678901, "delicate": 3,
+        "forward_ms": 0.5, "both_ms": 1.25, "step_ms": 2.5, "peak_mb": 123.4,
+    }  # fmt: skip
+    train = {"scene": "lit_solids", "primitives": 900, "steps": 2000, "step_ms": 3.14159, "psnr": 31.2345, "of": "psnr"}
+    records = [{"device": "A card", "torch": "2.11", "times": [times], "train": [train]}, {"device": "None", "torch": "1"}]
+    found = script.times_table(records)
+    assert found.startswith("A card, torch 2.11:\n\n| form |") and "None" not in found
+    assert found.splitlines()[-1] == "| K=8 p=0 | 5,000 | 800×600 | 12,345 | 678,901 | 0.50 | 1.25 | 2.50 | 2000 | 123 |"
+    assert script.training_table(records).splitlines()[-1] == "| lit solids | 900 | 2,000 | 3.14 | 31.23 (psnr) |"
+    assert script.parity_table(records) == ""

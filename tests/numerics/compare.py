@@ -15,6 +15,7 @@ from neuprim.core.render.backends import ORACLE
 from neuprim.core.render.output import Tally
 from neuprim.core.render.reference.backend import pixel_directions
 from tests import scenes
+from tests.backends import by
 
 
 @dataclass
@@ -108,7 +109,7 @@ def draw(
     leaves = {k: v.detach().to(dtype).requires_grad_() for k, v in t.items()}
     view = camera.viewmat.detach().clone().requires_grad_(with_view)
     background = torch.linspace(0.2, 0.9, scenes.channels(t)).to(dtype).requires_grad_()
-    output = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(settings, backend=backend), background)
+    output = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(settings, **by(backend)), background)
     h, w, C = output.rgb.shape
     keep = torch.ones(h, w, dtype=torch.float64) if skip is None else (~skip).double()
     tally = output.watch((weights((h, w), 3).abs() * keep).float())

@@ -1,6 +1,6 @@
-"""Forms with one thing wrong, drawn by both backends: each must be refused by name. Run by ``test_forms.py`` in a process of its own.
+"""Forms with one thing wrong, drawn by some backends: each must be refused by name. Run by ``test_forms.py`` in a process of its own.
 
-    python -m tests.numerics.forms_fuzz [COUNT] [SEED]
+    python -m tests.numerics.forms_fuzz [COUNT] [SEED] [BACKEND ...]
 
 Between them are forms that only look odd (strides, views, mixed dtypes), which must be drawn, forward and backward, as plain ones are.
 Prints one line of counts; what goes wrong is an exception, or the end of the process.
@@ -21,6 +21,7 @@ from neuprim.core.errors import FormError
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
 from tests import scenes
+from tests.backends import by
 
 CAMERA = scenes.camera(9, 7)
 PARTS = ("geometry", "density", "colour")
@@ -124,7 +125,7 @@ def draw(lowered: Lowered, backend: str) -> tuple[Tensor, dict[str, Tensor | Non
     leaves = {name: v.detach().requires_grad_() for name, (_, v) in tensors_of(lowered).items()}
     for name, value in leaves.items():
         lowered = with_tensor(lowered, name, value)
-    settings = RenderSettings(backend=backend, sort=random.choice(["center", "entry"]))  # type: ignore[arg-type]
+    settings = RenderSettings(**by(backend), sort=random.choice(["center", "entry"]))  # type: ignore[arg-type]
     image = render_lowered(lowered, CAMERA, settings).rgb
     image.sum().backward()
     return image.detach(), {name: v.grad for name, v in leaves.items()}
@@ -132,7 +133,7 @@ def draw(lowered: Lowered, backend: str) -> tuple[Tensor, dict[str, Tensor | Non
 
 def refuse(lowered: Lowered, backend: str, name: str, background: Any = None) -> None:
     try:
-        image = render_lowered(lowered, CAMERA, RenderSettings(backend=backend), background).rgb
+        image = render_lowered(lowered, CAMERA, RenderSettings(**by(backend)), background).rgb
     except FormError as error:
         text = str(error)
         if name not in text or "expected" not in text or "\n" in text:
@@ -168,12 +169,12 @@ def same(r: random.Random, lowered: Lowered, backend: str) -> None:
         assert (grad is None) == (other is None) and (grad is None or other is None or torch.equal(grad, other)), f"{backend}: {name}"
 
 
-def main(count: int, seed: int) -> None:
+def main(count: int, seed: int, backends: list[str]) -> None:
     torch.set_num_threads(1)
     r = random.Random(seed)
     refused = skipped = drawn = 0
     while refused < count:
-        lowered, backend = random_form(r), ("cpu", "reference")[refused % 2]
+        lowered, backend = random_form(r), backends[refused % len(backends)]
         name = r.choice([*tensors_of(lowered), "background", "rows", "omega0"])
         if name == "background":
             channels = getattr(lowered.colour, "rgb", getattr(lowered.colour, "base", None)).shape[1]  # type: ignore[union-attr]
@@ -214,4 +215,4 @@ def main(count: int, seed: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int((sys.argv[1:] or ["2000"])[0]), int((sys.argv[2:] or ["0"])[0]))
+    main(int((sys.argv[1:] or ["2000"])[0]), int((sys.argv[2:] or ["0"])[0]), sys.argv[3:] or ["cpu", "reference"])

@@ -12,7 +12,7 @@ from neuprim.core.errors import BackendUnavailable, NonFiniteError
 from neuprim.core.model.fields import Constant, Opaque, OpaqueColour
 from neuprim.core.render import RenderSettings, choose, render_lowered
 from tests import scenes
-from tests.backends import BACKENDS, FAST
+from tests.backends import BACKENDS, FAST, LEFT_OUT, by
 from tests.numerics.cases import CASES, DEFAULT, case
 from tests.numerics.compare import assert_same_frame, draw, row_errors
 
@@ -45,6 +45,11 @@ def test_cases_mean_what_they_say() -> None:
         assert (first - second).abs().max() > (1e-6 if name == "opaque" else 0.05), name
 
 
+def test_no_backend_is_left_out() -> None:
+    if LEFT_OUT:
+        pytest.skip("not tested here: " + "; ".join(f"{name}: {why}" for name, why in LEFT_OUT.items()))
+
+
 def test_a_view_that_shows_nothing() -> None:
     t = scenes.tensors(20)
     camera = scenes.camera(33, 20)
@@ -55,7 +60,7 @@ def test_a_view_that_shows_nothing() -> None:
     for backend in BACKENDS:
         leaves = {k: v.clone().requires_grad_() for k, v in t.items()}
         background.grad = None
-        out = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(DEFAULT, backend=backend), background)
+        out = render_lowered(scenes.lowered(leaves), replace(camera, viewmat=view), replace(DEFAULT, **by(backend)), background)
         assert torch.equal(out.rgb, background.detach().expand(20, 33, 3)) and out.depth is not None
         assert out.alpha.abs().max() == 0 and out.depth.abs().max() == 0
         (out.rgb.sum() + out.alpha.sum() + out.depth.sum()).backward()
@@ -66,7 +71,7 @@ def test_a_view_that_shows_nothing() -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_no_primitives_at_all(backend: str) -> None:
     leaves = {k: v[:0].clone().requires_grad_() for k, v in scenes.tensors(2).items()}
-    out = render_lowered(scenes.lowered(leaves), scenes.camera(20, 17), RenderSettings(backend=backend), torch.tensor([0.5, 0.25, 1.0]))
+    out = render_lowered(scenes.lowered(leaves), scenes.camera(20, 17), RenderSettings(**by(backend)), torch.tensor([0.5, 0.25, 1.0]))
     assert torch.equal(out.rgb, torch.tensor([0.5, 0.25, 1.0]).expand(17, 20, 3))
     assert out.alpha.abs().max() == 0
     if out.rgb.requires_grad:
@@ -88,18 +93,20 @@ def test_any_number_of_threads_gives_the_same_bits(backend: str) -> None:
     assert frames[0].output.alpha.max() > 0.5
 
 
-def test_a_far_camera_loses_no_digits() -> None:
+@pytest.mark.parametrize("backend", FAST)
+def test_a_far_camera_loses_no_digits(backend: str) -> None:
     """A thousand radii away every primitive is a few pixels wide: float64 preparation keeps them exact."""
     t = scenes.tensors(80, 8, seed=5, radius=0.01)
     t["means"] *= 0.05
     camera = scenes.camera(48, 35, distance=100.0, fov=0.06)
-    assert_same_frame(t, camera, DEFAULT)
+    assert_same_frame(t, camera, DEFAULT, backend=backend)
 
 
-def test_order_of_primitives_does_not_matter() -> None:
+@pytest.mark.parametrize("backend", FAST)
+def test_order_of_primitives_does_not_matter(backend: str) -> None:
     t, camera, settings = case("K=8 C=3")
     shuffle = torch.randperm(len(t["means"]), generator=torch.Generator().manual_seed(1))
-    first, second = (draw("cpu", u, camera, settings) for u in (t, {k: v[shuffle] for k, v in t.items()}))
+    first, second = (draw(backend, u, camera, settings) for u in (t, {k: v[shuffle] for k, v in t.items()}))
     assert torch.equal(first.output.rgb, second.output.rgb)
     assert torch.equal(first.grads["means"][shuffle], second.grads["means"])
 
@@ -127,20 +134,22 @@ def test_reference_gradients_are_finite_differences(neurons: int, distance: floa
     assert torch.autograd.gradcheck(functional, [x.requires_grad_() for x in inputs], eps=1e-7, atol=2e-6, rtol=1e-5)
 
 
-def test_only_the_asked_for_gradients_are_made() -> None:
+@pytest.mark.parametrize("backend", FAST)
+def test_only_the_asked_for_gradients_are_made(backend: str) -> None:
     t, camera, settings = case("K=8 C=3")
-    alone = draw("cpu", t, camera, settings, with_view=False)
-    both = draw("cpu", t, camera, settings)
+    alone = draw(backend, t, camera, settings, with_view=False)
+    both = draw(backend, t, camera, settings)
     assert "viewmat" not in alone.grads
     assert all(torch.equal(alone.grads[k], both.grads[k]) for k in t)
 
 
-def test_the_floor_on_grazing_rays_is_shared() -> None:
+@pytest.mark.parametrize("backend", FAST)
+def test_the_floor_on_grazing_rays_is_shared(backend: str) -> None:
     """A large floor changes the gradients of both backends alike and the image of neither."""
     t, camera, settings = case("K=3 C=5")
     floored = replace(settings, depth_floor=0.2)
-    fast, _ = assert_same_frame(t, camera, floored)
-    plain = draw("cpu", t, camera, settings)
+    fast, _ = assert_same_frame(t, camera, floored, backend=backend)
+    plain = draw(backend, t, camera, settings)
     assert torch.equal(fast.output.rgb, plain.output.rgb)
     assert row_errors(fast.grads["log_scales"], plain.grads["log_scales"]).max() > 0.01
 

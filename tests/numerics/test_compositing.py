@@ -13,8 +13,9 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import ConfigError
 from neuprim.core.render import RenderSettings, render_lowered
+from neuprim.core.render.backends import ORACLE
 from tests import scenes
-from tests.backends import BACKENDS
+from tests.backends import BACKENDS, by
 
 BACKGROUND = (0.3, 0.1, 0.8)
 
@@ -101,10 +102,11 @@ def test_against_the_loop(name: str) -> None:
     settings = replace(settings, depth=True)
     expected = loop(t, camera, settings)
     assert expected[1].max() > 0.3
-    for backend, bound in (("reference", 1e-11), ("cpu", 1e-5)):
+    for backend in BACKENDS:
+        bound = 1e-11 if backend == ORACLE else 1e-5
         dtype = torch.float64 if backend == "reference" else torch.float32
         model = {k: v.to(dtype) for k, v in t.items()}
-        out = render_lowered(scenes.lowered(model), camera, replace(settings, backend=backend), torch.tensor(BACKGROUND, dtype=dtype))
+        out = render_lowered(scenes.lowered(model), camera, replace(settings, **by(backend)), torch.tensor(BACKGROUND, dtype=dtype))
         assert out.depth is not None
         for image, found in zip(expected, (out.rgb, out.alpha, out.depth), strict=True):
             scale = max(np.abs(image).max(), 1.0)
@@ -122,7 +124,7 @@ def test_the_primitive_that_crosses_the_limit_still_counts(backend: str) -> None
     t["means"] = torch.tensor([1.0, 0.0, -1.0])[:, None] * axis
     t["colors"] = torch.eye(3)
     camera = scenes.camera(17, 17)
-    settings = RenderSettings(backend=backend, alpha_max=0.9, transmittance_min=0.05)
+    settings = RenderSettings(**by(backend), alpha_max=0.9, transmittance_min=0.05)
     out = render_lowered(scenes.lowered(t), camera, settings, torch.ones(3))
     assert out.rgb[8, 8].tolist() == pytest.approx([0.9 + 0.01, 0.09 + 0.01, 0.01], abs=1e-6)
     assert out.alpha[8, 8].item() == pytest.approx(0.99, abs=1e-6)
@@ -135,7 +137,7 @@ def test_a_clamped_pair_has_no_gradient_in_its_density(backend: str) -> None:
     t["b2"][:] = 50.0
     t = {k: v.clone().requires_grad_() for k, v in t.items()}
     camera = scenes.camera(3, 3, fov=1.0)
-    out = render_lowered(scenes.lowered(t), camera, RenderSettings(backend=backend))
+    out = render_lowered(scenes.lowered(t), camera, RenderSettings(**by(backend)))
     assert torch.allclose(out.alpha, torch.tensor(0.99))
     out.rgb.sum().backward()
     assert t["b2"].grad is not None and t["b2"].grad.abs().max() == 0
@@ -146,7 +148,7 @@ def test_a_clamped_pair_has_no_gradient_in_its_density(backend: str) -> None:
 def test_negative_integrals_are_empty_space(backend: str) -> None:
     t = scenes.tensors(5, 0)
     t["b2"] = -t["b2"].abs()
-    out = render_lowered(scenes.lowered(t), scenes.camera(16, 16), RenderSettings(backend=backend, alpha_min=0.0))
+    out = render_lowered(scenes.lowered(t), scenes.camera(16, 16), RenderSettings(**by(backend), alpha_min=0.0))
     assert out.alpha.abs().max() == 0
 
 

@@ -14,8 +14,9 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import ConfigError
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
+from neuprim.core.render.backends import ORACLE
 from tests import scenes
-from tests.backends import BACKENDS, FAST
+from tests.backends import BACKENDS, FAST, by
 from tests.numerics.cases import CASES, along_z, case, needle_and_sphere, spheres
 from tests.numerics.compare import assert_same_frame, draw, entries
 
@@ -25,7 +26,7 @@ ENTRY = RenderSettings(sort="entry", depth=True)
 def render(t: dict[str, Tensor], camera: Camera, settings: RenderSettings, backend: str, **knobs: Any) -> RenderOutput:
     dtype = torch.float64 if backend == "reference" else torch.float32
     model = scenes.lowered({k: v.to(dtype) for k, v in t.items()})
-    return render_lowered(model, camera, replace(settings, backend=backend, **knobs))
+    return render_lowered(model, camera, replace(settings, **by(backend), **knobs))
 
 
 # ---------------------------------------------------------------- fast against reference
@@ -51,13 +52,14 @@ def test_the_cases_show_another_image_than_the_order_of_centres() -> None:
         assert (images[0] - images[1]).abs().max() > 0.02
 
 
-def test_float64_pixels_are_sorted_too() -> None:
-    """Needles and discs near the camera, which the cpu backend draws in float64."""
+@pytest.mark.parametrize("backend", FAST)
+def test_float64_pixels_are_sorted_too(backend: str) -> None:
+    """Needles and discs near the camera, which fast backends draw in float64."""
     t = scenes.tensors(40, 4, seed=2, radius=0.3)
     t["log_scales"][:, 0] -= 4.0
     camera = scenes.camera(40, 30, distance=0.5, fov=60)
-    assert render(t, camera, ENTRY, "cpu").stats.extra["float64"] > 3
-    assert_same_frame(t, camera, replace(ENTRY, depth_floor=1e-3))
+    assert render(t, camera, ENTRY, backend).stats.extra["float64"] > 3
+    assert_same_frame(t, camera, replace(ENTRY, depth_floor=1e-3), backend=backend)
 
 
 def test_any_number_of_threads_gives_the_same_bits() -> None:
@@ -122,7 +124,8 @@ def test_against_the_order_by_hand(distance: float, extra: float, knobs: dict[st
     camera = scenes.camera(14, 10, distance=distance, fov=45 if distance > 1 else 90, shift=(0.8, 0.4))
     settings = replace(ENTRY, **knobs)  # type: ignore[arg-type]
     rgb, alpha = by_hand(t, camera, settings)
-    for backend, bound in (("reference", 1e-11), ("cpu", 1e-5)):
+    for backend in BACKENDS:
+        bound = 1e-11 if backend == ORACLE else 1e-5
         out = render(t, camera, settings, backend)
         assert (out.rgb.double() - rgb).abs().max() < bound and (out.alpha.double() - alpha).abs().max() < bound, backend
 
@@ -185,8 +188,9 @@ def test_coincident_primitives_keep_their_index_order(sort: str) -> None:
     t = {k: torch.cat([v, v]) for k, v in t.items()}
     t["colors"][12:] = 1 - t["colors"][12:]
     camera, settings = scenes.camera(33, 25), replace(ENTRY, sort=sort)
-    fast, slow = (render(t, camera, settings, backend, alpha_min=0.0).rgb for backend in ("cpu", "reference"))
-    assert (fast - slow).abs().max() < 1e-5
+    truth = render(t, camera, settings, ORACLE, alpha_min=0.0).rgb
+    for backend in FAST:
+        assert (render(t, camera, settings, backend, alpha_min=0.0).rgb - truth).abs().max() < 1e-5, backend
 
 
 def test_settings_that_do_not_exist_are_named() -> None:

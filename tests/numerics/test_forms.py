@@ -25,14 +25,14 @@ from neuprim.core.render.joint import joint_volume
 from neuprim.core.volumes.grid import density_at, density_grid
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
-from tests.backends import BACKENDS
+from tests.backends import BACKENDS, FAST, by
 
 CAMERA = scenes.camera(20, 16)
 N, K = 20, 8
 
 
 def settings(backend: str, **more: Any) -> RenderSettings:
-    return RenderSettings(backend=backend, **more)
+    return RenderSettings(**by(backend), **more)
 
 
 def model(density: type[CosineDensity] = CosineDensity, colour: type[SphericalHarmonics] = SphericalHarmonics) -> Primitives:
@@ -66,6 +66,15 @@ def test_no_wrong_form_crashes_or_passes() -> None:
     done = subprocess.run(words, capture_output=True, text=True, cwd=Path(__file__).parents[2])
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.startswith("2000 wrong forms refused") and "100 odd but right ones drawn alike" in done.stdout
+
+
+@pytest.mark.parametrize("backend", [b for b in FAST if b != "cpu"])
+def test_no_wrong_form_passes_other_backends(backend: str) -> None:
+    """Fewer of them: what refuses is the same, and every other form is another kernel to compile."""
+    words = [sys.executable, "-m", "tests.numerics.forms_fuzz", "100", "0", backend]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=Path(__file__).parents[2])
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.startswith("100 wrong forms refused") and "5 odd but right ones drawn alike" in done.stdout
 
 
 @pytest.mark.slow
@@ -271,12 +280,13 @@ def drawn(t: dict[str, Tensor], backend: str, **more: Any) -> tuple[Tensor, dict
     return image.detach(), {k: v.grad for k, v in t.items() if v.grad is not None}
 
 
+@pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize("hidden", [None, 3])
 @pytest.mark.parametrize("names", [["W1"], ["means", "w2"], ["b2"], ["base", "colors"], ["Wx"]])
-def test_dtypes_may_be_mixed(names: list[str], hidden: int | None) -> None:
+def test_dtypes_may_be_mixed(names: list[str], hidden: int | None, backend: str) -> None:
     t = scenes.tensors(N, 4, hidden=hidden)
     mixed = {k: v.double() if k in names else v for k, v in t.items()}
-    (image, grads), (other, found) = drawn(t, "cpu"), drawn(mixed, "cpu")
+    (image, grads), (other, found) = drawn(t, backend), drawn(mixed, backend)
     assert torch.equal(image, other.float())
     for name, grad in grads.items():
         assert found[name].dtype == mixed[name].dtype and torch.equal(grad, found[name].float()), name
@@ -284,10 +294,11 @@ def test_dtypes_may_be_mixed(names: list[str], hidden: int | None) -> None:
 
 @pytest.mark.parametrize("sort", ["center", "entry"])
 @pytest.mark.parametrize(("neurons", "hidden"), [(MOST_UNITS, None), (17, MOST_UNITS)])
-def test_as_many_units_as_the_kernels_know(neurons: int, hidden: int | None, sort: str) -> None:
+@pytest.mark.parametrize("backend", FAST)
+def test_as_many_units_as_the_kernels_know(backend: str, neurons: int, hidden: int | None, sort: str) -> None:
     t = scenes.tensors(N, neurons, hidden=hidden)
     t["w2"] = t["w2"] / neurons**0.5
-    (image, grads), (truth, expected) = drawn(t, "cpu", sort=sort), drawn({k: v.double() for k, v in t.items()}, "reference", sort=sort)
+    (image, grads), (truth, expected) = drawn(t, backend, sort=sort), drawn({k: v.double() for k, v in t.items()}, "reference", sort=sort)
     assert (image - truth).abs().max() < 2e-6
     for name, grad in expected.items():
         assert (grads[name] - grad).norm() <= 1e-4 * grad.norm(), name

@@ -6,16 +6,19 @@ import sys
 
 import pytest
 
+from tests.backends import FAST, SLOW_HERE
 from tests.numerics.wild import render_block
 
 
-def test_twenty_thousand_wild_primitives() -> None:
-    assert max(render_block(seed) for seed in range(10)) > 0.5
+@pytest.mark.parametrize("backend", FAST)
+def test_twenty_thousand_wild_primitives(backend: str) -> None:
+    assert max(render_block(seed, backend) for seed in range(10)) > 0.5
 
 
 @pytest.mark.slow
-def test_a_million_wild_primitives() -> None:
-    assert max(render_block(seed) for seed in range(500)) > 0.5
+@pytest.mark.parametrize("backend", [b for b in FAST if b not in SLOW_HERE])
+def test_a_million_wild_primitives(backend: str) -> None:
+    assert max(render_block(seed, backend) for seed in range(500)) > 0.5
     if sys.platform == "linux":
         import resource
 

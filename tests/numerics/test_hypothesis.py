@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+from tests.backends import FAST
 from tests.numerics.extremes.draw import aimed, normalised, primitive
 from tests.numerics.extremes.measure import OPEN, Case, compare, gradients, integral_errors
 from tests.numerics.extremes.oracle import long_integrals
@@ -51,18 +53,19 @@ def case(d: Draw) -> Case | None:
     return Case(normalised(t, exact, d.rate, d.depth), camera, OPEN).cast("float32")
 
 
-def check(d: Draw) -> None:
+def check(d: Draw, backend: str = "cpu") -> None:
     drawn = case(d)
     if drawn is None:
         assume(False)
         return
-    errors = integral_errors(drawn, "cpu")
+    errors = integral_errors(drawn, backend)
     assert errors.forward <= FORWARD, f"error/S {errors.forward:.2g}, drawn in float64: {errors.wide}"
     assert errors.thin <= THIN, f"thin {errors.thin:.2g}, drawn in float64: {errors.wide}"
-    for name, value in gradients(drawn, "cpu", 0)[0].items():
+    for name, value in gradients(drawn, backend, 0)[0].items():
         assert torch.isfinite(value).all(), name
 
 
+OTHERS = [name for name in FAST if name != "cpu"]
 COMMON = {"derandomize": True, "deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
 
 
@@ -72,6 +75,14 @@ def test_bounds_hold_wherever_hypothesis_looks(d: Draw) -> None:
     check(d)
 
 
+@pytest.mark.parametrize("backend", OTHERS)
+@settings(max_examples=30, **COMMON)  # type: ignore[arg-type]
+@given(d=DRAWS, neurons=st.sampled_from([0, 1, 3, 8, 16]))
+def test_bounds_hold_on_other_backends(backend: str, d: Draw, neurons: int) -> None:
+    """With numbers of neurons that other tests have compiled kernels for."""
+    check(replace(d, neurons=neurons), backend)
+
+
 @pytest.mark.slow
 @settings(max_examples=5000, **COMMON)  # type: ignore[arg-type]
 @given(DRAWS)
@@ -79,16 +90,18 @@ def test_bounds_hold_wherever_hypothesis_looks_for_long(d: Draw) -> None:
     check(d)
 
 
-def test_found_cases_stay_mended() -> None:
+@pytest.mark.parametrize("backend", FAST)
+def test_found_cases_stay_mended(backend: str) -> None:
     for name, found in FOUND.items():
         assert case(found) is not None, f"{name}: the case must draw something"
-        check(found)
+        check(found, backend)
 
 
+@pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize("name", SWEPT)
-def test_swept_cases_stay_mended(name: str) -> None:
+def test_swept_cases_stay_mended(name: str, backend: str) -> None:
     region_name, number = SWEPT[name]
     region = next(r for r in REGIONS if r.name == region_name)
-    errors = compare(region.case(number), "cpu", "float32", region.whole, gradients=True)
+    errors = compare(region.case(number), backend, "float32", region.whole, gradients=True)
     assert errors.hits > 0
     assert errors.forward <= region.forward and errors.thin <= region.thin and errors.gradient <= region.gradient, errors

@@ -18,7 +18,7 @@ from neuprim.core.render import RenderSettings, choose, render_lowered
 from neuprim.core.render.joint import joint_volume
 from neuprim.core.render.reference.rays import pixel_directions
 from tests import scenes
-from tests.backends import BACKENDS, FAST
+from tests.backends import BACKENDS, FAST, by
 from tests.numerics.compare import assert_same_frame, draw
 
 NET = ("Wx", "bias", "Wout", "base")
@@ -93,10 +93,11 @@ def case(name: str) -> tuple[dict[str, Tensor], Camera, RenderSettings]:
 
 
 # at distance/radius 1e5 entries differ by less than float32 knows of their depth
+@pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize(("name", "sort"), [(n, s) for n in CASES for s in ORDERS if s == "center" or "1e5" not in n])
-def test_extremes(name: str, sort: str) -> None:
+def test_extremes(name: str, sort: str, backend: str) -> None:
     t, camera, settings = case(name)
-    fast, slow = assert_same_frame(t, camera, replace(settings, sort=sort))  # type: ignore[arg-type]
+    fast, slow = assert_same_frame(t, camera, replace(settings, sort=sort), backend=backend)  # type: ignore[arg-type]
     assert slow.output.alpha.max() > 0.1, "the view must show something"
     if " rad" in name:  # float32 knows the slower phases well enough, the others not
         assert (fast.output.stats.extra["float64"] > 30) == ("30 rad" not in name)
@@ -152,7 +153,7 @@ def test_negative_colours_are_black_and_pass_no_gradient(backend: str, sort: str
     t = scenes.tensors(40, 4, seed=2, hidden=5)
     t["base"] -= 10.0
     leaves = {k: v.requires_grad_() for k, v in t.items()}
-    out = render_lowered(scenes.lowered(leaves), scenes.camera(33, 25), RenderSettings(backend=backend, sort=sort))  # type: ignore[arg-type]
+    out = render_lowered(scenes.lowered(leaves), scenes.camera(33, 25), RenderSettings(**by(backend), sort=sort))  # type: ignore[arg-type]
     assert out.alpha.max() > 0.3 and out.rgb.abs().max() == 0
     out.rgb.sum().backward()
     assert all(v.grad is not None and v.grad.abs().max() == 0 for v in leaves.values())
@@ -165,7 +166,7 @@ def test_a_network_that_starts_at_zero_can_learn(backend: str) -> None:
     t["Wout"] *= 0
     t["base"] *= 0
     leaves = {k: v.requires_grad_() for k, v in t.items()}
-    out = render_lowered(scenes.lowered(leaves), scenes.camera(33, 25), RenderSettings(backend=backend))
+    out = render_lowered(scenes.lowered(leaves), scenes.camera(33, 25), RenderSettings(**by(backend)))
     out.rgb.sum().backward()
     seen = leaves["base"].grad
     assert seen is not None and (seen > 0.1).any() and leaves["Wout"].grad is not None and leaves["Wout"].grad.abs().max() > 0.1
@@ -243,7 +244,7 @@ def test_not_a_number_is_refused_by_name(name: str, value: float, backend: str) 
     t = scenes.tensors(20, hidden=3)
     t[name][13].view(-1)[-1] = value
     with pytest.raises(NonFiniteError, match=rf"\b{name} of primitive 13\b"):
-        render_lowered(scenes.lowered(t), scenes.camera(20, 20), RenderSettings(backend=backend))
+        render_lowered(scenes.lowered(t), scenes.camera(20, 20), RenderSettings(**by(backend)))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -253,7 +254,7 @@ def test_denormals_and_huge_phases_are_drawn(name: str, backend: str) -> None:
         leaves = {k: v.requires_grad_() for k, v in scenes.tensors(20, hidden=3).items()}
         with torch.no_grad():
             leaves[name][5] = value
-        out = render_lowered(scenes.lowered(leaves), scenes.camera(20, 20), RenderSettings(backend=backend))
+        out = render_lowered(scenes.lowered(leaves), scenes.camera(20, 20), RenderSettings(**by(backend)))
         assert torch.isfinite(out.rgb).all() and out.alpha.max() > 0.2
         out.rgb.sum().backward()
         assert all(v.grad is not None and torch.isfinite(v.grad).all() for v in leaves.values())
@@ -263,7 +264,7 @@ def test_denormals_and_huge_phases_are_drawn(name: str, backend: str) -> None:
 def test_no_primitives_at_all(backend: str) -> None:
     leaves = {k: v[:0].clone().requires_grad_() for k, v in scenes.tensors(2, hidden=3).items()}
     sky = torch.tensor([0.5, 0.25, 1.0])
-    out = render_lowered(scenes.lowered(leaves), scenes.camera(20, 17), RenderSettings(backend=backend), sky)
+    out = render_lowered(scenes.lowered(leaves), scenes.camera(20, 17), RenderSettings(**by(backend)), sky)
     assert torch.equal(out.rgb, sky.expand(17, 20, 3))
 
 
@@ -278,11 +279,12 @@ def test_only_colours_may_learn() -> None:
     assert all(torch.equal(a, b) for a, b in zip(*both, strict=True) if a is not None and b is not None)
 
 
-def test_double_precision_models() -> None:
+@pytest.mark.parametrize("backend", FAST)
+def test_double_precision_models(backend: str) -> None:
     t, camera = scenes.tensors(30, 3, seed=5, hidden=4), scenes.camera(30, 22)
     wide = {k: v.double().requires_grad_() for k, v in t.items()}
-    out = render_lowered(scenes.lowered(wide), camera, RenderSettings(backend="cpu"))
+    out = render_lowered(scenes.lowered(wide), camera, RenderSettings(**by(backend)))
     assert out.rgb.dtype == torch.float64
     out.rgb.sum().backward()
     assert wide["Wx"].grad is not None and wide["Wx"].grad.dtype == torch.float64
-    assert (out.rgb - render_lowered(scenes.lowered(t), camera, RenderSettings(backend="cpu")).rgb).abs().max() < 2e-6
+    assert (out.rgb - render_lowered(scenes.lowered(t), camera, RenderSettings(**by(backend))).rgb).abs().max() < 2e-6

@@ -14,13 +14,13 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render, render_lowered
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
-from tests.backends import BACKENDS
+from tests.backends import BACKENDS, by
 
 NAMES = ["means", "log_scales", "quats", "W1", "b1", "w2", "b2"]
 
 
 def settings(backend: str) -> RenderSettings:
-    return RenderSettings(backend=backend)
+    return RenderSettings(**by(backend))
 
 
 def model(count: int = 20) -> Primitives:

@@ -11,7 +11,7 @@ from torch import Tensor
 from neuprim.core.errors import ConfigError
 from neuprim.core.render import RenderOutput, RenderSettings, find, render_lowered
 from tests import scenes
-from tests.backends import BACKENDS
+from tests.backends import BACKENDS, by
 
 SETTINGS = RenderSettings(depth=True)
 SKY = torch.tensor([0.3, 0.6, 0.1])
@@ -35,7 +35,7 @@ def blocks(image: Tensor, n: int) -> Tensor:
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("n", [2, 3])
 def test_means_of_a_finer_image(backend: str, sort: str, n: int) -> None:
-    settings = replace(SETTINGS, backend=backend, sort=sort)  # type: ignore[arg-type]
+    settings = replace(SETTINGS, **by(backend), sort=sort)  # type: ignore[arg-type]
     first, second = leaves(), leaves()
     out, fine = frame(first, replace(settings, samples=n)), frame(second, settings, n)
     assert out.rgb.shape == (15, 20, 3) and out.alpha.shape == (15, 20) and out.depth is not None and fine.depth is not None
@@ -72,7 +72,7 @@ def test_statistics_compare_with_one_ray_per_pixel() -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_only_what_is_watched_is_summed(backend: str) -> None:
     """A tally is zeros until the backward pass; a second one takes the place of the first."""
-    out = frame(leaves(), replace(SETTINGS, backend=backend, samples=2))
+    out = frame(leaves(), replace(SETTINGS, **by(backend), samples=2))
     first, second = out.watch(torch.ones(15, 20)), out.watch(torch.full((15, 20), 0.25, requires_grad=True))
     assert second.weight.shape == second.error_weight.shape == (40,) and second.weight.abs().max() == 0
     out.rgb.sum().backward()
@@ -90,7 +90,7 @@ def test_counts_out_of_range_are_named(value: int) -> None:
 def test_one_sample_is_the_backend_itself(backend: str) -> None:
     draw = find(backend).load()
     t = scenes.tensors(40, 4, seed=6)
-    settings = replace(SETTINGS, backend=backend, samples=1)
+    settings = replace(SETTINGS, **by(backend), samples=1)
     out, direct = frame(t, settings), draw(scenes.lowered(t), CAMERA, SKY, settings)
     assert torch.equal(out.rgb, direct.rgb) and torch.equal(out.alpha, direct.alpha) and torch.equal(out.depth, direct.depth)
     assert out.stats.samples == direct.stats.samples == 1 and out.stats.pairs == direct.stats.pairs

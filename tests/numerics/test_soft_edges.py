@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neuprim.core.render import RenderSettings, render_lowered
 from tests import scenes
-from tests.backends import FAST
+from tests.backends import FAST, by
 from tests.numerics.cases import CASES, case
 from tests.numerics.compare import assert_same_frame
 from tests.numerics.wild import render_block
@@ -84,7 +84,7 @@ def test_silhouettes_have_finite_gradients_without_a_floor() -> None:
             for floor in (1e-12, 1e-2):
                 leaves = {k: v.clone().requires_grad_() for k, v in t.items()}
                 with scenes.soft(edge):
-                    out = render_lowered(scenes.lowered(leaves), camera, replace(settings, backend=backend, depth=False, depth_floor=floor))
+                    out = render_lowered(scenes.lowered(leaves), camera, replace(settings, **by(backend), depth=False, depth_floor=floor))
                 out.rgb.sum().backward()
                 assert leaves["means"].grad is not None and bool(torch.isfinite(leaves["means"].grad).all())
                 grads.append(leaves["means"].grad)
@@ -92,6 +92,7 @@ def test_silhouettes_have_finite_gradients_without_a_floor() -> None:
 
 
 @pytest.mark.parametrize("edge", EDGES)
-def test_wild_primitives_stay_finite(edge: int) -> None:
+@pytest.mark.parametrize("backend", FAST)
+def test_wild_primitives_stay_finite(backend: str, edge: int) -> None:
     with scenes.soft(edge):
-        assert max(render_block(seed) for seed in range(6)) > 0.3
+        assert max(render_block(seed, backend) for seed in range(6)) > 0.3

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from neuprim.core.render import RenderSettings, render_lowered
 from tests import scenes
+from tests.backends import by
 
 BLOCK = 2000
 
@@ -38,12 +39,12 @@ def wild(seed: int, count: int = BLOCK) -> dict[str, Tensor]:
     return {k: v.float() for k, v in t.items()}
 
 
-def render_block(seed: int) -> float:
+def render_block(seed: int, backend: str = "cpu") -> float:
     """Draw a block from inside or outside and go back; returns the largest opacity."""
     t = {k: v.requires_grad_() for k, v in wild(seed).items()}
     camera = scenes.camera(40, 32, distance=(0.1, 3.0, 50.0)[seed % 3], fov=(40.0, 120.0)[seed % 2])
     knobs = {"alpha_min": 0.0, "transmittance_min": 0.0} if seed % 5 == 0 else {}
-    out = render_lowered(scenes.lowered(t), camera, RenderSettings(backend="cpu", depth=seed % 2 == 0, **knobs))
+    out = render_lowered(scenes.lowered(t), camera, RenderSettings(**by(backend), depth=seed % 2 == 0, **knobs))
     assert torch.isfinite(out.rgb).all() and torch.isfinite(out.alpha).all(), f"image of block {seed}"
     total = out.rgb.sum() + out.alpha.sum()
     if out.depth is not None:

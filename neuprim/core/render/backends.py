@@ -18,6 +18,7 @@ from neuprim.core.cameras.rays import AnyCamera, RayCamera
 from neuprim.core.compute import device as hardware
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.model.forms import Constant, Cosine, RayNet
+from neuprim.core.notices import warn_once
 
 if TYPE_CHECKING:
     from neuprim.core.model.primitives import Lowered
@@ -98,6 +99,10 @@ class Backend:
     def place(self, settings: RenderSettings) -> str:
         """The kind of device that it draws on under these settings."""
         return self.devices[0] if settings.device == AUTO else settings.device
+
+    def computer(self, settings: RenderSettings) -> str:
+        """What it computes on under these settings, for a run's numbers."""
+        return self.device() if self.place(settings) == self.devices[0] else _processor()
 
     def absent(self, place: str) -> str | None:
         """Why it cannot draw on this kind of device here, as the rest of a sentence; None if it can."""
@@ -291,8 +296,12 @@ def choose(lowered: Lowered, settings: RenderSettings, camera: AnyCamera | None 
     check_device(settings)
     faults = []
     for backend in candidates(settings, lowered.kind):
-        fault = backend.fault(lowered, camera, backend.place(settings))
+        place = backend.place(settings)
+        fault = backend.fault(lowered, camera, place)
         if fault is None:
+            if place != backend.devices[0]:
+                own = next((f"; renderer.backend={b.name} is made for it" for b in TABLE if b.devices[0] == place), "")
+                warn_once(f"renderer.backend={backend.name} is slow on the {place}, where only its tests draw{own}")
             return backend
         faults.append(f"renderer.backend={backend.name} {fault}")
     other = next((b for b in TABLE if b.fault(lowered, camera) is None), None)

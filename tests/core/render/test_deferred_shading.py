@@ -12,7 +12,7 @@ from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.shading import points_seen
 from tests import scenes
-from tests.backends import BACKENDS
+from tests.backends import BACKENDS, by
 
 BACKGROUND = torch.tensor([0.3, 0.6, 0.9])
 
@@ -24,7 +24,7 @@ def lowered() -> Lowered:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_points_are_where_the_depth_image_says(backend: str) -> None:
     camera, found = scenes.camera(), []
-    settings = RenderSettings(backend=backend, depth=True)
+    settings = RenderSettings(**by(backend), depth=True)
     plain = render_lowered(lowered(), camera, settings)
     assert plain.depth is not None
 
@@ -46,7 +46,7 @@ def test_points_are_where_the_depth_image_says(backend: str) -> None:
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_matter_is_shaded_and_the_background_is_not(backend: str) -> None:
-    camera, settings = scenes.camera(), RenderSettings(backend=backend)
+    camera, settings = scenes.camera(), RenderSettings(**by(backend))
     black = render_lowered(lowered(), camera, settings)
     half = render_lowered(replace(lowered(), shade=lambda p: torch.full((len(p),), 0.5)), camera, settings, BACKGROUND)
     expected = 0.5 * black.rgb + (1 - black.alpha)[..., None] * BACKGROUND
@@ -57,7 +57,7 @@ def test_matter_is_shaded_and_the_background_is_not(backend: str) -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_gradients_are_those_of_the_product(backend: str) -> None:
     """Against a factor put on by hand to the picture over black; a depth image that nothing is asked of adds nothing."""
-    camera, settings = scenes.camera(), RenderSettings(backend=backend)
+    camera, settings = scenes.camera(), RenderSettings(**by(backend))
     weights = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
     grads = []
     for shaded in (True, False):

@@ -16,6 +16,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.render import RenderSettings, render_lowered
 from tests import scenes
+from tests.backends import by
 from tests.numerics.compare import undecided
 from tests.numerics.extremes.oracle import Integrals, long_colours, long_integrals
 
@@ -26,6 +27,7 @@ SOLID = 0.45  # shorter chords, as a share of the central one, are thin: D < 0.2
 OPAQUE = 1.5  # optical depth beyond which alpha is compared instead
 RIM = 1e-6  # |D| below which float32 may not know whether a ray meets an ellipsoid, which a hard edge's gradients hang on
 FUNCTIONALS = 4
+KEEPING = ("cpu", "reference")  # what others keep of a frame serves one backward pass
 _SHORTEST = 1e-2  # share of the central chord below which a soft edge's error is compared with that of one as long
 
 
@@ -55,7 +57,7 @@ class Errors:
         at: S/S_c where ``forward`` was found.
         gradient: error of a parameter's gradient over the gradient's norm; ``parameter`` is the worst one.
         hits: pixels compared.
-        wide: primitives that the cpu backend drew in float64.
+        wide: primitives that a fast backend drew in float64.
     """
 
     forward: float = 0.0
@@ -87,7 +89,7 @@ def drawn(case: Case, backend: str) -> tuple[np.ndarray, int]:  # type: ignore[t
     t = dict(case.tensors)
     t["colors"] = torch.ones_like(t["colors"][:, :1])
     with torch.no_grad():
-        out = render_lowered(scenes.lowered(t), case.camera, replace(case.settings, backend=backend))
+        out = render_lowered(scenes.lowered(t), case.camera, replace(case.settings, **by(backend)))
     return out.rgb[..., 0].double().numpy(), int(out.stats.extra.get("float64", 0))
 
 
@@ -127,7 +129,7 @@ def colour_errors(case: Case, backend: str, exact: Integrals) -> Errors:
     """
     plain = case.tensors | {"Wout": 0 * case.tensors["Wout"], "base": torch.ones_like(case.tensors["base"])}
     with torch.no_grad():
-        settings = replace(case.settings, backend=backend)
+        settings = replace(case.settings, **by(backend))
         out, of_one = (render_lowered(scenes.lowered(t), case.camera, settings) for t in (case.tensors, plain))
     opacity = of_one.rgb.double().numpy()
     seen = exact.hit & (opacity[..., 0] > 1e-30)
@@ -149,9 +151,12 @@ def gradients(case: Case, backend: str, seed: int, keep: Tensor | None = None) -
     h, w, C = case.camera.height, case.camera.width, scenes.channels(case.tensors)
     keep = torch.ones(h, w, 1, dtype=torch.float64) if keep is None else keep
     leaves = {k: v.detach().clone().requires_grad_() for k, v in case.tensors.items()}
-    out = render_lowered(scenes.lowered(leaves), case.camera, replace(case.settings, backend=backend))
+    lowered, settings = scenes.lowered(leaves), replace(case.settings, **by(backend))
+    out = render_lowered(lowered, case.camera, settings)
     grads = []
-    for _ in range(FUNCTIONALS):
+    for number in range(FUNCTIONALS):
+        if number and backend not in KEEPING:
+            out = render_lowered(lowered, case.camera, settings)
         rgb, alpha = ((torch.randn(h, w, n, generator=g, dtype=torch.float64) * keep).to(out.rgb.dtype) for n in (C, 1))
         found = torch.autograd.grad((out.rgb, out.alpha), list(leaves.values()), (rgb, alpha[..., 0]), retain_graph=True, allow_unused=True)
         grads.append({k: torch.zeros_like(v) if x is None else x for (k, v), x in zip(leaves.items(), found, strict=True)})
@@ -188,7 +193,7 @@ def frame_errors(case: Case, backend: str) -> tuple[Errors, Tensor]:
     exact = case.cast("float64")
     with torch.no_grad():
         images = [
-            render_lowered(scenes.lowered(c.tensors), c.camera, replace(c.settings, backend=name))
+            render_lowered(scenes.lowered(c.tensors), c.camera, replace(c.settings, **by(name)))
             for c, name in ((case, backend), (exact, "reference"))
         ]
     skip = undecided(exact.tensors, exact.camera, exact.settings)

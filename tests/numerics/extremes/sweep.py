@@ -6,13 +6,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from neuprim.core.model.edge import EDGES
-from neuprim.core.render.backends import ORACLE, available
+from neuprim.core.render.backends import ORACLE
+from tests import backends
 from tests.numerics.extremes.measure import OPAQUE, RIM, SOLID, Errors, compare, integrals
 from tests.numerics.extremes.regions import COLOUR, REGIONS, THIN, Region
 
 __all__ = ["BACKENDS", "Result", "document", "line", "measure", "sweep", "table"]
 
-BACKENDS = (*((backend.name, "float32") for backend in available()), (ORACLE, "float64"))
+BACKENDS = (*((name, "float32") for name in backends.BACKENDS), (ORACLE, "float64"))
 _HEADER = (
     "| region | backend | error/S | thin | gradient | drawn in float64 | bounds | |",
     "| --- | --- | --- | --- | --- | --- | --- | --- |",
@@ -77,7 +78,7 @@ def line(row: Sequence[Result]) -> str:
 
     thin = "" if region.whole else beside([f"{r.errors.thin:.1e}" for r in row])
     gradient = "" if first.backend == ORACLE else beside([f"{r.errors.gradient:.1e}" for r in row])
-    wide = beside([f"{r.errors.wide}" for r in row]) + f" of {first.errors.primitives}" if first.backend == "cpu" else ""
+    wide = beside([f"{r.errors.wide}" for r in row]) + f" of {first.errors.primitives}" if first.backend != ORACLE else ""
     bounds = [f"{region.forward:.0e}"]
     if not region.whole:
         bounds.append(_once([f"{region.thin_at(r.edge):.0e}" for r in row]))
@@ -116,7 +117,7 @@ What is compared:
 - **colour network**: the density is everyday; in place of its integral the colour is compared, over |base| + sum |Wout|, with the network
   in extended precision at the middle of the chord, on solid chords ("error/S") and on the others ("thin", without a factor). Radians
   are what the fastest unit turns over a length of 2 m.
-- **drawn in float64**: primitives whose pixels the cpu backend computes in float64, because float32 could not follow.
+- **drawn in float64**: primitives whose pixels a fast backend computes in float64, because float32 could not follow.
 
 ## Where the usual bounds do not hold
 

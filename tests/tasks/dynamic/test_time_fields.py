@@ -23,7 +23,7 @@ from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.density import PARTS, TimeDensity
 from neuprim.tasks.dynamic.invisible import invisible_fraction
 from tests import scenes
-from tests.backends import BACKENDS
+from tests.backends import BACKENDS, by
 
 VARIANTS = ["none", *("+".join(c) for n in range(1, len(PARTS) + 1) for c in itertools.combinations(PARTS, n))]
 COUNT = 30
@@ -138,7 +138,7 @@ def test_primitives_outside_their_window_are_left_out_and_nothing_changes() -> N
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_gradients_reach_living_primitives_and_no_others(backend: str) -> None:
     m = model("phase+offset+window+motion", dtype=torch.float32)
-    output = render(m, scenes.camera(), at(0.5), RenderSettings(backend=backend))
+    output = render(m, scenes.camera(), at(0.5), RenderSettings(**by(backend)))
     tally = output.watch(torch.ones(output.rgb.shape[:2]))
     (output.rgb * torch.rand(output.rgb.shape, generator=torch.Generator().manual_seed(1))).sum().backward()
     rows = m.density.alive(m.of(m.density), at(0.5))

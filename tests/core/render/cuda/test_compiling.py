@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
+import json
+import subprocess
+import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -12,6 +17,8 @@ pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip ins
 from neuprim.core.compute.warp import wp
 from neuprim.core.render.cuda import binning, prepare, prepare_backward
 
+BENCHMARKS = Path(__file__).parents[4] / "benchmarks"
+needs_sm_90 = pytest.mark.skipif(90 not in wp.get_cuda_supported_archs(), reason="this build of Warp does not compile for sm_90")
 KERNELS = {
     "prepare": prepare.prepare_kernel(False),
     "prepare of float64": prepare.prepare_kernel(True),
@@ -22,10 +29,68 @@ KERNELS = {
 }
 
 
-@pytest.mark.skipif(90 not in wp.get_cuda_supported_archs(), reason="this build of Warp does not compile for sm_90")
+@needs_sm_90
 @pytest.mark.parametrize("name", KERNELS)
 def test_it_compiles_for_sm_90(name: str, tmp_path: Path) -> None:
     kernel: Any = KERNELS[name]
     wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=False)
     (cubin,) = tmp_path.glob("*.cubin")
     assert cubin.stat().st_size > 1000
+
+
+# ---------------------------------------------------------------- what kernels take
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """benchmarks/gpu_kernels.py"""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    return importlib.import_module("gpu_kernels")
+
+
+@pytest.fixture
+def record(script: ModuleType) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(script.RESULTS.read_text(encoding="utf-8"))
+    return found
+
+
+@needs_sm_90
+@pytest.mark.parametrize("forms", [("K=8 p=0", "K=0 p=2"), ("every frame",)])
+def test_kernels_take_no_more_than_they_did(forms: tuple[str, ...], record: dict[str, Any]) -> None:
+    """In a process of its own, as kernels are compiled for blocks of their own sizes. Record what is meant: gpu_kernels.py --record."""
+    if record["warp"] != wp.__version__:
+        pytest.skip(f"recorded with Warp {record['warp']}, whose compiler is another one than that of {wp.__version__}")
+    words = [sys.executable, str(BENCHMARKS / "gpu_kernels.py"), "--check", "--archs", "90", "--forms", *forms]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("| 90 |") == sum(r["arch"] == 90 and r["form"] in forms for r in record["kernels"]) > 5
+
+
+def test_what_has_grown_or_spills_is_named(script: ModuleType, record: dict[str, Any]) -> None:
+    rows = record["kernels"]
+    assert script.grown(rows, rows) == [] and script.spilled(rows) == []
+    at = next(i for i, r in enumerate(rows) if (r["form"], r["kernel"], r["arch"]) == ("K=8 p=0", "forward", 90))
+    more = [*rows[:at], {**rows[at], "registers": 99, "stack": 8}, *rows[at + 1 :]]
+    assert script.grown(more, rows) == [
+        f"K=8 p=0: forward on sm_90: registers {rows[at]['registers']} -> 99",
+        "K=8 p=0: forward on sm_90: stack 0 -> 8",
+    ]
+    assert script.spilled(more) == ["K=8 p=0: forward spills on sm_90: 8 bytes of stack"]
+    assert script.grown(rows, rows[:at] + rows[at + 1 :]) == ["K=8 p=0: forward on sm_90 is not recorded"]
+
+
+def test_every_form_is_recorded_for_every_architecture(script: ModuleType, record: dict[str, Any]) -> None:
+    rows = record["kernels"]
+    wanted = {(form, name, arch) for form in (*script.FORMS, script.EVERY) for name, _, _ in script.kernels(form) for arch in script.ARCHS}
+    assert {(r["form"], r["kernel"], r["arch"]) for r in rows} == wanted and len(rows) == len(wanted)
+    page = script.PAGE.read_text(encoding="utf-8")
+    assert f"<!-- gpu-kernels -->\n{script.document(record)}\n<!-- /gpu-kernels -->" in page
+
+
+def test_a_file_that_is_no_cubin_is_refused(script: ModuleType, tmp_path: Path) -> None:
+    cubins = importlib.import_module("shared.cubins")
+    file = tmp_path / "a.cubin"
+    file.write_bytes(b"MZ" * 50)
+    with pytest.raises(ValueError, match="no 64-bit ELF file"):
+        cubins.resources(file)

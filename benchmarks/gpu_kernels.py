@@ -1,0 +1,161 @@
+"""What every kernel of the CUDA backend takes of a card, compiled ahead of time on any machine: registers, stack, shared memory, code.
+
+    python benchmarks/gpu_kernels.py [--archs 80 89 90] [--forms "K=8 p=0" ...] [--record | --check | --from-record]
+
+Compiled are the kernels of K = 0, 2, 8 and 16 neurons, hard edges and p = 2, with constant colours and with colour networks of 8 units, and
+those that every frame needs. No driver is needed. A stack means spilled registers, but for kernels in float64, which keep their neurons there;
+one at K <= 8 exits with status 1, unless the kernel itself asks for fewer registers than it could use ("capped"), as more warps hide more.
+
+--record        writes benchmarks/results/gpu_kernels.json and the table in docs/gpu.md
+--check         compares with what is recorded there: exits with status 1 when registers, stack or shared memory have grown
+--from-record   writes the table from the file and compiles nothing
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import warp
+from shared.cubins import compiled, resources
+from shared.tables import ROOT, Table, between_markers
+
+from neuprim.core.compute.warp import BLOCK
+from neuprim.core.render.cuda import binning, delicate, forward, net, passes, prepare, prepare_backward
+from neuprim.core.render.cuda import layout as L
+from neuprim.core.render.cuda.forms import Form
+from neuprim.core.render.cuda.placement import PER_BLOCK
+
+RESULTS = Path(__file__).parent / "results" / "gpu_kernels.json"
+PAGE = ROOT / "docs" / "gpu.md"
+ARCHS = (80, 89, 90)
+EVERY = "every frame"
+NET = ", H=8"
+FORMS = {f"K={K} p={p}{NET if H > 0 else ''}": Form(K, p, 3, H) for H, K, p in product((-1, 8), (0, 2, 8, 16), (0, 2))}
+UNSPILLED, IN_FLOAT64 = 8, "float64"
+"""Neurons up to which no kernel may spill, other than those with this in their name."""
+
+Row = dict[str, Any]
+
+
+def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
+    """(name, kernel, threads of a block) of a form, or of every frame."""
+    if name == EVERY:
+        yield "prepare", prepare.prepare_kernel(False), PER_BLOCK
+        yield "prepare, backward", prepare_backward._kernel(False), PER_BLOCK
+        yield "rows in float64", prepare.wide_kernel(False), PER_BLOCK
+        yield "network units", net._kernels(False)[0], PER_BLOCK
+        yield "emit", binning._kernels()[0], PER_BLOCK
+        yield "list", binning._kernels()[1], BLOCK
+        yield "spans", passes.row_spans, BLOCK
+        yield "sums", passes.sum_pairs, BLOCK
+        yield "float64 pairs", delicate.delicate_kernel(False), L.WARP
+        return
+    form = FORMS[name]
+    yield "forward", forward.forward_kernel(form, True, False), L.PIXELS
+    yield "pixels", passes.pixels_kernel(form, False), L.PIXELS
+    if form.hidden > 0:
+        yield "network pairs", passes.net_pairs_kernel(form), L.WARP
+        return
+    yield "pairs", passes.pairs_kernel(form, False), L.WARP
+    yield "composite by entry", passes.composite_kernel(form, False), BLOCK
+    yield "uncomposite by entry", passes.uncomposite_kernel(form, False), BLOCK
+    yield "float64 pairs, backward", passes.delicate_pairs_kernel(form, False), L.WARP
+
+
+def measure(archs: list[int], forms: list[str]) -> list[Row]:
+    table, rows = Table("form", "kernel", "arch", "threads", "capped", "registers", "stack", "shared", "code"), []
+    with tempfile.TemporaryDirectory() as place:
+        for form in forms:
+            for kernel, compiles, block in kernels(form):
+                for arch in archs:
+                    found = resources(compiled(compiles, arch, block, Path(place) / str(len(rows))))
+                    capped = compiles.options.get("launch_bounds") is not None
+                    row = {"form": form, "kernel": kernel, "arch": arch, "threads": block, "capped": capped, **asdict(found)}
+                    rows.append(row)
+                    table.row(*row.values())
+    return rows
+
+
+def spilled(rows: list[Row]) -> list[str]:
+    return [
+        f"{r['form']}: {r['kernel']} spills on sm_{r['arch']}: {r['stack']} bytes of stack"
+        for r in rows
+        if r["stack"]
+        and not r["capped"]
+        and IN_FLOAT64 not in r["kernel"]
+        and (r["form"] == EVERY or FORMS[r["form"]].neurons <= UNSPILLED)
+    ]
+
+
+def grown(rows: list[Row], recorded: list[Row]) -> list[str]:
+    """What takes more than it did, or is not in the record."""
+    before = {(r["form"], r["kernel"], r["arch"]): r for r in recorded}
+    found = []
+    for row in rows:
+        old = before.get((row["form"], row["kernel"], row["arch"]))
+        where = f"{row['form']}: {row['kernel']} on sm_{row['arch']}"
+        if old is None:
+            found.append(f"{where} is not recorded")
+            continue
+        found += [f"{where}: {key} {old[key]} -> {row[key]}" for key in ("registers", "stack", "shared") if row[key] > old[key]]
+    return found
+
+
+def document(record: dict[str, Any]) -> str:
+    """The table of docs/gpu.md: registers of the hot kernels, with the stack where there is any."""
+    found = {(r["form"], r["kernel"], r["arch"]): r for r in record["kernels"]}
+    columns = ("forward", "pixels", "pairs", "network pairs")
+    lines = [f"| form | {' | '.join(columns)} |", "| --- |" + " --- |" * len(columns)]
+    for form in FORMS:
+        cells = []
+        for kernel in columns:
+            rows = [found[form, kernel, arch] for arch in ARCHS if (form, kernel, arch) in found]
+            texts = [str(r["registers"]) + (f" + {r['stack']} B" if r["stack"] else "") + (" capped" if r["capped"] else "") for r in rows]
+            cells.append(texts[0] if len(set(texts)) == 1 else " / ".join(texts))
+        lines.append(f"| {form} | {' | '.join(cells)} |")
+    shared = max(r["shared"] for r in record["kernels"])
+    most = max((r for r in record["kernels"] if r["form"] == EVERY), key=lambda r: r["registers"])
+    said = (
+        f"Registers a thread on sm_{' / '.join(str(a) for a in ARCHS)}, one number where they agree, with bytes of stack where registers "
+        f'spill, "capped" where a kernel asks for fewer than it could use; C = 3 channels, H = 8 units of a colour network. Of the kernels that every frame needs {most["kernel"]} takes the most, '
+        f"{most['registers']}; no block has more than {shared:,} bytes of shared memory. Compiled with Warp {record['warp']}."
+    )
+    return f"{said}\n\n" + "\n".join(lines)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--archs", nargs="*", type=int, choices=ARCHS, default=list(ARCHS))
+    parser.add_argument("--forms", nargs="*", choices=(*FORMS, EVERY), default=[*FORMS, EVERY])
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--record", action="store_true")
+    what.add_argument("--check", action="store_true")
+    what.add_argument("--from-record", action="store_true")
+    args = parser.parse_args()
+    if args.from_record:
+        between_markers(PAGE, "gpu-kernels", document(json.loads(RESULTS.read_text())))
+        return 0
+    rows = measure(args.archs, args.forms)
+    faults = spilled(rows)
+    if args.check:
+        faults += grown(rows, json.loads(RESULTS.read_text())["kernels"])
+    if args.record:
+        record = {"warp": warp.__version__, "kernels": rows}
+        lines = ",\n".join("  " + json.dumps(row) for row in rows)
+        RESULTS.write_text(f'{{\n "warp": "{warp.__version__}",\n "kernels": [\n{lines}\n ]\n}}\n')
+        between_markers(PAGE, "gpu-kernels", document(record))
+    for fault in faults:
+        print(fault, file=sys.stderr)
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

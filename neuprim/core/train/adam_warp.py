@@ -29,8 +29,8 @@ _MOVE = """
     const float g = reinterpret_cast<const float*>(grad)[i];
     float& m = reinterpret_cast<float*>(first)[i];
     float& v = reinterpret_cast<float*>(second)[i];
-    m = beta1 * m + (1.0f - beta1) * g;
-    v = beta2 * v + (1.0f - beta2) * g * g;
+    m = beta1 * m + rest1 * g;
+    v = beta2 * v + rest2 * g * g;
     reinterpret_cast<float*>(value)[i] -= step * m / (sqrtf(v) * slow + 1e-15f);
 """
 
@@ -41,8 +41,9 @@ def _finite(grad: wp.uint64, i: wp.int64) -> int: ...
 
 @wp.func_native(_MOVE)
 def _move(
-    value: wp.uint64, grad: wp.uint64, first: wp.uint64, second: wp.uint64, i: wp.int64, step: float, slow: float, beta1: float, beta2: float
-): ...
+    value: wp.uint64, grad: wp.uint64, first: wp.uint64, second: wp.uint64, i: wp.int64, step: float, slow: float,
+    beta1: float, beta2: float, rest1: float, rest2: float,
+): ...  # fmt: skip
 
 
 @functools.cache
@@ -62,9 +63,9 @@ def _kernels() -> tuple[Any, Any]:
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def move(
         values: _POINTERS, grads: _POINTERS, firsts: _POINTERS, seconds: _POINTERS, ends: _LONGS, widths: _LONGS, rates: _FLOATS,
-        beta1: float, beta2: float, log1: float, log2: float, age: wp.array(dtype=wp.int64), bad: wp.array(dtype=wp.int32),
+        beta1: float, beta2: float, rest1: float, rest2: float, log1: float, log2: float, age: wp.array(dtype=wp.int64), bad: wp.array(dtype=wp.int32),
     ):  # fmt: skip
-        """``widths``: numbers per row; ``log1``, ``log2``: logarithms of the betas; ``age``: steps of each row, this one included."""
+        """``widths``: numbers per row; ``rest1``, ``rest2``: 1 - beta, rounded once; ``log1``, ``log2``: logarithms of the betas; ``age``: steps of each row, this one included."""
         n = wp.int64(wp.tid())
         if bad[0] == 0:
             k = int(0)
@@ -79,7 +80,7 @@ def _kernels() -> tuple[Any, Any]:
             if t * log2 > -0.25:  # the difference would cancel: 1 - exp(x) = -x (1 + x/2 (1 + x/3 (1 + x/4 (1 + x/5))))
                 x = t * log2
                 slow = wp.sqrt(1.0 / (-x * (1.0 + x * 0.5 * (1.0 + x / 3.0 * (1.0 + x * 0.25 * (1.0 + x * 0.2))))))
-            _move(values[k], grads[k], firsts[k], seconds[k], i, step, slow, beta1, beta2)
+            _move(values[k], grads[k], firsts[k], seconds[k], i, step, slow, beta1, beta2, rest1, rest2)
 
     return check, move
 
@@ -114,5 +115,5 @@ def adam_rows(
     for total, pointers, ends_, _, _ in groups:
         launch(check, total, (pointers[1], ends_, flag), device)
     for total, pointers, ends_, widths, own in groups:
-        launch(move, total, (*pointers, ends_, widths, own, *betas, *logs, array(age, wp.int64), flag), device)
+        launch(move, total, (*pointers, ends_, widths, own, *betas, *(1 - beta for beta in betas), *logs, array(age, wp.int64), flag), device)
     return int(bad) == 0

@@ -69,7 +69,9 @@ def camera(width: int, height: int) -> Camera:
     return Camera(square.viewmat, square.fx, square.fy, width / 2, height / 2, width, height)
 
 
-def step_of(lowered: Lowered, leaves: list[torch.Tensor], cam: Camera, settings: RenderSettings) -> tuple[Callable[[], Any], Callable[[], Any], Callable[[], Any]]:
+def step_of(
+    lowered: Lowered, leaves: list[torch.Tensor], cam: Camera, settings: RenderSettings
+) -> tuple[Callable[[], Any], Callable[[], Any], Callable[[], Any]]:
     """A forward pass, a forward and backward pass, and a training step."""
     background = torch.zeros(3, device="cuda")
     target = torch.rand(cam.height, cam.width, 3, device="cuda")
@@ -93,7 +95,10 @@ def step_of(lowered: Lowered, leaves: list[torch.Tensor], cam: Camera, settings:
 
 
 def times(counts: list[int], sizes: list[tuple[int, int]]) -> list[dict[str, Any]]:
-    table, rows = Table("form", "primitives", "size", "pairs", "hits", "forward ms", "forward + backward", "step", "frames/s", "peak MB"), []
+    table, rows = (
+        Table("form", "primitives", "size", "pairs", "hits", "forward ms", "forward + backward", "step", "frames/s", "peak MB"),
+        [],
+    )
     settings = RenderSettings(backend="cuda")
     for name, (K, p) in FORMS.items():
         for count in counts:
@@ -161,14 +166,25 @@ def train(names: list[str], folders: dict[str, Any]) -> list[dict[str, Any]]:
         fitted = complete(fitted)
         ms = 1e3 * (fitted.trainer.elapsed - before) / (STEPS[name] - 20)
         metrics = fitted.metrics()
-        rows.append({"scene": name, "primitives": fitted.model.count, "steps": STEPS[name], "step_ms": ms, "psnr": metrics[scene.judged], "of": scene.judged})
+        rows.append(
+            {
+                "scene": name,
+                "primitives": fitted.model.count,
+                "steps": STEPS[name],
+                "step_ms": ms,
+                "psnr": metrics[scene.judged],
+                "of": scene.judged,
+            }
+        )
         table.row(name, fitted.model.count, STEPS[name], f"{ms:.2f}", f"{metrics[scene.judged]:.2f}", scene.judged)
     return rows
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--parts", nargs="*", default=["parity", "times", "kernels", "train"], choices=("parity", "times", "kernels", "train"))
+    parser.add_argument(
+        "--parts", nargs="*", default=["parity", "times", "kernels", "train"], choices=("parity", "times", "kernels", "train")
+    )
     parser.add_argument("--scenes", nargs="*", type=int, default=[5_000, 20_000, 100_000, 300_000, 1_000_000])
     parser.add_argument("--sizes", nargs="*", default=["800x800", "1920x1080"])
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"), help="of the part parity")
@@ -178,7 +194,10 @@ def main() -> None:
     parser.add_argument("--record", action="store_true")
     args = parser.parse_args()
     sizes = [tuple(int(x) for x in size.split("x")) for size in args.sizes]
-    result: dict[str, Any] = {"device": torch.cuda.get_device_name() if torch.cuda.is_available() else "Warp's CPU blocks", "torch": torch.__version__}
+    result: dict[str, Any] = {
+        "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "Warp's CPU blocks",
+        "torch": torch.__version__,
+    }
     if "parity" in args.parts:
         result["parity"] = parity(args.device)
     if "times" in args.parts:

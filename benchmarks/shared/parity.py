@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from shared.tables import Table
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
@@ -15,6 +14,7 @@ from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
+from shared.tables import Table
 
 __all__ = ["KINDS", "parity", "small_scene"]
 
@@ -50,7 +50,9 @@ def drawn(values: list[Tensor], edge: int, settings: RenderSettings, device: str
     means, log_scales, quats, W1, b1, w2, b2, colours = leaves
     lowered = Lowered(Geometry(means, log_scales, quats), Cosine(W1, b1, w2, b2, 30.0, edge), Constant(colours))
     out = render_lowered(lowered, Camera(view, 70.0, 72.0, 31.0, 33.0, SIZE, SIZE), settings, background)
-    image = torch.cat([out.rgb, out.alpha[..., None], torch.zeros_like(out.alpha[..., None]) if out.depth is None else out.depth[..., None]], -1)
+    image = torch.cat(
+        [out.rgb, out.alpha[..., None], torch.zeros_like(out.alpha[..., None]) if out.depth is None else out.depth[..., None]], -1
+    )
     weights = torch.randn(SIZE, SIZE, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     weights[..., 4] *= 0.1
     grads = torch.autograd.grad((image * weights.to(image)).sum(), [*leaves, view, background], allow_unused=True)
@@ -69,8 +71,20 @@ def parity(device: str) -> list[dict[str, Any]]:
             image, found = drawn(values, edge, own, device, torch.float32)
             again, refound = drawn(values, edge, own, device, torch.float32)
             same = bool((image == again).all()) and all(bool((a == b).all()) for a, b in zip(found, refound, strict=True))
-            worst = [float((a - b).abs().max() / b.abs().max().clamp_min(1e-9)) if b.numel() else 0.0 for a, b in zip(found, expected, strict=True)]
+            worst = [
+                float((a - b).abs().max() / b.abs().max().clamp_min(1e-9)) if b.numel() else 0.0
+                for a, b in zip(found, expected, strict=True)
+            ]
             error = float((image - truth).abs().max())
-            rows.append({"neurons": neurons, "edge": edge, "scene": kind, "image": error, "gradients": dict(zip(NAMES, worst, strict=True)), "same": same})
+            rows.append(
+                {
+                    "neurons": neurons,
+                    "edge": edge,
+                    "scene": kind,
+                    "image": error,
+                    "gradients": dict(zip(NAMES, worst, strict=True)),
+                    "same": same,
+                }
+            )
             table.row(f"{neurons}, {edge}", kind, f"{error:.1e}", *(f"{w:.0e}" for w in worst), same)
     return rows

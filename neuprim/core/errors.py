@@ -15,6 +15,7 @@ __all__ = [
     "CheckpointError",
     "ConfigError",
     "DataError",
+    "DeviceMemoryError",
     "FormError",
     "NeuprimError",
     "NonFiniteError",
@@ -50,6 +51,10 @@ class BackendUnavailable(NeuprimError):
 
 class NonFiniteError(NeuprimError):
     """A parameter, gradient or loss became NaN or infinite; the message names parameter and primitive."""
+
+
+class DeviceMemoryError(NeuprimError):
+    """A card's memory is full; the message says with what, and what to lower."""
 
 
 class FormError(NeuprimError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from neuprim.core.model.checks import check_shape
 
-__all__ = ["RenderOutput", "RenderStats", "Tally", "Watch", "mean_depth"]
+__all__ = ["RenderOutput", "RenderStats", "Tally", "Watch", "mean_depth", "together"]
 
 
 @dataclass
@@ -33,6 +34,13 @@ class Tally:
             return self.weight, self.error_weight
         weight, error_weight = (sums.new_zeros(count).index_copy_(0, self.rows, sums) for sums in (self.weight, self.error_weight))
         return weight, error_weight
+
+
+def together(tallies: Sequence[Tally], count: int) -> Tally:
+    """The sums over several frames of a model with ``count`` primitives."""
+    sums = [tally.of_all(count) for tally in tallies]
+    weight, error = (torch.stack([each[k] for each in sums]).sum(0) for k in (0, 1))
+    return Tally(weight, error)
 
 
 @dataclass

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="valid-type, no-untyped-def"
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Adam over all parameters of a model in two launches on a card: one that looks for numbers that are not finite, one that moves.
 
 In torch code a step is a hundred launches, which take longer than a small frame. Warp is imported with this module.
@@ -115,5 +115,7 @@ def adam_rows(
     for total, pointers, ends_, _, _ in groups:
         launch(check, total, (pointers[1], ends_, flag), device)
     for total, pointers, ends_, widths, own in groups:
-        launch(move, total, (*pointers, ends_, widths, own, *betas, *(1 - beta for beta in betas), *logs, array(age, wp.int64), flag), device)
+        launch(
+            move, total, (*pointers, ends_, widths, own, *betas, *(1 - beta for beta in betas), *logs, array(age, wp.int64), flag), device
+        )
     return int(bad) == 0

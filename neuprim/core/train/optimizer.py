@@ -158,12 +158,17 @@ class RowAdam:
         """The update in two launches on a card; False, and nothing done, where it cannot be or a gradient is not finite."""
         from neuprim.core.train.adam_warp import adam_rows
 
-        groups = [[v for _, v, _ in updates], [g for _, _, g in updates], [self.m[s.name] for s, _, _ in updates], [self.v[s.name] for s, _, _ in updates]]
-        values, _, first, second = groups
-        if not all(x.dtype == torch.float32 for group in groups for x in group) or not all(x.is_contiguous() for x in (*values, *first, *second)):
+        values, grads = [value for _, value, _ in updates], [grad for _, _, grad in updates]
+        first, second = ([moments[spec.name] for spec, _, _ in updates] for moments in (self.m, self.v))
+        groups = (values, grads, first, second)
+        if not all(x.dtype == torch.float32 for group in groups for x in group) or not all(
+            x.is_contiguous() for x in (*values, *first, *second)
+        ):
             return False
         age, betas = self.age + 1, (BETA1, self.beta2)
-        if not adam_rows(*groups, [rates[s.name] for s, _, _ in updates], age, betas, (math.log(BETA1), math.log(self.beta2))):
+        if not adam_rows(
+            values, grads, first, second, [rates[s.name] for s, _, _ in updates], age, betas, (math.log(BETA1), math.log(self.beta2))
+        ):
             return False
         self.age = age
         return True

@@ -78,7 +78,8 @@ class TrainSettings:
     elapsed/max_seconds.
 
     Attributes:
-        iterations: steps, one view each.
+        iterations: steps.
+        views_per_step: views that a step looks at; gradients are their mean. A card has room for several small images.
         max_seconds: stop after this many seconds of training, if given (such a run is not bit-reproducible).
         rates: learning rate by parameter name, over the specs' own.
         rate_units: unit of a parameter's rate by its name, over the spec's own: "absolute" (a position's is in scene units a step), or
@@ -102,6 +103,7 @@ class TrainSettings:
     """
 
     iterations: Annotated[int, Range(at_least=0)] = 30_000
+    views_per_step: Annotated[int, Range(1, 1024)] = 1
     max_seconds: Annotated[float, Range(above=0, says="a positive number of seconds")] | None = None
     rates: dict[str, NotNegative] = field(default_factory=dict)
     rate_units: dict[str, RateUnit] = field(default_factory=dict)

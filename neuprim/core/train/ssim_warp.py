@@ -1,4 +1,4 @@
-# mypy: disable-error-code="valid-type, no-untyped-def"
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """L1 + SSIM with its analytic gradient in four launches on a card: the twin of :mod:`neuprim.core.train.ssim_cpu`, see there for the derivation.
 
 Blurs are separable: a thread a number, eleven taps along a row, then along a column, and back again for the gradient. Warp is imported with
@@ -108,7 +108,14 @@ def similarity(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, 
         return torch.empty(shape, dtype=torch.float32, device=device)
 
     window = _window()
-    rows, S, maps, columns, difference, grad = empty(H, w, C, 5), empty(h, w, C), empty(h, w, C, 3), empty(H, w, C, 3), empty(H, W, C), empty(H, W, C)
+    rows, S, maps, columns, difference, grad = (
+        empty(H, w, C, 5),
+        empty(h, w, C),
+        empty(h, w, C, 3),
+        empty(H, w, C, 3),
+        empty(H, W, C),
+        empty(H, W, C),
+    )
     first, second = array(a, wp.float32), array(b, wp.float32)
     along_rows, compare, back_along_columns, gradient = _kernels()
     launch(along_rows, (H, w, C), (first, second, window, array(rows, _vec5)), device)

@@ -25,12 +25,12 @@ from neuprim.core.data import Dataset, Pixels
 from neuprim.core.data.check import check_pixels, check_points
 from neuprim.core.data.initial import subset
 from neuprim.core.data.points_file import read_points
-from neuprim.core.errors import CheckpointError, ConfigError, DataError, NonFiniteError, nearest
+from neuprim.core.errors import CheckpointError, ConfigError, DataError, DeviceMemoryError, NonFiniteError, nearest
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.render.output import Tally
+from neuprim.core.render.output import Tally, together
 from neuprim.core.render.place import device_of
 from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.ahead import Ahead
@@ -49,7 +49,7 @@ _USUAL_OPACITY = 0.5
 
 @dataclass(frozen=True)
 class StepReport:
-    """What one step did. ``psnr`` is of the training view just seen, or of the extinction at points where no view was; ``change`` says what
+    """What one step did. ``psnr`` is of the training view just seen (the mean of several), or of the extinction at points where no view was; ``change`` says what
     the population did, if anything."""
 
     step: int
@@ -195,9 +195,18 @@ class Trainer:
 
         Raises:
             NonFiniteError: a loss, gradient or parameter is NaN or infinite; nothing was updated by this step.
+            DeviceMemoryError: the card has no room for a step; what was saved is intact.
         """
-        with limited(self.renderer.threads):
-            return self._train_step()
+        try:
+            with limited(self.renderer.threads):
+                return self._train_step()
+        except torch.OutOfMemoryError as error:
+            camera = self.dataset.train.view(0).camera
+            size = f"{camera.width} x {camera.height} pixels"
+            raise DeviceMemoryError(
+                f"{self.device}: out of memory at step {self.step} with {self.model.count} primitives, images of {size} and "
+                f"train.views_per_step={self.settings.views_per_step}; lower one of them. The last checkpoint is intact"
+            ) from error
 
     def _train_step(self) -> StepReport:
         start = time.perf_counter()
@@ -207,13 +216,17 @@ class Trainer:
         for value in model.params.values():
             value.grad = None
 
-        seen = None if self.settings.supervision == "voxels" else self._look(progress)
+        looks = 0 if self.settings.supervision == "voxels" else self.settings.views_per_step
+        others = [self._look_and_leave(progress, looks) for _ in range(looks - 1)]
+        seen = self._look(progress) if looks else None
         known = self._look_inside() if self._points_due() else None
         if seen is None:
             assert known is not None
             loss, parts = known.loss, known.parts
         else:
             loss, parts = seen.loss, seen.parts
+            if others:
+                loss = loss / looks
             if known is not None:
                 loss, parts = loss + self.settings.voxel_weight * known.loss, {**parts, **known.parts}
         if self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from:
@@ -225,7 +238,7 @@ class Trainer:
 
         tally = seen.tally if seen is not None else known.tally() if known is not None else None
         assert tally is not None
-        self.population.observe(model, tally)
+        self.population.observe(model, tally if not others else together([*(other.tally for other in others), tally], model.count))
         self.optimizer.step(model.params, self.rates())
         self.step += 1
         change = None
@@ -235,7 +248,19 @@ class Trainer:
                 self._apply(change)
         self.elapsed += time.perf_counter() - start
         psnr, name = (seen.psnr, seen.name) if seen is not None else (known.psnr, known.name) if known is not None else (0.0, "")
+        if seen is not None and others:
+            cost += sum(other.loss.item() for other in others) / looks
+            psnr, name = sum(view.psnr for view in (*others, seen)) / looks, f"{name} and {looks - 1} more"
+            parts = parts | {part: sum(view.parts[part] for view in (*others, seen)) / looks for part in seen.parts}
         return StepReport(self.step, self.elapsed, cost, parts, psnr, model.count, name, change.text if change else None)
+
+    def _look_and_leave(self, progress: float, looks: int) -> _ImageStep:
+        """One of several views of a step: its share of the gradient stays, and what its frame kept is given back."""
+        seen = self._look(progress)
+        if not math.isfinite(seen.loss.item()):
+            self._refuse(seen.loss.item(), seen, None)
+        (seen.loss / looks).backward()
+        return replace(seen, loss=seen.loss.detach())
 
     def _look(self, progress: float) -> _ImageStep:
         """Draw the next view and compare."""

@@ -14,10 +14,13 @@ from torch import Tensor
 from neuprim.core import checkpoint
 from neuprim.core.compute import threads
 from neuprim.core.data import Dataset
-from neuprim.core.errors import CheckpointError, ConfigError, DataError, NonFiniteError
+from neuprim.core.errors import CheckpointError, ConfigError, DataError, DeviceMemoryError, NonFiniteError
 from neuprim.core.metrics import psnr
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import Tally
 from neuprim.core.task import Supervision
-from neuprim.core.train.settings import ModelSettings, TrainSettings
+from neuprim.core.train.population.fixed import Fixed
+from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer, initial_model
 from neuprim.runs.measure import draw
 from tests.core import tiny
@@ -186,6 +189,52 @@ def test_the_psnr_of_a_step_is_that_of_the_pixels_that_count() -> None:
     assert report.psnr == pytest.approx(expected, abs=1e-4)
 
 
+class _Seen(Fixed):
+    """Leaves the model as it is and keeps what it was told."""
+
+    def __init__(self) -> None:
+        super().__init__(PopulationSettings(strategy="fixed"))
+        self.weights: list[Tensor] = []
+
+    def observe(self, model: Primitives, tally: Tally) -> None:
+        self.weights.append(tally.of_all(model.count)[0].clone())
+
+
+@pytest.mark.parametrize("views", [2, 3])
+def test_gradients_of_several_views_are_their_mean(views: int, plain: Dataset) -> None:
+    """And the population sees all of them, and the report speaks of all of them."""
+    still = {spec.name: 0.0 for spec in tiny.trainer(plain, 10).model.specs}
+    several = tiny.trainer(plain, 10, views_per_step=views, rates=still)
+    single = tiny.trainer(plain, 10, rates=still)
+    several.population, single.population = together, apart = _Seen(), _Seen()
+    report = several.train_step()
+    grads: dict[str, Tensor] = {}
+    reports = []
+    for _ in range(views):
+        reports.append(single.train_step())
+        for name, value in single.model.params.items():
+            if value.grad is not None:  # bands of colours that are locked have none
+                grads[name] = grads.get(name, torch.zeros_like(value)) + value.grad / views
+    assert len(grads) >= 8
+    rounding = 1e-6 * max(float(grad.abs().max()) for grad in grads.values())  # of spheres, turning them is nothing else
+    for name, value in several.model.params.items():
+        assert (value.grad is not None) == (name in grads)
+        assert value.grad is None or torch.allclose(value.grad, grads[name], rtol=1e-4, atol=rounding), name
+    assert len(together.weights) == 1 and torch.allclose(together.weights[0], sum(apart.weights, torch.zeros(())), rtol=1e-5)
+    assert report.loss == pytest.approx(sum(r.loss for r in reports) / views, rel=1e-5)
+    assert report.psnr == pytest.approx(sum(r.psnr for r in reports) / views, rel=1e-5)
+    assert report.parts == pytest.approx({k: sum(r.parts[k] for r in reports) / views for k in reports[0].parts}, rel=1e-5)
+    assert report.view == f"{reports[-1].view} and {views - 1} more" and several.step == 1
+
+
+def test_a_non_finite_image_among_several_stops_by_view() -> None:
+    dataset = tiny.two_primitives()
+    dataset.train.images[2].rgb[3, 4, 1] = float("nan")  # type: ignore[attr-defined]
+    trainer = tiny.trainer(dataset, views_per_step=6)
+    with pytest.raises(NonFiniteError, match=r"loss is nan at step 0 on view v2"):
+        trainer.train_step()
+
+
 # ---------------------------------------------------------------- what goes wrong
 
 
@@ -220,6 +269,16 @@ def test_a_non_finite_gradient_stops_by_name(name: str) -> None:
         trainer.train_step()
     assert all(torch.equal(v, before[k]) for k, v in trainer.model.params.items())
     assert trainer.optimizer.age.tolist() == [3] * 12
+
+
+def test_a_full_card_is_one_line_that_says_what_to_lower(plain: Dataset) -> None:
+    trainer = tiny.trainer(plain, views_per_step=2)
+    trainer.train_step()
+    trainer.loss = lambda *_: (_ for _ in ()).throw(torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB"))
+    with pytest.raises(
+        DeviceMemoryError, match=r"out of memory at step 1 with 12 primitives, images of \d+ x \d+ pixels and train.views_per_step=2; lower"
+    ):
+        trainer.train_step()
 
 
 def test_a_non_finite_parameter_stops_by_name(plain: Dataset) -> None:

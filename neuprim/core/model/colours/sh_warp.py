@@ -1,4 +1,4 @@
-# mypy: disable-error-code="valid-type, no-untyped-def"
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Spherical-harmonics colours with their gradient on a card, a thread a primitive, float64 inside: the twin of
 :mod:`neuprim.core.model.colours.sh_cpu`. Warp is imported with this module."""
 
@@ -124,17 +124,23 @@ def _kernels(degree: int) -> tuple[Any, Any]:
 
 class _Colors(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
         means, dc, rest = (x.detach().contiguous() for x in (means, dc, rest))
         centre = device.beside(origin.detach(), means).double().contiguous()
         color = torch.empty(dc.shape, dtype=torch.float32, device=dc.device)
-        arrays = (array(means, wp.vec3), array(dc, wp.float32), array(rest, wp.float32), array(centre, wp.float64), array(color, wp.float32))
+        arrays = (
+            array(means, wp.vec3),
+            array(dc, wp.float32),
+            array(rest, wp.float32),
+            array(centre, wp.float64),
+            array(color, wp.float32),
+        )
         launch(_kernels(degree)[0], len(means), arrays, means.device)
         ctx.tensors, ctx.degree, ctx.origin = (means, rest, centre, color), degree, (origin.dtype, origin.device)
         return color
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
         means, rest, centre, color = ctx.tensors
         g_means, g_dc, g_rest = torch.empty_like(means), torch.empty_like(color), torch.empty_like(rest)
         launch(

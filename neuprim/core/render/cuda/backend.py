@@ -64,7 +64,14 @@ class _Rasterize(torch.autograd.Function):
             net = prepared_net(log_scales, quats, *network)
         try:
             frame = prepared(
-                tensors, colors, camera, viewmat, settings.near, omega0 / (2 * math.pi), edge, net.fast if net is not None and net.hidden else None
+                tensors,
+                colors,
+                camera,
+                viewmat,
+                settings.near,
+                omega0 / (2 * math.pi),
+                edge,
+                net.fast if net is not None and net.hidden else None,
             )
         except NotFinite as error:
             raise _blame(tensors | {"base" if network else "colors": colors}, error.row) from None

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Backward, first pass: a thread a pixel walks its hits back to front and leaves dL/dI and the weight in each slot. No neurons, no sums."""
 
 from __future__ import annotations
@@ -19,24 +20,24 @@ def pixels_kernel(form: Form, depth: bool) -> Any:
     C, H = form.channels, form.hidden
     colours = L.colours(form.neurons)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)  # type: ignore[untyped-decorator]
+    @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
     def backward_pixels(
-        rows: wp.array2d(dtype=wp.vec4),  # type: ignore[valid-type]
-        starts: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-        ids: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-        spans: wp.array2d(dtype=wp.uint16),  # type: ignore[valid-type]
-        offsets: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        rows: wp.array2d(dtype=wp.vec4),
+        starts: wp.array(dtype=wp.int32),
+        ids: wp.array(dtype=wp.int32),
+        spans: wp.array2d(dtype=wp.uint16),
+        offsets: wp.array(dtype=wp.int32),
         limits: wp.vec4,
         size: wp.vec2i,
-        transmittance: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-        reached: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-        g_rgb: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
-        g_transmittance: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-        g_z: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-        depths: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-        hues: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
-        hits: wp.array(dtype=wp.vec2),  # type: ignore[valid-type]
-    ):  # type: ignore[no-untyped-def]
+        transmittance: wp.array(dtype=wp.float32),
+        reached: wp.array(dtype=wp.int32),
+        g_rgb: wp.array2d(dtype=wp.float32),
+        g_transmittance: wp.array(dtype=wp.float32),
+        g_z: wp.array(dtype=wp.float32),
+        depths: wp.array(dtype=wp.float32),
+        hues: wp.array2d(dtype=wp.float32),
+        hits: wp.array(dtype=wp.vec2),
+    ):
         """``g_transmittance`` already holds the background's share. With b what lies behind a hit, sum of w (dL/dw) and the rest of the light:
         dL/dI = (1 - alpha) T dL/dw - b, and 0 where the opacity was clamped."""
         tile, lane = wp.tid()

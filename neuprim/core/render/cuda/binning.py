@@ -1,4 +1,4 @@
-# mypy: disable-error-code="valid-type, no-untyped-def"
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Tile lists on the device: which primitives reach which 16 x 16 tile, front to back; the twin of :mod:`neuprim.core.render.cpu.binning`.
 
 Everything is counted before it is written, and sorted by integers, so that a rerun gives the same bits. The host waits once, for how many

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="valid-type, no-untyped-def"
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Compositing in the order in which each ray enters its chords (``sort = "entry"``), forward and backward.
 
 Every hit is listed first, with a key of pixel and entry (:mod:`~neuprim.core.render.cuda.forward`), the list is sorted, and a thread a pixel walks

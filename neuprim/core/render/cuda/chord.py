@@ -1,3 +1,4 @@
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """One pixel's chord through one primitive on the device, forward and backward: the CPU's (:mod:`neuprim.core.render.cpu.chord`) in vectors.
 
 Method: "Line integral". An optical depth is I = N_p |d| D^p half field, with field the mean of the density's numerator, weighted by the edge.
@@ -44,12 +45,12 @@ class Chord:
 
 
 @wp.func
-def xyz(a: wp.vec4):  # type: ignore[no-untyped-def]
+def xyz(a: wp.vec4):
     return wp.vec3(a[0], a[1], a[2])
 
 
 @wp.func
-def ray_of(rows: Any, j: int):  # type: ignore[no-untyped-def]
+def ray_of(rows: Any, j: int):
     """From row ``j`` of a tile of rows or of the whole array."""
     r = Ray()
     r.e0 = rows[j, L.E0]
@@ -62,7 +63,7 @@ def ray_of(rows: Any, j: int):  # type: ignore[no-untyped-def]
 
 
 @wp.func
-def chord(r: Ray, px: float, py: float):  # type: ignore[no-untyped-def]
+def chord(r: Ray, px: float, py: float):
     """Of the pixel centre (px, py)."""
     c = Chord()
     c.du = px - r.e0[3]
@@ -96,7 +97,7 @@ class Pull:
 
 
 @wp.func
-def through(c: Chord, g_half: float, g_mid: float, g_tm: float, gD: float, gA: float, gq: wp.vec3, gv: wp.vec3):  # type: ignore[no-untyped-def]
+def through(c: Chord, g_half: float, g_mid: float, g_tm: float, gD: float, gA: float, gq: wp.vec3, gv: wp.vec3):
     """From dL/d(half, mid) and dL/d(chord middle) = gq, dL/d(half e) = gv; gD is complete, with what reaches D through ``h``."""
     gt1 = 0.5 * (g_mid + g_half)
     gt0 = 0.5 * (g_mid - g_half) * c.uncut
@@ -112,7 +113,7 @@ def through(c: Chord, g_half: float, g_mid: float, g_tm: float, gD: float, gA: f
 
 
 @wp.func
-def through_chord(c: Chord, g_half: float, g_mid: float, gD: float, by_depth: float, gq: wp.vec3, gv: wp.vec3):  # type: ignore[no-untyped-def]
+def through_chord(c: Chord, g_half: float, g_mid: float, gD: float, by_depth: float, gq: wp.vec3, gv: wp.vec3):
     """The same in float32, where dh/dD = ``by_depth`` and nothing reaches a ray on other ways than D and the ends."""
     gt1 = 0.5 * (g_mid + g_half)
     gt0 = 0.5 * (g_mid - g_half) * c.uncut
@@ -120,13 +121,13 @@ def through_chord(c: Chord, g_half: float, g_mid: float, gD: float, by_depth: fl
 
 
 @wp.func
-def pixel(lane: int):  # type: ignore[no-untyped-def]
+def pixel(lane: int):
     """(x, y) in the tile of a block's thread: a warp covers 8 x 4 pixels, which small primitives fill better than rows."""
     return wp.vec2i((lane & 7) | ((lane >> 2) & 8), ((lane >> 3) & 3) | ((lane >> 4) & 12))
 
 
 @wp.func
-def place(span: int, offset: int, x: int):  # type: ignore[no-untyped-def]
+def place(span: int, offset: int, x: int):
     """Slot of pixel x of a tile row, -1 outside its span (start << 8 | last << 4 | first)."""
     slot = int(-1)
     if x >= (span & 15) and x <= ((span >> 4) & 15):

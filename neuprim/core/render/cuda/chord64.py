@@ -1,3 +1,4 @@
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """One pixel's chord and the mean density along it in float64, for the few primitives that float32 cannot follow.
 
 Needles and discs near the camera, fast neurons, and every soft edge that the near plane may cut. The formulas are the CPU's
@@ -37,12 +38,12 @@ class Chord64:
 
 
 @wp.func
-def _vector(wide: wp.array2d(dtype=wp.float64), r: int, c: int):  # type: ignore
+def _vector(wide: wp.array2d(dtype=wp.float64), r: int, c: int):
     return wp.vec3d(wide[r, c], wide[r, c + 1], wide[r, c + 2])
 
 
 @wp.func
-def chord64(wide: wp.array2d(dtype=wp.float64), r: int, X: int, Y: int):  # type: ignore
+def chord64(wide: wp.array2d(dtype=wp.float64), r: int, X: int, Y: int):
     """Of pixel (X, Y) and row ``r``."""
     c = Chord64()
     zero = wp.float64(0.0)
@@ -79,7 +80,7 @@ class Weight:
 
 
 @wp.func
-def weight_of(c: Chord64, edge: int):  # type: ignore[no-untyped-def]
+def weight_of(c: Chord64, edge: int):
     """(D - a (shift + half u)^2)^p."""
     w = Weight()
     two = wp.float64(2.0)
@@ -110,7 +111,7 @@ def weight_of(c: Chord64, edge: int):  # type: ignore[no-untyped-def]
 
 
 @wp.func
-def _bessel(z: wp.float64):  # type: ignore[no-untyped-def]
+def _bessel(z: wp.float64):
     """j_0 to j_5 of any z: a series below 2, where upward recursion loses digits."""
     j = vec6d()
     one = wp.float64(1.0)
@@ -137,7 +138,7 @@ def _bessel(z: wp.float64):  # type: ignore[no-untyped-def]
 
 
 @wp.func
-def moments(z: wp.float64):  # type: ignore[no-untyped-def]
+def moments(z: wp.float64):
     """C_0, S_1, C_2, S_3, C_4, S_5."""
     j = _bessel(z)
     two = wp.float64(2.0)
@@ -154,20 +155,20 @@ def moments(z: wp.float64):  # type: ignore[no-untyped-def]
 
 
 @wp.func
-def neuron64(wide: wp.array2d(dtype=wp.float64), r: int, o: int):  # type: ignore
+def neuron64(wide: wp.array2d(dtype=wp.float64), r: int, o: int):
     """(WX, WY, WZ) of the unit at column ``o``."""
     return _vector(wide, r, o)
 
 
 @wp.func
-def phase64(c: Chord64, w: wp.vec3d, phase: wp.float64):  # type: ignore[no-untyped-def]
+def phase64(c: Chord64, w: wp.vec3d, phase: wp.float64):
     """At the chord's middle, in radians, of less than half a turn."""
     u = wp.dot(c.q, w) + phase
     return wp.float64(6.283185307179586) * (u - wp.rint(u))
 
 
 @wp.func
-def rate64(c: Chord64, w: wp.vec3d):  # type: ignore[no-untyped-def]
+def rate64(c: Chord64, w: wp.vec3d):
     """z, radians over half a chord."""
     return wp.float64(6.283185307179586) * c.half * wp.dot(c.e, w)
 
@@ -183,7 +184,7 @@ class Moments:
 
 
 @wp.func
-def dot64(w: Weight, M: vec6d):  # type: ignore[no-untyped-def]
+def dot64(w: Weight, M: vec6d):
     """The moments of a weight."""
     out = Moments()
     out.even = w.q[0] * M[0] + w.q[2] * M[2] + w.q[4] * M[4]

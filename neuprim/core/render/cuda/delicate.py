@@ -1,3 +1,4 @@
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Opacities in float64 of the primitives that float32 cannot follow, and where rays enter them, left in their pixels' slots beforehand."""
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ __all__ = ["delicate_kernel", "ray_norm"]
 
 
 @wp.func
-def ray_norm(lens: wp.vec4, X: int, Y: int):  # type: ignore[no-untyped-def]
+def ray_norm(lens: wp.vec4, X: int, Y: int):
     """Length of the ray direction whose camera-z is 1."""
     x = (wp.float64(X) + wp.float64(0.5) - wp.float64(lens[2])) / wp.float64(lens[0])
     y = (wp.float64(Y) + wp.float64(0.5) - wp.float64(lens[3])) / wp.float64(lens[1])
@@ -27,23 +28,23 @@ def ray_norm(lens: wp.vec4, X: int, Y: int):  # type: ignore[no-untyped-def]
 def delicate_kernel(depth: bool) -> Any:
     """For any form; ``depth``: also camera-z of the chords' middles."""
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)  # type: ignore[untyped-decorator]
+    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def delicate(
-        pairs: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-        wide: wp.array2d(dtype=wp.float64),  # type: ignore[valid-type]
-        slots: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-        ids: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-        tiles: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-        spans: wp.array2d(dtype=wp.uint16),  # type: ignore[valid-type]
-        offsets: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        pairs: wp.array(dtype=wp.int32),
+        wide: wp.array2d(dtype=wp.float64),
+        slots: wp.array(dtype=wp.int32),
+        ids: wp.array(dtype=wp.int32),
+        tiles: wp.array(dtype=wp.int32),
+        spans: wp.array2d(dtype=wp.uint16),
+        offsets: wp.array(dtype=wp.int32),
         lens: wp.vec4,
         limits: wp.vec4,
         size: wp.vec2i,
         neurons: int,
         edge: int,
-        hits: wp.array(dtype=wp.vec2),  # type: ignore[valid-type]
-        depths: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    ):  # type: ignore[no-untyped-def]
+        hits: wp.array(dtype=wp.vec2),
+        depths: wp.array(dtype=wp.float32),
+    ):
         """A warp a pair of those listed in ``pairs``; ``slots[i]``: the row of primitive i in ``wide``."""
         member, lane = wp.tid()
         n = pairs[member]

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """The backward pass over pairs for primitives in float64: :mod:`~neuprim.core.render.cuda.backward_pairs` for the few.
 
 A hard edge has the gradient of its ends. A soft one has none there, the density being zero, and its weight depends on D, on a = e.e and on the
@@ -30,26 +31,26 @@ def delicate_pairs_kernel(form: Form, depth: bool) -> Any:
     width = L.gradient_width(K, C)
     row_of, add_lanes = row_type(width), row_sums(width)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)  # type: ignore[untyped-decorator]
+    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def delicate_pairs(
-        pairs: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-        wide: wp.array2d(dtype=wp.float64),  # type: ignore[valid-type]
-        slots: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-        ids: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-        tiles: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-        spans: wp.array2d(dtype=wp.uint16),  # type: ignore[valid-type]
-        offsets: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        pairs: wp.array(dtype=wp.int32),
+        wide: wp.array2d(dtype=wp.float64),
+        slots: wp.array(dtype=wp.int32),
+        ids: wp.array(dtype=wp.int32),
+        tiles: wp.array(dtype=wp.int32),
+        spans: wp.array2d(dtype=wp.uint16),
+        offsets: wp.array(dtype=wp.int32),
         lens: wp.vec4,
         depth_floor: float,
         size: wp.vec2i,
         neurons: int,
-        reached: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-        hits: wp.array(dtype=wp.vec2),  # type: ignore[valid-type]
-        g_rgb: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
-        g_z: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-        error: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-        out: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    ):  # type: ignore[no-untyped-def]
+        reached: wp.array(dtype=wp.int32),
+        hits: wp.array(dtype=wp.vec2),
+        g_rgb: wp.array2d(dtype=wp.float32),
+        g_z: wp.array(dtype=wp.float32),
+        error: wp.array(dtype=wp.float32),
+        out: wp.array(dtype=wp.float32),
+    ):
         member, lane = wp.tid()
         n = pairs[member]
         r = slots[ids[n]]

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Compositing, forward: a block a tile, a thread a pixel.
 
 Rows of primitives come to shared memory in batches; a tile ends when no pixel sees light through it any more. What the backward pass needs
@@ -25,7 +26,7 @@ CUT_AT = -1e30
 
 
 @wp.func
-def key_of(pixel: int, entry: float):  # type: ignore[no-untyped-def]
+def key_of(pixel: int, entry: float):
     """Sorts by pixel, then by entry: floats in the order of integers."""
     bits = wp.int64(wp.cast(entry, wp.int32))
     if bits < wp.int64(0):
@@ -56,28 +57,28 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False) -
     colour_type = wp.types.vector(length=C, dtype=wp.float32)
     mean = float(NORMS[P])
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)  # type: ignore[untyped-decorator]
+    @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
     def forward(
-        rows: wp.array2d(dtype=wp.vec4),  # type: ignore[valid-type]
-        net: wp.array2d(dtype=wp.vec4),  # type: ignore[valid-type]
-        starts: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-        ids: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-        spans: wp.array2d(dtype=wp.uint16),  # type: ignore[valid-type]
-        offsets: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+        rows: wp.array2d(dtype=wp.vec4),
+        net: wp.array2d(dtype=wp.vec4),
+        starts: wp.array(dtype=wp.int32),
+        ids: wp.array(dtype=wp.int32),
+        spans: wp.array2d(dtype=wp.uint16),
+        offsets: wp.array(dtype=wp.int32),
         lens: wp.vec4,
         limits: wp.vec4,
-        background: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+        background: wp.array(dtype=wp.float32),
         size: wp.vec2i,
-        rgb: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
-        transmittance: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-        zsum: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-        hits: wp.array(dtype=wp.vec2),  # type: ignore[valid-type]
-        depths: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-        hues: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
-        reached: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-        keys: wp.array(dtype=wp.int64),  # type: ignore[valid-type]
-        owners: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    ):  # type: ignore[no-untyped-def]
+        rgb: wp.array2d(dtype=wp.float32),
+        transmittance: wp.array(dtype=wp.float32),
+        zsum: wp.array(dtype=wp.float32),
+        hits: wp.array(dtype=wp.vec2),
+        depths: wp.array(dtype=wp.float32),
+        hues: wp.array2d(dtype=wp.float32),
+        reached: wp.array(dtype=wp.int32),
+        keys: wp.array(dtype=wp.int64),
+        owners: wp.array(dtype=wp.int32),
+    ):
         """limits = (alpha_min, alpha_max, transmittance_min, -); ``net``, ``hues``: of colour networks; ``reached[tile]``: the pairs before it
         were composited."""
         tile, lane = wp.tid()

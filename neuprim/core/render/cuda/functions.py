@@ -1,3 +1,4 @@
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Functions of one phase on the device: cos and B_p in turns, as the CPU's polynomials up to half a turn and by recursion beyond.
 
 B_p(z) = (2p + 1)!! j_p(z)/z^p and B_p' = -z B_(p+1)/(2p + 3), so that the backward pass needs one more member of the family and nothing else.
@@ -32,7 +33,7 @@ Function = Callable[..., Any]
 
 
 @wp.func
-def cos_turns(y: float):  # type: ignore[no-untyped-def]
+def cos_turns(y: float):
     """cos(2 pi r) of y = r^2, |r| <= 1/2."""
     return (((((_C6 * y + _C5) * y + _C4) * y + _C3) * y + _C2) * y + _C1) * y + _C0
 
@@ -41,10 +42,10 @@ def _polynomial(coefficients: tuple[float, ...]) -> Function:
     c0, c1, c2, c3, c4, c5 = coefficients
 
     @wp.func
-    def polynomial(y: float):  # type: ignore[no-untyped-def]
+    def polynomial(y: float):
         return ((((c5 * y + c4) * y + c3) * y + c2) * y + c1) * y + c0
 
-    return polynomial  # type: ignore[no-any-return]
+    return polynomial
 
 
 _B = tuple(_polynomial(c) for c in BANDS)
@@ -52,7 +53,7 @@ _sinc = _B[0]
 
 
 @wp.func
-def sin_turns(r: float):  # type: ignore[no-untyped-def]
+def sin_turns(r: float):
     """sin(2 pi r), |r| <= 1/2."""
     return TAU * r * _sinc(r * r)
 
@@ -62,7 +63,7 @@ def band_of(edge: int) -> tuple[Function, Function]:
     low, high = _B[edge], _B[edge + 1]
 
     @wp.func
-    def value(v: float):  # type: ignore[no-untyped-def]
+    def value(v: float):
         k = wp.rint(v)
         r = v - k
         y = r * r
@@ -78,7 +79,7 @@ def band_of(edge: int) -> tuple[Function, Function]:
         return 15.0 * (3.0 * j1 * iz - j0) * iz * iz
 
     @wp.func
-    def pair(v: float):  # type: ignore[no-untyped-def]
+    def pair(v: float):
         k = wp.rint(v)
         r = v - k
         y = r * r

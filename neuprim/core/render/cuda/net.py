@@ -1,4 +1,4 @@
-# mypy: disable-error-code="valid-type, no-untyped-def"
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Colour networks per primitive (:class:`~neuprim.core.model.forms.RayNet`), in float64: the twin of :mod:`neuprim.core.render.cpu.colour_net`.
 
 The network sees the chord's middle, which the density's pixel stage has anyway in whitened space: its first layer goes there, in turns, once per
@@ -183,7 +183,7 @@ def net_backward(
         weights: (N, .) gradient rows of the density's pass; grads: (N, .) those of the networks' pass, units from column ``first``.
     """
     double = net.Wx.dtype == torch.float64
-    real, vec3, vec4 = _types(double)
+    _, vec3, vec4 = _types(double)
     out = tuple(torch.empty(x.shape, dtype=torch.float32, device=x.device) for x in (net.Wx, net.bias, net.Wout))
     launch(
         _kernels(double)[2], net.Wx.shape[0],

@@ -105,7 +105,9 @@ def forward(frame: Frame, form: Form, net: Net | None, background: Tensor, setti
         else:
             total = int(ends[-1])
         if total >= _MOST_HITS:
-            raise BackendUnavailable(f"primitives cover {total} pixels in all; the cuda backend counts to {_MOST_HITS - 1}: render a smaller image")
+            raise BackendUnavailable(
+                f"primitives cover {total} pixels in all; the cuda backend counts to {_MOST_HITS - 1}: render a smaller image"
+            )
 
     def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.empty(shape, dtype=dtype, device=device)
@@ -160,7 +162,14 @@ def forward(frame: Frame, form: Form, net: Net | None, background: Tensor, setti
 
 
 def backward(
-    frame: Frame, form: Form, net: Net | None, drawn: Composited, settings: RenderSettings, g_rgb: Tensor, g_T: Tensor, g_z: Tensor | None,
+    frame: Frame,
+    form: Form,
+    net: Net | None,
+    drawn: Composited,
+    settings: RenderSettings,
+    g_rgb: Tensor,
+    g_T: Tensor,
+    g_z: Tensor | None,
     error: Tensor,
 ) -> tuple[Tensor, Tensor | None]:
     """(N, gradient_width) gradient rows, and (N, net_width) of colour networks; the slots' contents are used up.
@@ -176,7 +185,12 @@ def backward(
     rows, ids, tile_of = array(frame.rows, wp.vec4), array(lists.ids, wp.int32), array(lists.tile_of, wp.int32)
     shapes, starts_at, hits = array(drawn.spans, wp.uint16), array(drawn.offsets, wp.int32), array(drawn.hits, wp.vec2)
     reached, grad = array(drawn.reached, wp.int32), array(g_rgb, wp.float32)
-    T, gT, zs, hues = array(drawn.transmittance, wp.float32), array(g_T, wp.float32), array(drawn.depths, wp.float32), array(drawn.hues, wp.float32)
+    T, gT, zs, hues = (
+        array(drawn.transmittance, wp.float32),
+        array(g_T, wp.float32),
+        array(drawn.depths, wp.float32),
+        array(drawn.hues, wp.float32),
+    )
     if drawn.order is None or drawn.begins is None or drawn.owners is None:
         launch(
             pixels_kernel(form, depth), (tiles, L.PIXELS),

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="valid-type, no-untyped-def"
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Where a primitive lies before the camera, in float64: what the per-primitive kernels and their backward pass share.
 
 The twin of ``_frame`` and of the geometry in ``_wide_row`` of :mod:`neuprim.core.render.cpu.prepare`, which say what the numbers are.

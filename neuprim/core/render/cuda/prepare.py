@@ -1,4 +1,4 @@
-# mypy: disable-error-code="valid-type, no-untyped-def"
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """The per-primitive stage on the device, one thread a primitive, float64 inside: the twin of :mod:`neuprim.core.render.cpu.prepare`.
 
 Three differences of form: rows are float4 with the colours in them, neurons stay in the model's order, and TU and TV are 0 where a caller's

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="valid-type, no-untyped-def"
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """The chain rule from gradient rows to parameters, one thread a primitive, float64 inside: the twin of the CPU's ``prepare_backward``."""
 
 import functools

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="valid-type, no-untyped-def"
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Colour networks at pixels: the backward pass over pairs of what they add, and both passes in float64 for delicate primitives.
 
 A slot's hue is the colour before max(0, .), which the forward pass leaves there. A network's share of the gradient of a ray comes through the
@@ -144,7 +144,7 @@ def delicate_hues_kernel(channels: int) -> Any:
 @functools.cache
 def delicate_net_kernel(form: Form) -> Any:
     """:func:`net_pairs_kernel` for delicate pairs, in float64."""
-    C, H = form.channels, form.hidden
+    C = form.channels
     each, width = L.net_columns(C), net_width(form)
     row_of, add_lanes = row_type(width), row_sums(width)
     vecC = wp.types.vector(length=C, dtype=wp.float32)

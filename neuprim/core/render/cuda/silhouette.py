@@ -1,4 +1,4 @@
-# mypy: disable-error-code="valid-type, no-untyped-def"
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Which tiles a primitive's silhouette reaches, row by row: exact for ellipses, up to a margin of 1e-3 pixels; the twin of ``_reached``."""
 
 from neuprim.core.compute.warp import wp

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Which pixels of a tile a primitive's silhouette covers: a span in each of its 16 rows.
 
 Each pixel inside has a slot of its own, in the order of pairs, rows and pixels, where the forward pass leaves what the backward pass needs: a
@@ -15,17 +16,17 @@ __all__ = ["row_spans"]
 _MARGIN, _ROUNDING = 2e-3, 4e-7  # pixels, and per pixel of the ellipse; a pixel too many is rejected by its own D
 
 
-@wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)  # type: ignore[untyped-decorator]
+@wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
 def row_spans(
-    rows: wp.array2d(dtype=wp.vec4),  # type: ignore[valid-type]
-    silhouettes: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
-    boxes: wp.array(dtype=wp.vec4i),  # type: ignore[valid-type]
-    ids: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    tiles: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+    rows: wp.array2d(dtype=wp.vec4),
+    silhouettes: wp.array2d(dtype=wp.float32),
+    boxes: wp.array(dtype=wp.vec4i),
+    ids: wp.array(dtype=wp.int32),
+    tiles: wp.array(dtype=wp.int32),
     size: wp.vec2i,
-    spans: wp.array2d(dtype=wp.uint16),  # type: ignore[valid-type]
-    counts: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-):  # type: ignore[no-untyped-def]
+    spans: wp.array2d(dtype=wp.uint16),
+    counts: wp.array(dtype=wp.int32),
+):
     """Thread n: the rows of pair n, start << 8 | last << 4 | first, and how many pixels they have together."""
     n = wp.tid()
     i = ids[n]

@@ -102,6 +102,10 @@ def light_visibility(
 
     def visibility(points: Tensor) -> Tensor:
         points, limits = points.detach().double().contiguous(), (bias * diameter, softness * diameter)
+        if device.kernels(points, opacities):
+            from neuprim.tasks.relight import visibility_warp
+
+            return visibility_warp.arriving_light(points, device.beside(view, points), near, focal, opacities, distances, *limits)
         if not device.fused(points, opacities):
             return arriving(points, device.beside(view, points), near, focal, opacities, distances, *limits)
         from neuprim.tasks.relight.visibility_cpu import arriving_light  # numba, loaded when first needed

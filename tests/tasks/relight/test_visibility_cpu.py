@@ -57,6 +57,24 @@ def test_depth_images_are_read_as_torch_reads_them(slabs: int) -> None:
     assert found[50] == 1.0
 
 
+@pytest.mark.parametrize("slabs", [1, 4])
+def test_so_are_they_on_a_card(slabs: int) -> None:
+    """Its kernel, on Warp's CPU blocks; beside what is on the processor, also for points that are not finite."""
+    pytest.importorskip("warp", reason="the cuda backend's kernels need Warp")
+    from neuprim.tasks.relight import visibility_warp
+
+    generator = torch.Generator().manual_seed(slabs)
+    alphas = torch.rand(slabs, 24, 24, generator=generator)
+    alphas[torch.rand(alphas.shape, generator=generator) < 0.4] = 0.0
+    depths = torch.where(alphas > 0, 0.01 + 4 * torch.rand(alphas.shape, generator=generator), 0.0)
+    points = 6 * torch.rand(5000, 3, generator=generator, dtype=torch.float64) - 3
+    points[7], points[8, 1], points[9] = float("nan"), float("inf"), camera().position
+    given = (points, camera().viewmat[:3].contiguous(), 0.05, 20.0, alphas, depths, 0.2, 0.3)
+    found, wanted = visibility_warp.arriving_light(*given), np.full(len(points), -1.0, np.float32)
+    arriving_light(0, len(points), *(x.numpy() if isinstance(x, Tensor) else x for x in given), wanted)
+    assert torch.allclose(found, torch.from_numpy(wanted), rtol=0, atol=1e-6) and 0.1 < float((found < 0.99).float().mean())
+
+
 def test_points_that_are_not_finite_are_lit() -> None:
     points = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, -np.inf]])
     found = np.zeros(3, np.float32)

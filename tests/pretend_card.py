@@ -83,6 +83,8 @@ class Card(TorchDispatchMode):
                     raise RuntimeError(f"{name}: expected all tensors to be on the same device, found {[str(x.device) for x in tensors]}")
         if cards and (name in _WAITS or (name == "aten::_to_copy" and asked is not None and torch.device(asked).type == "cpu")):
             self.waits["copy to the host" if name == "aten::_to_copy" else name.removeprefix("aten::")] += 1
+        if name == "aten::_to_copy" and not cards and asked is not None and torch.device(asked) == CARD and not kwargs.get("non_blocking"):
+            self.waits["copy to the card"] += 1
         if name in _INDEXED and any(isinstance(x, Tensor) and x.dtype == torch.bool for x in tree_iter(args[1])) and cards:
             self.waits["index by a mask"] += 1
         if asked is not None:
@@ -104,7 +106,7 @@ class _Written(TorchFunctionMode):
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
         if func in (torch.tensor, torch.as_tensor) and kwargs.get("device") is not None:
-            return func(*args, **{**kwargs, "device": None}).to(kwargs["device"])
+            return func(*args, **{**kwargs, "device": None}).to(kwargs["device"])  # a wait, too
         return func(*args, **kwargs)
 
 
@@ -113,13 +115,14 @@ def _held(value: Any) -> Any:
 
 
 @contextmanager
-def pretended(monkeypatch: pytest.MonkeyPatch) -> Iterator[Card]:
-    """Inside, this machine has a card, and a backend that draws on it: the processor's, with what it takes and makes moved."""
+def pretended(monkeypatch: pytest.MonkeyPatch, memory: int = 1 << 30) -> Iterator[Card]:
+    """Inside, this machine has a card with some bytes of memory, and a backend that draws on it: the processor's, with what it takes and makes moved."""
     with monkeypatch.context() as patch:
         patch.setattr(device, "CARD", CARD.type)
         patch.setattr(device, "KINDS", ("cpu", CARD.type))
         patch.setattr(device, "card_missing", lambda: None)
         patch.setattr(device, "of_kind", torch.device)
+        patch.setattr(device, "spare_memory", lambda where: memory)
         patch.setattr(
             device, "from_host", lambda tensor, where: tensor.to(where) if where != CARD else _OnCard(tensor.clone())
         )  # in any thread

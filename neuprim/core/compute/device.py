@@ -7,11 +7,14 @@ what they are given; where they may not, a twin in torch code computes the same.
 from __future__ import annotations
 
 import functools
+import importlib.util
 
 import torch
 from torch import Tensor
 
-__all__ = ["CARD", "HOST", "KINDS", "PROCESSOR", "card_missing", "from_host", "fused", "of_kind"]
+__all__ = [
+    "CARD", "HOST", "KINDS", "PROCESSOR", "beside", "card_missing", "from_host", "fused", "kernels", "of_kind", "spare_memory",
+]  # fmt: skip
 
 PROCESSOR, CARD = "cpu", "cuda"
 KINDS: tuple[str, ...] = (PROCESSOR, CARD)
@@ -23,6 +26,16 @@ HOST = torch.device(PROCESSOR)
 def fused(*tensors: Tensor) -> bool:
     """Whether operations that are compiled for the processor may read these tensors."""
     return all(tensor.is_cpu for tensor in tensors)
+
+
+@functools.cache
+def _warp() -> bool:
+    return importlib.util.find_spec("warp") is not None
+
+
+def kernels(*tensors: Tensor) -> bool:
+    """Whether operations that are compiled for a card may read these tensors."""
+    return all(tensor.is_cuda for tensor in tensors) and _warp()
 
 
 @functools.cache
@@ -45,3 +58,13 @@ def from_host(tensor: Tensor, device: torch.device) -> Tensor:
     if device.type != CARD or not tensor.is_cpu:
         return tensor.to(device)
     return tensor.pin_memory().to(device, non_blocking=True)
+
+
+def beside(tensor: Tensor, like: Tensor) -> Tensor:
+    """A few numbers on the device of another tensor, and of its dtype; differentiable. Copies to a card do not wait for it."""
+    return tensor.to(like, non_blocking=tensor.is_cpu)
+
+
+def spare_memory(device: torch.device) -> int:
+    """Bytes of a card's memory that nothing uses."""
+    return int(torch.cuda.mem_get_info(device)[0])

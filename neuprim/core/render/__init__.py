@@ -77,7 +77,7 @@ def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings
     if backend.place(settings) != lowered.kind:
         draw = elsewhere(draw, device.of_kind(backend.place(settings)))
     if background is not None:
-        background = background.to(lowered.geometry.means.device)
+        background = background.to(lowered.geometry.means.device, non_blocking=background.is_cpu)
     paint: Draw = draw if lowered.shade is None else with_shade(draw)
     if settings.samples > 1:
         if isinstance(camera, RayCamera):

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera, RayCamera
+from neuprim.core.compute import device
 from neuprim.core.model.checks import check_result
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.output import RenderOutput
@@ -23,9 +24,9 @@ Draw = Callable[..., RenderOutput]
 def points_seen(depth: Tensor, camera: AnyCamera) -> Tensor:
     """(H, W, 3) float64 scene points at a depth image (H, W): camera-z, or distance for a ``RayCamera``; no gradient."""
     depth = depth.detach().double()
-    view = camera.viewmat.detach().double().to(depth.device)
+    view = device.beside(camera.viewmat.detach(), depth)
     if isinstance(camera, RayCamera):
-        local = camera.directions.detach().double().to(depth.device) * depth[..., None]
+        local = device.beside(camera.directions.detach(), depth) * depth[..., None]
     else:
         x = (torch.arange(camera.width, dtype=torch.float64, device=depth.device) + 0.5 - camera.cx) / camera.fx
         y = (torch.arange(camera.height, dtype=torch.float64, device=depth.device) + 0.5 - camera.cy) / camera.fy
@@ -53,14 +54,14 @@ def with_shade(draw: Draw) -> Draw:
     return shaded
 
 
-def elsewhere(draw: Draw, device: torch.device) -> Draw:
+def elsewhere(draw: Draw, place: torch.device) -> Draw:
     """The same, drawn on another device than the frame's tensors are on, and moved back; differentiable."""
 
     def moved(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
         own = lowered.geometry.means.device
-        camera = replace(camera, viewmat=camera.viewmat.to(device))
-        output = draw(lowered.to(device), camera, None if background is None else background.to(device), settings)
-        output.stats.drawn_on = output.stats.drawn_on or device
+        camera = replace(camera, viewmat=camera.viewmat.to(place))
+        output = draw(lowered.to(place), camera, None if background is None else background.to(place), settings)
+        output.stats.drawn_on = output.stats.drawn_on or place
         depth = None if output.depth is None else output.depth.to(own)
         return replace(output, rgb=output.rgb.to(own), alpha=output.alpha.to(own), depth=depth)
 

@@ -6,6 +6,7 @@ take a first step 3.2 times its rate (method: "splitting exactly"), so bias corr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from functools import lru_cache
 
@@ -121,6 +122,8 @@ class RowAdam:
             value, grad = params[spec.name].detach(), params[spec.name].grad
             if grad is not None and value.numel():
                 updates.append((spec, value, grad))
+        if updates and device.kernels(self.age) and self._step_kernels(updates, rates):
+            return
         fused = device.fused(self.age)
         if fused or not _all_finite([grad for _, _, grad in updates]):
             for spec, _, grad in updates:
@@ -150,6 +153,20 @@ class RowAdam:
                 _adam_rows(*arguments)
 
         parallel_for(share, len(work), 1, 0)
+
+    def _step_kernels(self, updates: list[tuple[ParameterSpec, Tensor, Tensor]], rates: dict[str, float]) -> bool:
+        """The update in two launches on a card; False, and nothing done, where it cannot be or a gradient is not finite."""
+        from neuprim.core.train.adam_warp import adam_rows
+
+        groups = [[v for _, v, _ in updates], [g for _, _, g in updates], [self.m[s.name] for s, _, _ in updates], [self.v[s.name] for s, _, _ in updates]]
+        values, _, first, second = groups
+        if not all(x.dtype == torch.float32 for group in groups for x in group) or not all(x.is_contiguous() for x in (*values, *first, *second)):
+            return False
+        age, betas = self.age + 1, (BETA1, self.beta2)
+        if not adam_rows(*groups, [rates[s.name] for s, _, _ in updates], age, betas, (math.log(BETA1), math.log(self.beta2))):
+            return False
+        self.age = age
+        return True
 
     def _step_rows(self, updates: list[tuple[ParameterSpec, Tensor, Tensor]], rates: dict[str, float]) -> None:
         """The update in torch code, in the arithmetic of the kernel."""

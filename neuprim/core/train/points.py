@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.data import Dataset, PointSupervision
 from neuprim.core.data.check import check_samples
 from neuprim.core.model.primitives import Primitives
@@ -59,11 +60,11 @@ def point_step(
     colour = samples.source is not None and settings.voxel_colour > 0
     found = values_at(model, samples.conditions, samples.points, colour, threads)
     where = found.sigma.device
-    wrong = (found.sigma - samples.sigma.to(where)) / samples.sigma_scale
+    wrong = (found.sigma - device.from_host(samples.sigma, where)) / samples.sigma_scale
     loss = wrong.square().mean()
     parts = {"voxel_sigma": loss.item()}
     if found.source is not None and samples.source is not None:
-        light = ((found.source - samples.source.to(where)) / samples.source_scale).square().mean()
+        light = ((found.source - device.from_host(samples.source, where)) / samples.source_scale).square().mean()
         parts["voxel_source"] = light.item()
         loss = loss + settings.voxel_colour * light
     peak = max(float(samples.sigma.max()), 1e-30) / samples.sigma_scale

@@ -6,6 +6,7 @@ blurs.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -13,40 +14,57 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
-__all__ = ["photometric_torch"]
+from neuprim.core.compute import device
 
-_TAPS = 11
-_x = np.arange(_TAPS) - 5.0
-_WINDOW = (np.exp(-(_x**2) / (2 * 1.5**2)) / np.exp(-(_x**2) / (2 * 1.5**2)).sum()).tolist()
+__all__ = ["TAPS", "WINDOW", "photometric_torch"]
+
+TAPS = 11
+_x = np.arange(TAPS) - 5.0
+WINDOW = (np.exp(-(_x**2) / (2 * 1.5**2)) / np.exp(-(_x**2) / (2 * 1.5**2)).sum()).tolist()
 _C1, _C2 = 0.01**2, 0.03**2
+
+
+@functools.cache
+def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.tensor(WINDOW, dtype=dtype, device=device)
 
 
 def _blurred(maps: Tensor) -> Tensor:
     """(M, H - 10, W - 10) of (M, H, W)."""
     M = len(maps)
-    window = torch.tensor(_WINDOW, dtype=maps.dtype, device=maps.device).expand(M, 1, _TAPS)
+    window = _window(maps.dtype, maps.device).expand(M, 1, TAPS)
     with torch.backends.cudnn.flags(enabled=False):
         down = conv2d(maps[None], window[..., None], groups=M)
         return conv2d(down, window[:, :, None], groups=M)[0]
 
 
+def _measured(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+    """Means of |x - y| and of SSIM, (2,) float64, and the gradient (H, W, C); in a few kernels where there are some."""
+    if device.kernels(rendered, truth) and rendered.dtype == truth.dtype == torch.float32:
+        from neuprim.core.train.ssim_warp import similarity
+
+        return similarity(rendered, truth, weight)
+    x, y = rendered.permute(2, 0, 1), truth.permute(2, 0, 1)
+    a, b, xx, yy, xy = _blurred(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
+    A, B = 2 * a * b + _C1, 2 * (xy - a * b) + _C2
+    iC, iD = 1 / (a * a + b * b + _C1), 1 / (xx - a * a + yy - b * b + _C2)
+    S = A * B * iC * iD
+    maps = [2 * b * (B - A) * iC * iD - 2 * a * S * (iC - iD), -S * iD, 2 * A * iC * iD]
+    from_x, from_xx, from_xy = (_blurred(pad(torch.cat(maps), (TAPS - 1,) * 4)) / S.numel()).chunk(
+        3
+    )  # the adjoint: the window is symmetric
+    difference = x - y
+    grad = (1 - weight) / x.numel() * difference.sign() - weight * (from_x + 2 * x * from_xx + y * from_xy)
+    means = torch.stack([difference.abs().mean(dtype=torch.float64), S.mean(dtype=torch.float64)])
+    return means, grad.permute(1, 2, 0).contiguous()
+
+
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rendered: Tensor, truth: Tensor, weight: float, parts: dict[str, float]) -> Tensor:
-        x, y = rendered.detach().permute(2, 0, 1), truth.detach().permute(2, 0, 1)
-        a, b, xx, yy, xy = _blurred(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
-        A, B = 2 * a * b + _C1, 2 * (xy - a * b) + _C2
-        iC, iD = 1 / (a * a + b * b + _C1), 1 / (xx - a * a + yy - b * b + _C2)
-        S = A * B * iC * iD
-        maps = [2 * b * (B - A) * iC * iD - 2 * a * S * (iC - iD), -S * iD, 2 * A * iC * iD]
-        from_x, from_xx, from_xy = (_blurred(pad(torch.cat(maps), (_TAPS - 1,) * 4)) / S.numel()).chunk(
-            3
-        )  # the adjoint: the window is symmetric
-        difference = x - y
-        grad = (1 - weight) / x.numel() * difference.sign() - weight * (from_x + 2 * x * from_xx + y * from_xy)
-        means = torch.stack([difference.abs().mean(dtype=torch.float64), S.mean(dtype=torch.float64)])
+        means, grad = _measured(rendered.detach(), truth.detach(), weight)
         parts["l1"], parts["ssim"] = means.tolist()
-        ctx.save_for_backward(grad.permute(1, 2, 0).contiguous())
+        ctx.save_for_backward(grad)
         return ((1 - weight) * means[0] + weight * (1 - means[1])).to(rendered.dtype)
 
     @staticmethod

@@ -151,7 +151,7 @@ class Trainer:
         self.device = device_of(model, self.renderer, first.camera, first.conditions)
         model.params = model.to(self.device).params
         self.optimizer = RowAdam(model.specs, model.params, settings.adam_beta2)
-        self._ahead = Ahead(self._pixels) if self.device.type == device.CARD else None
+        self._ahead = Ahead(self._pixels, device.spare_memory(self.device) // 4) if self.device.type == device.CARD else None
         self.population = make_population(settings.population)
         self.generator = torch.Generator().manual_seed(seed + 1)
         self.order = torch.empty(0, dtype=torch.int64)
@@ -242,7 +242,7 @@ class Trainer:
         index = self._next_view()
         view = self.dataset.train.view(index)
         pixels = self._pixels(index) if self._ahead is None else self._ahead.take(index, self.order)
-        background = self._background().to(self.device)
+        background = self._background().to(self.device, non_blocking=True)
         truth = pixels.over(background)
         output = render(self.model, view.camera, view.conditions, self.renderer, background)
         rgb = output.rgb if pixels.mask is None else torch.where(pixels.mask[..., None], output.rgb, truth)

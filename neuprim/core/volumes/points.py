@@ -239,7 +239,7 @@ def _elsewhere(
     g = living.geometry
     cells = cells_of(places)
     point, prim = pairs_on(g, cells.order, cells.grid, cells.placed)
-    x = torch.from_numpy(places).to(g.means.device)[point]
+    x = device.from_host(torch.from_numpy(places), g.means.device)[point]
     values = cosine_values(form, g, prim, x) if isinstance(form, Cosine) else living.sigma(prim, x.to(g.means)).double()
     sigma = values.clamp_min(0)
     columns = [sigma[:, None]] if colors is None else [sigma[:, None], sigma[:, None] * colors.double()[prim]]

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.model.densities.cosine import cosine_density
 from neuprim.core.model.forms import Cosine, LoweredDensity
 from neuprim.core.model.geometry import Geometry
@@ -23,7 +24,9 @@ def pairs_on(geometry: Geometry, sorted_by: np.ndarray, grid: Grid, sorted_point
     The points are those of :class:`~neuprim.core.volumes.points.Cells`: their ``order``, ``grid`` and ``placed``.
     """
     means, scales, axes = (x.detach().double() for x in (geometry.means, geometry.scales, geometry.rotations.double()))
-    order, starts, low, counts, placed = (torch.from_numpy(x).to(means.device) for x in (sorted_by, *grid[:2], grid[3], sorted_points))
+    order, starts, low, counts, placed = (
+        device.from_host(torch.from_numpy(x), means.device) for x in (sorted_by, *grid[:2], grid[3], sorted_points)
+    )
     reach = (axes * scales[:, None, :]).norm(dim=2)
     first = ((means - reach - low) / grid[2]).clamp_min(0.0).floor().minimum(counts).long()
     last = ((means + reach - low) / grid[2]).clamp_min(-1.0).minimum(counts - 1.0).floor().long()

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.compute import device
 from neuprim.core.model.colours import sh
 from neuprim.core.model.fields import ColourField, Conditions, Constant
 from neuprim.core.model.geometry import Geometry
@@ -78,7 +79,7 @@ class TimeHarmonics(ColourField):
         powers = xi ** torch.arange(1, self.powers + 1, dtype=torch.float64, device=xi.device)
         for name, basis in (("time_poly", powers), ("time_cos", waves.cos()), ("time_sin", waves.sin())):
             if name in params:
-                dc = dc + (params[name] * basis.to(dc)[:, None]).sum(1)
+                dc = dc + (params[name] * device.beside(basis, dc)[:, None]).sum(1)
         return dc, params.get("sh_rest")
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity, amplified, cosine_density, split_cosine, split_scale
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
 from neuprim.core.model.geometry import Geometry
@@ -115,7 +116,10 @@ class TimeDensity(DensityField):
         if "offset" in self.parts:
             angle = math.pi * xi * torch.arange(1, OFFSET_TERMS + 1, dtype=torch.float64, device=xi.device)
             b2 = params["b2"]
-            own["b2"] = b2 + (params["offset_cos"] @ angle.cos().to(b2) + params["offset_sin"] @ angle.sin().to(b2))[:, None]
+            own["b2"] = (
+                b2
+                + (params["offset_cos"] @ device.beside(angle.cos(), b2) + params["offset_sin"] @ device.beside(angle.sin(), b2))[:, None]
+            )
         w2, b2 = amplified(own["w2"], own["b2"], own.get("log_gain"))
         if "window" in self.parts:
             from neuprim.tasks.dynamic.frame_cpu import fused_window  # numba, loaded when first needed

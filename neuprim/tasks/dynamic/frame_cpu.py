@@ -43,7 +43,7 @@ def fused_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi:
     ``center`` and ``log_window`` are (N, 1), all of one dtype; no gradient for the time ``xi`` ().
     """
     if not device.fused(w2, b2, center, log_window):
-        weight = fade(((xi.to(b2) - center) / log_window.exp()).square(), WINDOW_EDGE)
+        weight = fade(((xi.to(b2.dtype) - center) / log_window.exp()).square(), WINDOW_EDGE)
         return w2 * weight, b2 * weight
     result: tuple[Tensor, Tensor] = _Window.apply(w2, b2, center, log_window, xi)
     return result
@@ -82,7 +82,7 @@ def fused_move(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Te
     ``velocity`` and ``acceleration`` are (N, 3), ``center`` (N, 1), all of one dtype; no gradient for the time ``xi`` ().
     """
     if not device.fused(means, velocity, acceleration, center):
-        since = xi.to(velocity) - center
+        since = xi.to(velocity.dtype) - center
         return means + (velocity + acceleration * since) * since
     moved: Tensor = _Move.apply(means, velocity, acceleration, center, xi)
     return moved

@@ -19,6 +19,7 @@ from typing import Any
 from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.compute import device
 from neuprim.core.model.fields import ColourField, Conditions, LoweredDensity, RayNet, Shading
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
@@ -97,9 +98,9 @@ class LightNetwork(ColourField):
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> RayNet:
         means = geometry.means
-        view = unit(means - camera.position.to(means))
-        to_light = conditions["light"].to(means) - means
-        strength = conditions["light_intensity"].to(means).expand(self.channels) / self.typical
+        view = unit(means - device.beside(camera.position, means))
+        to_light = device.beside(conditions["light"], means) - means
+        strength = device.beside(conditions["light_intensity"], means).expand(self.channels) / self.typical
         factor = strength.expand(means.shape[0], -1)
         if self.falloff:
             factor = factor / to_light.square().sum(-1, keepdim=True).clamp_min(1e-12)

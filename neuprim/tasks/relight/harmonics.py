@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.compute import device
 from neuprim.core.model.fields import ColourField, Conditions, Constant
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import ParameterSpec, Params
@@ -42,12 +43,12 @@ class LightHarmonics(ColourField):
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         color = params["c_dc"]
-        to_light = conditions["light"].to(color) - geometry.means
+        to_light = device.beside(conditions["light"], color) - geometry.means
         squared = to_light.square().sum(-1, keepdim=True).clamp_min(1e-12)
         if self.degree:
             bands = real_harmonics(unit(to_light), self.degree)[:, 1:]
             color = color + (bands[:, :, None] * params["light_sh"]).sum(1)
-        strength = conditions["light_intensity"].to(color) / self.typical / (squared if self.falloff else 1.0)
+        strength = device.beside(conditions["light_intensity"], color) / self.typical / (squared if self.falloff else 1.0)
         return Constant(color.clamp_min(0.0) * strength)
 
 

@@ -76,10 +76,10 @@ def light_visibility(
         camera = Camera(look_at(light, center, up), focal, focal, SIZE / 2, SIZE / 2, SIZE, SIZE)
         near = max(1e-4 * radius, distance - 1.5 * radius, 1e-6)
         own = replace(settings, depth=True, near=near, samples=1)
-        depths = means @ camera.viewmat[2, :3].to(means) + camera.viewmat[2, 3]
+        depths = means @ device.beside(camera.viewmat[2, :3], means) + camera.viewmat[2, 3]
         low, high = torch.stack([depths.min(), depths.max()]).tolist()
         edges = torch.linspace(low, high, LAYERS + 1, dtype=torch.float64)
-        slabs = torch.bucketize(depths, edges[1:-1].to(means))
+        slabs = torch.bucketize(depths, device.beside(edges[1:-1], means))
         order = torch.argsort(slabs, stable=True)
         geometry_by_slab, density_by_slab = geometry[order], density.rows(order)
         ends = torch.bincount(slabs, minlength=LAYERS).cumsum(0).tolist()
@@ -103,7 +103,7 @@ def light_visibility(
     def visibility(points: Tensor) -> Tensor:
         points, limits = points.detach().double().contiguous(), (bias * diameter, softness * diameter)
         if not device.fused(points, opacities):
-            return arriving(points, view.to(points.device), near, focal, opacities, distances, *limits)
+            return arriving(points, device.beside(view, points), near, focal, opacities, distances, *limits)
         from neuprim.tasks.relight.visibility_cpu import arriving_light  # numba, loaded when first needed
 
         found = np.empty(len(points), np.float32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -142,8 +143,17 @@ def test_settings_rebuild_the_field() -> None:
     assert (again.degree, again.channels, again.active) == (2, 4, 2)
 
 
+def on_blocks(means: torch.Tensor, dc: torch.Tensor, rest: torch.Tensor, origin: torch.Tensor, degree: int) -> torch.Tensor:
+    """The card's kernels, on Warp's CPU blocks."""
+    pytest.importorskip("warp", reason="the cuda backend's kernels need Warp")
+    from neuprim.core.model.colours.sh_warp import fused_colors
+
+    return fused_colors(means, dc, rest, origin, degree)
+
+
+@pytest.mark.parametrize("kernels", [sh.colors, on_blocks])
 @pytest.mark.parametrize("degree", [1, 2, 3])
-def test_values_and_gradients_are_those_of_float64(degree: int) -> None:
+def test_values_and_gradients_are_those_of_float64(degree: int, kernels: Callable[..., torch.Tensor]) -> None:
     """Also of the camera's position, and for colours that are cut off at zero."""
     g = torch.Generator().manual_seed(degree)
     shapes = {"means": (50, 3), "dc": (50, 4), "rest": (50, 15, 4), "origin": (3,)}
@@ -153,7 +163,7 @@ def test_values_and_gradients_are_those_of_float64(degree: int) -> None:
         for name, value in exact.items():
             value.copy_(mine[name])
     pull = torch.randn(50, 4, generator=g)
-    found, wanted = sh.colors(**mine, degree=degree), sh.colors(**exact, degree=degree)
+    found, wanted = kernels(**mine, degree=degree), sh.colors(**exact, degree=degree)
     assert bool((wanted == 0).any()) and torch.allclose(found.double(), wanted, rtol=1e-5, atol=1e-5)
     (found * pull).sum().backward()
     (wanted * pull.double()).sum().backward()

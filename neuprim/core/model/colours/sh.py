@@ -68,7 +68,11 @@ def colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degre
         from neuprim.core.model.colours.sh_cpu import fused_colors  # numba, loaded when first needed
 
         return fused_colors(means, dc, rest, origin, degree)
-    offset = means - origin.to(means)
+    if device.kernels(means, dc, rest) and dc.dtype == means.dtype == torch.float32:
+        from neuprim.core.model.colours import sh_warp
+
+        return sh_warp.fused_colors(means, dc, rest, origin, degree)
+    offset = means - device.beside(origin, means)
     direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-30)
     bands = basis(direction, degree)[:, 1:]
     return (dc * C0 + 0.5 + (bands[:, :, None] * rest[:, : bands.shape[1]]).sum(1)).clamp_min(0.0)

@@ -1,0 +1,158 @@
+# mypy: disable-error-code="valid-type, no-untyped-def"
+"""Spherical-harmonics colours with their gradient on a card, a thread a primitive, float64 inside: the twin of
+:mod:`neuprim.core.model.colours.sh_cpu`. Warp is imported with this module."""
+
+import functools
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.core.compute import device
+from neuprim.core.compute.warp import OPTIONS, array, launch, wp
+from neuprim.core.model.colours.sh_constants import C0, C1, C2, C3
+
+__all__ = ["fused_colors"]
+
+d, f = wp.float64, wp.float32
+_C0, _C1 = wp.constant(d(C0)), wp.constant(d(C1))
+_vec15 = wp.types.vector(length=15, dtype=wp.float64)
+
+
+@functools.cache
+def _functions(degree: int) -> tuple[Any, Any]:
+    a0, a1, a2, a3, a4 = (d(c) for c in C2)
+    b0, b1, b2, b3, b4, b5, b6 = (d(c) for c in C3)
+    two, three, four, six, eight = d(2.0), d(3.0), d(4.0), d(6.0), d(8.0)
+
+    @wp.func
+    def basis(v: wp.vec3d):
+        """Bands 1 to ``degree`` at a unit direction."""
+        x, y, z = v[0], v[1], v[2]
+        Y = _vec15()
+        Y[0] = -_C1 * y
+        Y[1] = _C1 * z
+        Y[2] = -_C1 * x
+        xx, yy, zz = x * x, y * y, z * z
+        if wp.static(degree >= 2):
+            Y[3] = a0 * x * y
+            Y[4] = a1 * y * z
+            Y[5] = a2 * (two * zz - xx - yy)
+            Y[6] = a3 * x * z
+            Y[7] = a4 * (xx - yy)
+        if wp.static(degree >= 3):
+            Y[8] = b0 * y * (three * xx - yy)
+            Y[9] = b1 * x * y * z
+            Y[10] = b2 * y * (four * zz - xx - yy)
+            Y[11] = b3 * z * (two * zz - three * xx - three * yy)
+            Y[12] = b4 * x * (four * zz - xx - yy)
+            Y[13] = b5 * z * (xx - yy)
+            Y[14] = b6 * x * (xx - three * yy)
+        return Y
+
+    @wp.func
+    def gradient(v: wp.vec3d, g: _vec15):
+        """sum_k g_k dY_k/d(x, y, z), the basis taken as polynomials of a free direction."""
+        x, y, z = v[0], v[1], v[2]
+        out = wp.vec3d(-_C1 * g[2], -_C1 * g[0], _C1 * g[1])
+        if wp.static(degree >= 2):
+            p, q, r, s, t = a0 * g[3], a1 * g[4], a2 * g[5], a3 * g[6], a4 * g[7]
+            out += wp.vec3d(
+                p * y - two * r * x + s * z + two * t * x, p * x + q * z - two * r * y - two * t * y, q * y + four * r * z + s * x
+            )
+        if wp.static(degree >= 3):
+            xx, yy, zz = x * x, y * y, z * z
+            i, j, k, l = b0 * g[8], b1 * g[9], b2 * g[10], b3 * g[11]
+            m, n, o = b4 * g[12], b5 * g[13], b6 * g[14]
+            out += wp.vec3d(
+                six * i * x * y + j * y * z - two * k * x * y - six * l * x * z + m * (four * zz - three * xx - yy) + two * n * x * z
+                + three * o * (xx - yy),
+                three * i * (xx - yy) + j * x * z + k * (four * zz - xx - three * yy) - six * l * y * z - two * m * x * y - two * n * y * z
+                - six * o * x * y,
+                j * x * y + eight * k * y * z + l * (six * zz - three * xx - three * yy) + eight * m * x * z + n * (xx - yy),
+            )  # fmt: skip
+        return out
+
+    return basis, gradient
+
+
+@functools.cache
+def _kernels(degree: int) -> tuple[Any, Any]:
+    basis, basis_gradient = _functions(degree)
+    bands = (degree + 1) * (degree + 1) - 1
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    def forward(
+        means: wp.array(dtype=wp.vec3), dc: wp.array2d(dtype=float), rest: wp.array3d(dtype=float), origin: wp.array(dtype=wp.float64),
+        color: wp.array2d(dtype=float),
+    ):  # fmt: skip
+        i = wp.tid()
+        offset = wp.vec3d(means[i]) - wp.vec3d(origin[0], origin[1], origin[2])
+        Y = basis(offset / wp.max(wp.length(offset), d(1e-30)))
+        for c in range(color.shape[1]):
+            value = _C0 * d(dc[i, c]) + d(0.5)
+            for k in range(bands):
+                value += Y[k] * d(rest[i, k, c])
+            color[i, c] = f(wp.max(value, d(0.0)))
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+    def backward(
+        means: wp.array(dtype=wp.vec3), rest: wp.array3d(dtype=float), origin: wp.array(dtype=wp.float64), color: wp.array2d(dtype=float),
+        grad: wp.array2d(dtype=float), g_means: wp.array(dtype=wp.vec3), g_dc: wp.array2d(dtype=float), g_rest: wp.array3d(dtype=float),
+    ):  # fmt: skip
+        i = wp.tid()
+        offset = wp.vec3d(means[i]) - wp.vec3d(origin[0], origin[1], origin[2])
+        over = d(1.0) / wp.max(wp.length(offset), d(1e-30))
+        v = over * offset
+        Y = basis(v)
+        gY = _vec15()
+        for c in range(color.shape[1]):
+            g = d(0.0)
+            if color[i, c] > 0.0:
+                g = d(grad[i, c])
+            g_dc[i, c] = f(_C0 * g)
+            for k in range(bands):
+                g_rest[i, k, c] = f(Y[k] * g)
+                gY[k] += g * d(rest[i, k, c])
+            for k in range(bands, rest.shape[1]):
+                g_rest[i, k, c] = 0.0
+        free = basis_gradient(v, gY)
+        g_means[i] = wp.vec3(over * (free - wp.dot(free, v) * v))
+
+    return forward, backward
+
+
+class _Colors(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:  # type: ignore[override]
+        means, dc, rest = (x.detach().contiguous() for x in (means, dc, rest))
+        centre = device.beside(origin.detach(), means).double().contiguous()
+        color = torch.empty(dc.shape, dtype=torch.float32, device=dc.device)
+        arrays = (array(means, wp.vec3), array(dc, wp.float32), array(rest, wp.float32), array(centre, wp.float64), array(color, wp.float32))
+        launch(_kernels(degree)[0], len(means), arrays, means.device)
+        ctx.tensors, ctx.degree, ctx.origin = (means, rest, centre, color), degree, (origin.dtype, origin.device)
+        return color
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+        means, rest, centre, color = ctx.tensors
+        g_means, g_dc, g_rest = torch.empty_like(means), torch.empty_like(color), torch.empty_like(rest)
+        launch(
+            _kernels(ctx.degree)[1], len(means),
+            (
+                array(means, wp.vec3), array(rest, wp.float32), array(centre, wp.float64), array(color, wp.float32),
+                array(grad.contiguous(), wp.float32), array(g_means, wp.vec3), array(g_dc, wp.float32), array(g_rest, wp.float32),
+            ), means.device,
+        )  # fmt: skip
+        dtype, place = ctx.origin
+        view = -g_means.sum(0, dtype=torch.float64).to(place, dtype) if ctx.needs_input_grad[3] else None
+        return g_means, g_dc, g_rest, view, None
+
+
+def fused_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
+    """max(0, SH(direction origin -> mean) + 0.5) of float32 tensors: means (N, 3), dc (N, C), rest (N, bands, C) -> (N, C).
+
+    ``origin`` (3,) is the camera centre; gradients flow to all four. ``degree`` 1..3 selects how many bands count.
+    """
+    result: Tensor = _Colors.apply(means, dc, rest, origin, degree)
+    return result

@@ -74,7 +74,7 @@ CORE: dict[str, set[str]] = {
     "channels": {"data", "errors", "io", "task"},
     "checkpoint": {"errors", "io", "model", "task"},
     "extensions": {"channels", "checked", "conditions", "data", "errors", "model", "settings", "task", "volumes"},
-    "render": {"cameras", "compute", "errors", "metrics", "model", "settings"},
+    "render": {"cameras", "compute", "errors", "metrics", "model", "notices", "settings"},
     "train": {"checked", "compute", "data", "errors", "model", "render", "task", "volumes"},
     "uses": {"checked", "errors", "extensions", "task", "train"},
 }

@@ -91,15 +91,15 @@ def test_commands_know_it(fake: Fake, scene: Path, tmp_path: Path, monkeypatch: 
 
 def test_a_run_without_it_says_what_there_is(fake: Fake, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backends, "TABLE", backends.TABLE[1:])
-    with pytest.raises(ConfigError, match=r"^renderer\.backend=fake: expected auto, cpu or reference$"):
+    with pytest.raises(ConfigError, match=r"^renderer\.backend=fake: expected auto, cuda, cpu or reference$"):
         compose(words(scene, tmp_path / "run", 3, "renderer.backend=fake"))
 
 
 def test_a_wrong_name_is_told_the_table(fake: Fake, scene: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"^renderer\.backend=fke: expected auto, fake, cpu or reference$"):
+    with pytest.raises(ConfigError, match=r"^renderer\.backend=fke: expected auto, fake, cuda, cpu or reference$"):
         compose(words(scene, tmp_path / "run", 3, "renderer.backend=fke"))
     low, camera = scenes.lowered(scenes.tensors(3)), scenes.camera(8, 8)
-    with pytest.raises(ConfigError, match=r"^renderer\.backend=gpu: expected auto, fake, cpu or reference$"):
+    with pytest.raises(ConfigError, match=r"^renderer\.backend=gpu: expected auto, fake, cuda, cpu or reference$"):
         render_lowered(low, camera, RenderSettings(backend="gpu"))
     with pytest.raises(ConfigError, match=r"^renderer\.backend=null: expected auto or the name of a backend$"):
         RenderSettings(backend=None)  # type: ignore[arg-type]
@@ -114,7 +114,8 @@ def test_auto_is_the_first_that_does_not_refuse(fake: Fake) -> None:
     assert backends.choose(replace(net, density=Opaque(lambda prim, o, d, t0, t1: t1 - t0)), RenderSettings(), camera).name == "reference"
     fake.broken = "no such device"
     assert backends.choose(low, RenderSettings(), camera).name == "cpu"
-    assert [b.name for b in backends.available()] == ["cpu", "reference"] and backends.names() == ("fake", "cpu", "reference")
+    here = ["cpu", "reference"] if backends.no_card() else ["cuda", "cpu", "reference"]
+    assert [b.name for b in backends.available()] == here and backends.names() == ("fake", "cuda", "cpu", "reference")
 
 
 def test_a_refusal_names_it_and_one_that_can(fake: Fake) -> None:

@@ -25,7 +25,7 @@ from neuprim.core.render.joint import joint_volume
 from neuprim.core.volumes.grid import density_at, density_grid
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
-from tests.backends import BACKENDS, FAST, by
+from tests.backends import BACKENDS, FAST, SLOW_HERE, by
 
 CAMERA = scenes.camera(20, 16)
 N, K = 20, 8
@@ -294,7 +294,9 @@ def test_dtypes_may_be_mixed(names: list[str], hidden: int | None, backend: str)
 
 @pytest.mark.parametrize("sort", ["center", "entry"])
 @pytest.mark.parametrize(("neurons", "hidden"), [(MOST_UNITS, None), (17, MOST_UNITS)])
-@pytest.mark.parametrize("backend", FAST)
+@pytest.mark.parametrize(
+    "backend", [pytest.param(b, marks=[pytest.mark.slow] if b in SLOW_HERE else []) for b in FAST]
+)  # half a minute to compile
 def test_as_many_units_as_the_kernels_know(backend: str, neurons: int, hidden: int | None, sort: str) -> None:
     t = scenes.tensors(N, neurons, hidden=hidden)
     t["w2"] = t["w2"] / neurons**0.5

@@ -16,7 +16,7 @@ from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.chord import chord, pixel, place, ray_of, xyz
 from neuprim.core.render.cuda.forms import Form
-from neuprim.core.render.cuda.functions import band_of, cos_turns
+from neuprim.core.render.cuda.functions import band_of, cos_turns, opacity
 from neuprim.core.render.cuda.together import any_thread
 
 __all__ = ["BATCH", "CUT_AT", "forward_kernel"]
@@ -150,7 +150,7 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False) -
                                 if wp.static(P == 2):
                                     I *= c.D * c.D
                                 if I > 0.0:
-                                    alpha = wp.min(1.0 - wp.exp(-I), limits[1])
+                                    alpha = wp.min(opacity(I), limits[1])
                                     if alpha < limits[0]:
                                         alpha = 0.0
                                 if wp.static(H > 0):

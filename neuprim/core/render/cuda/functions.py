@@ -97,3 +97,11 @@ def band_of(edge: int) -> tuple[Function, Function]:
         return wp.vec2(15.0 * j2 * iz * iz, 105.0 * j3 * iz * iz * iz)
 
     return value, pair
+
+
+@wp.func
+def opacity(I: float):  # type: ignore[no-untyped-def]
+    """1 - exp(-I), I >= 0; a faint one keeps its digits, which the difference would lose."""
+    if I < 0.25:
+        return I * (((((-I / 720.0 + 1.0 / 120.0) * I - 1.0 / 24.0) * I + 1.0 / 6.0) * I - 0.5) * I + 1.0)
+    return 1.0 - wp.exp(-I)

@@ -9,18 +9,15 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
 from neuprim.core.compute import device
+from neuprim.core.train.ssim_window import TAPS, WINDOW
 
-__all__ = ["TAPS", "WINDOW", "photometric_torch"]
+__all__ = ["photometric_torch"]
 
-TAPS = 11
-_x = np.arange(TAPS) - 5.0
-WINDOW = (np.exp(-(_x**2) / (2 * 1.5**2)) / np.exp(-(_x**2) / (2 * 1.5**2)).sum()).tolist()
 _C1, _C2 = 0.01**2, 0.03**2
 
 

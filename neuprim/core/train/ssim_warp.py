@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute.warp import OPTIONS, array, launch, wp
-from neuprim.core.train.ssim_torch import TAPS, WINDOW
+from neuprim.core.train.ssim_window import TAPS, WINDOW
 
 __all__ = ["similarity"]
 

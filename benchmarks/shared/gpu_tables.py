@@ -63,7 +63,9 @@ def times_table(records: list[Record]) -> str:
         return [entry["form"], counts[0], size, *counts[1:], *(f"{x:.2f}" for x in ms), f"{1000 / ms[0]:.0f}", f"{entry['peak_mb']:,.0f}"]
 
     head = ["form", "primitives", "size", "pairs", "slots", "forward, ms", "and backward", "training step", "frames/s", "peak MB"]
-    return _tables(records, "times", head, row)
+    text = _tables(records, "times", head, row)
+    before = _tables(records, "times_before", head, row)
+    return f"{text}\n\nThe first version that ran there, up to a million primitives:\n\n{before}" if before else text
 
 
 def training_table(records: list[Record]) -> str:

@@ -370,7 +370,7 @@ def equations_table(recorded: dict[str, Any]) -> str:
     ]
     for key in dict.fromkeys((r["form"], r["edge"], r["neurons"]) for r in runs):
         own = [r for r in runs if (r["form"], r["edge"], r["neurons"]) == key]
-        step = 1e3 * statistics.mean(r["train_seconds"] / r["iterations"] for r in own)
+        step = 1e3 * statistics.mean(r["cpu_seconds"] / r["iterations"] for r in own)
         lines.append(
             f"| {key[0]} | {key[1]}{', gain' if own[0]['gain'] else ''} | {key[2]} | {own[0]['parameters_per_primitive']} "
             f"| {own[0]['primitives']:,} | {_spread(own, 'psnr')} dB | {_spread(own, 'psnr_mask')} dB | {_spread(own, 'psnr_pooled_mask')} dB "

@@ -7,7 +7,7 @@ Each run is its task's preset `quick`, cut to a number of steps. A size is the b
 as these bytes hold. Parts:
 
     forms     every form at every size, for as many steps as fit into the seconds that the paper's form takes for its own: the forms take turns
-              on this machine first, and each has its pace
+              on this machine first, over a whole run, and each has its pace in seconds that its thread computes
     slope     the same with half the steps, first seed: what the last doubling of the budget still brought
     gaussian  a true Gaussian has no fast kernel and runs on the reference backend: small images of the static scenes and few steps, equal count
               and equal bytes, beside the other forms in the same conditions
@@ -22,9 +22,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import torch
 from shared.forms import PAPER, SCENES, Form
 from shared.machine import cpu_name
 from shared.tables import README, between_markers, spread
@@ -55,6 +59,8 @@ KEYS = (
 # fourth step 40.62 .102 .189 .281, in every sixteenth *40.64 .114 .198 .290*; the first with four times the weight 40.19 .097 .188 .279; 4,096 in every
 # second 40.55 .095 .187 .276. On smoke_fire with quick's 13,500 primitives: images 45.74 .251 .322 .328; every sixteenth 44.89 .285 .294 .309; every
 # fourth 44.15 .330 .273 .300; every step 42.70 .323 .288 .295.
+# smoke_fire again, judged by another rig (scene.cameras=38), K = 0 p = 2, bytes of 1,000, at equal seconds (6,000, 5,249 and 3,855 steps), two seeds, inside
+# the mask: images 42.36 and 42.92, every sixteenth 41.15 and 41.43, every fourth 40.57 and 41.38. The fire gets its voxels for nothing and smoke does not.
 FORMS = {
     "static": ("8:0", "0:2", "2:2", "4:2"),
     "dynamic": ("8:0@images", "0:2@images", "0:2", "2:2"),
@@ -84,20 +90,34 @@ def words_of(form: str, scene: str, args: argparse.Namespace, count: int) -> tup
     return (*own.all_words(vars(args), scene), *Form.named(form).words, f"model.primitives={count}")
 
 
+def measure_paces(scene: str, size: int, forms: Sequence[str], args: argparse.Namespace) -> dict[str, float]:
+    """Seconds a step of each over a whole run as long as the reference's."""
+    torch.set_num_threads(1)
+    steps, trainers = STEPS[scene][size], {}
+    for form in forms:
+        count = Form.named(form).equal_bytes(size, SCENES[scene].task)
+        trainers[form] = begin(Trial(form, words_of(form, scene, args, count), steps)).trainer
+    return paces_of(trainers, steps)
+
+
 def measured_paces(args: argparse.Namespace) -> dict[str, float]:
     """Time of a step over that of the paper's form, by "scene size form"; what is recorded stays."""
-    found: dict[str, float] = json.loads(RESULTS.read_text()).get("paces", {}) if RESULTS.exists() else {}
+    whole: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    found: dict[str, float] = whole.setdefault("paces", {})
+    wanted = []
     for scene in args.scenes:
         for size in sizes(scene, args):
             missing = [f for f in forms_of(scene, args) if f"{scene} {size} {f}" not in found]
-            if not missing:
-                continue
-            reference = REFERENCE[SCENES[scene].task]
-            turns = dict.fromkeys([reference, *missing])  # ratios travel, seconds do not: the reference takes part every time
-            counts = {f: Form.named(f).equal_bytes(size, SCENES[scene].task) for f in turns}
-            took = paces_of({f: begin(Trial(f, words_of(f, scene, args, n), 10_000)).trainer for f, n in counts.items()})
-            found |= {f"{scene} {size} {f}": took[f] / took[reference] for f in turns}
-            print(f"paces of {scene}, {size}:", {f: round(took[f] / took[reference], 3) for f in turns}, flush=True)
+            if missing:  # ratios travel, seconds do not: the reference takes part every time
+                wanted.append((scene, size, list(dict.fromkeys([REFERENCE[SCENES[scene].task], *missing]))))
+    with ProcessPoolExecutor(args.jobs, multiprocessing.get_context("spawn")) as pool:
+        futures = [pool.submit(measure_paces, scene, size, forms, args) for scene, size, forms in wanted]
+        for (scene, size, forms), future in zip(wanted, futures, strict=True):
+            took = future.result()
+            ratios = {form: took[form] / took[forms[0]] for form in forms}
+            found |= {f"{scene} {size} {form}": ratio for form, ratio in ratios.items()}
+            RESULTS.write_text(json.dumps(whole, indent=1) + "\n")
+            print(f"paces of {scene}, {size}:", {form: round(ratio, 3) for form, ratio in ratios.items()}, flush=True)
     return found
 
 
@@ -167,7 +187,7 @@ def forms_table(found: dict[str, Any]) -> str:
     seeds = sorted({len(runs) for runs in groups.values()})
     lines.append(
         f"\nPreset `quick`, {' to '.join(str(n) for n in dict.fromkeys((seeds[0], seeds[-1])))} seed(s), mean ± half the spread; *bytes of* so many of the paper's primitives; steps: as many as fit into "
-        "the seconds of the paper's form, at paces measured in turns; *error of σ*: relative L2 over the files' voxels, early / middle / late; *last doubling*: what the second half of the budget brought, first seed. PSNR is of "
+        "the seconds of the paper's form, at paces measured in turns over whole runs (lit_solids: at their start); *error of σ*: relative L2 over the files' voxels, early / middle / late; *last doubling*: what the second half of the budget brought, first seed. PSNR is of "
         f"the whole image (solids, chair at 200×200 on white), inside the mask (fire, smoke_fire), clamped linear (lit_solids). {found['cpu']}, one thread."
     )
     return "\n".join(lines)

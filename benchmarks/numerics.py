@@ -1,6 +1,7 @@
 """Worst errors of every backend over the named extremes of the input space, for the three edges.
 
     python benchmarks/numerics.py [--coarse] [--cases N] [--regions NAME ...] [--edges 0 1 2] [--markdown FILE]
+    python benchmarks/numerics.py --run RUN_DIR [--near 0.01 3 3.5 4]
 
 Prints one line per region, backend and precision, with the edges' numbers side by side; exits with status 1 when a bound is broken. A
 backend and precision is "cpu float32", "reference float32" (float32 parameters, float64 inside) or "reference float64". The oracle runs in
@@ -10,13 +11,16 @@ extended precision and shares no code with the backends; gradients are compared 
 - thin: on shorter chords, misses included, error/S_c (S_c/S)^(2p - 1), S_c the central chord's S.
 - gradient: error of a parameter's gradient over the gradient's norm, over four random functionals of the image.
 
---markdown writes the table with an introduction; docs/numerical_limits.md is made that way.
+--markdown writes the table with an introduction; docs/numerical_limits.md is made that way. --run looks at a trained model instead: from a dozen
+of its held-out views, with the near plane at each of --near, how many primitives the cpu backend draws in float64, and the largest error of
+three small images against the reference backend.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -24,7 +28,35 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from neuprim.core.model.edge import EDGES
+from neuprim.core.render import RenderSettings, render
+from neuprim.runs.open import load_dataset, load_run
 from tests.numerics.extremes.sweep import document, line, sweep, table
+
+VIEWS, COMPARED, SMALL = 12, 3, 50
+"""Of a run: views to count in, how many of them to compare, and those images' sides."""
+
+
+@torch.no_grad()
+def trained(folder: Path, planes: Sequence[float]) -> None:
+    """Print what float64 is needed for in a finished run's model, one line per near plane."""
+    config, task, model, _ = load_run(folder)
+    dataset = load_dataset(config, task)
+    picks = sorted({i * len(dataset.test) // VIEWS for i in range(VIEWS)})
+    for near in planes:
+        fast, slow = (RenderSettings(backend=b, near=near, alpha_min=0.0, transmittance_min=0.0) for b in ("cpu", "reference"))
+        counts, worst = [], 0.0
+        for i in picks:
+            view = dataset.test.view(i)
+            counts.append(int(render(model, view.camera, view.conditions, fast, dataset.background).stats.extra["float64"]))
+            if len(counts) <= COMPARED:
+                images = [
+                    render(model, view.camera.resized(SMALL, SMALL), view.conditions, s, dataset.background).rgb for s in (fast, slow)
+                ]
+                worst = max(worst, (images[0] - images[1]).abs().max().item())
+        mean = sum(counts) / len(counts)
+        print(
+            f"near {near:g}: {mean:.1f} of {model.count} primitives in float64 ({min(counts)} to {max(counts)} a view), largest error {worst:.1e}"
+        )
 
 
 def main() -> int:
@@ -33,9 +65,14 @@ def main() -> int:
     parser.add_argument("--cases", type=int, help="cases per region")
     parser.add_argument("--regions", nargs="*", default=[], help="only regions whose name contains one of these")
     parser.add_argument("--edges", nargs="*", type=int, choices=EDGES, default=EDGES)
+    parser.add_argument("--run", type=Path, help="a finished run's directory, instead of the regions")
+    parser.add_argument("--near", nargs="*", type=float, default=[0.01], help="of --run: near planes, scene units")
     parser.add_argument("--markdown", type=Path, help="write the documentation page here")
     args = parser.parse_args()
     torch.set_num_threads(1)
+    if args.run:
+        trained(args.run, args.near)
+        return 0
     rows = []
     cases = args.cases or (3 if args.coarse else 40)
     print(table([]), flush=True)

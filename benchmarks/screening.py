@@ -20,7 +20,10 @@ from shared.tables import ROOT, between_markers
 from shared.trials import Trial, recorded, run_all
 
 SHORT = {"amplitude": ("b2", "w2"), "frequency": ("W1", "b1")}
-KEYS = ("psnr", "psnr_worst", "psnr_mask", "psnr_linear_clamped", "primitives", "parameters_per_primitive", "train_seconds")
+KEYS = (
+    "psnr", "psnr_worst", "psnr_mask", "psnr_linear_clamped", "sigma_relative_l2_early", "sigma_relative_l2_middle", "sigma_relative_l2_late",
+    "primitives", "parameters_per_primitive", "train_seconds",
+)  # fmt: skip
 GRID = "amplitude=0.03"
 """The rates at which every form of the table learns."""
 RESULTS = Path(__file__).parent / "results" / "screening.json"

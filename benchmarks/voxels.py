@@ -42,7 +42,19 @@ FORMS = {
 }
 """All with the starting values and rates of the preset quick."""
 
-SOURCES = ("images", "both", "voxels")
+SOURCES = {
+    "images": ("train.supervision=images",),
+    "both": ("train.supervision=both",),
+    "both, every step": ("train.supervision=both", "train.voxels_every=1"),
+    "voxels": ("train.supervision=voxels",),
+}
+"""What is learned from; ``both`` takes points as often as the preset says."""
+
+COMPARED = {
+    "K = 8, p = 0": ("images", "both, every step"),
+    "K = 0, p = 2, gain": tuple(SOURCES),
+    "K = 2, p = 2, gain": ("both, every step",),
+}
 THIRDS = ("early", "middle", "late")
 KEYS = ("psnr_mask", "psnr_pooled_mask", *(f"sigma_{k}_{t}" for k in ("relative_l2", "psnr_active", "max_error") for t in THIRDS))
 CLIPS = (0.0, 1e-4, 1e-3, 1e-2)
@@ -96,7 +108,7 @@ def measured(fitted: Fitted, model: Primitives) -> dict[str, Any]:
 def one(words: list[str], form: str, source: str, kilobytes: float) -> dict[str, Any]:
     """Fit, measure, store in 8 bits, measure again."""
     torch.set_num_threads(1)
-    named = [*words, *FORMS[form], f"train.supervision={source}"]
+    named = [*words, *FORMS[form], *SOURCES[source]]
     few = start(compose([*named, "model.primitives=8"], check_output=False))
     count = int(kilobytes * 1000 / 4 / few.model.parameters_per_primitive)
     fitted = start(compose([*named, f"model.primitives={count}"], check_output=False), dataset=few.dataset)
@@ -129,7 +141,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--kilobytes", type=float, nargs="*", default=[1240.0], help="of a model in float32")
     parser.add_argument("--forms", nargs="*", default=list(FORMS), choices=list(FORMS))
-    parser.add_argument("--from", dest="sources", nargs="*", default=list(SOURCES), choices=SOURCES)
+    parser.add_argument("--from", dest="sources", nargs="*", default=[], choices=list(SOURCES), help="for every form, instead of the usual")
     parser.add_argument("--docs", action="store_true")
     args = parser.parse_args()
     recorded: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"runs": []}
@@ -145,7 +157,7 @@ def main() -> None:
         for seed in range(args.seeds):
             for kilobytes in args.kilobytes:
                 for form in args.forms:
-                    for source in args.sources:
+                    for source in args.sources or COMPARED[form]:
                         entry = one([*data, f"seed={seed}"], form, source, kilobytes) | {
                             "asked": kilobytes,
                             "budget": budget[0] + budget[1],

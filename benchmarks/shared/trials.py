@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -24,7 +23,7 @@ from neuprim.runs.open import load_dataset
 
 __all__ = ["Trial", "begin", "held_out", "paces_of", "recorded", "run_all"]
 
-_GROWN, _ROUNDS, _STEPS, _DRAWS = 150, 6, 16, 500
+_TURN, _DRAWS = 16, 500
 
 
 @dataclass(frozen=True)
@@ -82,9 +81,13 @@ Wanted = Sequence[str] | Callable[[dict[str, Any]], dict[str, Any]]
 
 
 def train(trial: Trial, wanted: Wanted) -> dict[str, Any]:
-    """One run and its numbers."""
+    """One run and its numbers; ``cpu_seconds`` are those that this thread computed while the model learned."""
     torch.set_num_threads(1)
-    fitted = complete(begin(trial))
+    fitted = begin(trial)
+    compile_kernels(fitted.trainer)
+    start = time.thread_time()
+    complete(fitted)
+    seconds = time.thread_time() - start
     metrics = fitted.metrics()
     if trial.keep is not None:
         trial.keep.mkdir(parents=True, exist_ok=True)
@@ -94,6 +97,7 @@ def train(trial: Trial, wanted: Wanted) -> dict[str, Any]:
         "trial": trial.name,
         "seed": trial.seed,
         "iterations": trial.iterations,
+        "cpu_seconds": seconds,
         **dict(trial.facts),
         **(wanted(metrics) if callable(wanted) else {k: metrics[k] for k in wanted if k in metrics}),
     }
@@ -127,21 +131,24 @@ def run_all(
             print(f"{time.strftime('%H:%M')} {row['trial']}: {shown(row)}", flush=True)
 
 
-def paces_of(trainers: Mapping[str, Trainer]) -> dict[str, float]:
-    """Seconds a step of each, taking turns so that all meet the same noise; medians over rounds, of models that have trained a little."""
+def paces_of(trainers: Mapping[str, Trainer], steps: int = 480) -> dict[str, float]:
+    """Seconds a step of each, taking turns so that all meet the same noise; a mean over ``steps``, as a run pays for every one of them.
+
+    Primitives grow, move and shrink as a run goes on, so the fairest pace is that of a whole one. Turns are as long as the rarest look at voxels
+    is apart. Of trainers with one thread the clock counts what it computes, and not what others on the machine do meanwhile.
+    """
     for trainer in trainers.values():
         compile_kernels(trainer)
-        if trainer.dataset.points is not None:  # files are read once in a run, not in each of its first steps
+        if trainer.dataset.points is not None:  # files are read once in a run, which is next to nothing in a long one
             generator = torch.Generator().manual_seed(0)
             for _ in range(_DRAWS):
                 trainer.dataset.points.draw(8, generator)
-        for _ in range(_GROWN):
-            trainer.train_step()
-    took: dict[str, list[float]] = {name: [] for name in trainers}
-    for _ in range(_ROUNDS):
+    clock = time.thread_time if all(trainer.renderer.threads == 1 for trainer in trainers.values()) else time.perf_counter
+    took, turns = dict.fromkeys(trainers, 0.0), max(steps // _TURN, 1)
+    for _ in range(turns):
         for name, trainer in trainers.items():
-            start = time.perf_counter()
-            for _ in range(_STEPS):
+            start = clock()
+            for _ in range(_TURN):
                 trainer.train_step()
-            took[name].append((time.perf_counter() - start) / _STEPS)
-    return {name: statistics.median(seconds) for name, seconds in took.items()}
+            took[name] += clock() - start
+    return {name: seconds / (turns * _TURN) for name, seconds in took.items()}

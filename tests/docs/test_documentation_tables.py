@@ -6,8 +6,9 @@ import importlib
 import json
 import re
 import sys
+import time
 from collections.abc import Callable
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -140,6 +141,33 @@ def test_the_tables_of_the_forms_are_those_of_the_recorded_results(benchmark: Ca
     assert between("README.md", "expressivity") == script.short_table(found["trials"])
     grid = json.loads((RESULTS / "screening.json").read_text(encoding="utf-8"))
     assert between("docs/expressivity.md", "screening") == benchmark("screening").grid_table(grid["trials"])
+
+
+class Busy:
+    """Stands for a trainer: each step computes a millisecond, every ``every``-th as many more, and waits for ``waits`` seconds."""
+
+    def __init__(self, every: int = 0, waits: float = 0.0) -> None:
+        self.renderer, self.dataset = SimpleNamespace(threads=1), SimpleNamespace(points=None)
+        self.step, self.every, self.waits = 0, every, waits
+
+    def train_step(self) -> None:
+        self.step += 1
+        begin, due = time.thread_time(), self.every and self.step % self.every == 0
+        while time.thread_time() - begin < 1e-3 * (1 + (self.every if due else 0)):
+            pass
+        time.sleep(self.waits)
+
+
+def test_paces_are_what_a_thread_computes_with_its_share_of_rare_steps(
+    benchmark: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A median would not see every sixteenth step, and a clock on the wall would see what else the machine does."""
+    script = benchmark("shared.trials")
+    monkeypatch.setattr(script, "compile_kernels", lambda trainer: None)
+    took = script.paces_of({"plain": Busy(), "waits": Busy(waits=2e-3), "sometimes more": Busy(every=16)}, 64)
+    assert took["plain"] == pytest.approx(1e-3, rel=0.1)
+    assert took["waits"] / took["plain"] == pytest.approx(1, rel=0.15)
+    assert took["sometimes more"] / took["plain"] == pytest.approx(2, rel=0.1)
 
 
 def test_forms_of_equal_bytes_are_counted_by_their_parameters(benchmark: Callable[[str], ModuleType]) -> None:

@@ -139,6 +139,11 @@ What is compared:
   axis ratio 1e4 even the float64 reference knows D to about 1e-7 only; a phase that turns w radians per m likewise to about
   1e-16 x w x distance/radius.
 
+- **Near planes inside a scene.** From 1.5 m in front of the camera on a primitive is anchored at its own centre, wherever the near plane
+  lies. Of a trained chair's 2,000 primitives with a hard edge, 4 units from the camera, 12 a view are drawn in float64 with the near plane at 0.01 and 5
+  with it at 4, through the chair; did anchors keep 1.5 m from that plane, too, it would be 411. Soft edges that are cut are drawn in float64 either way.
+  No image of either is off by more than 5e-7 (`python benchmarks/numerics.py --run RUN_DIR --near 0.01 3 3.5 4`).
+
 ## Worst errors
 
 {table}

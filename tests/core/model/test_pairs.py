@@ -106,7 +106,13 @@ def test_code_that_returns_something_else_is_named() -> None:
         replace(low, colour=OpaqueColour(lambda prim, x, d: x, 2)).seen(pairs)
 
 
-KERNELS = {"core/render/backends.py", "core/render/cpu/backend.py", "core/render/cuda/backend.py", "core/volumes/grid.py", "core/volumes/points.py"}
+KERNELS = {
+    "core/render/backends.py",
+    "core/render/cpu/backend.py",
+    "core/render/cuda/backend.py",
+    "core/volumes/grid.py",
+    "core/volumes/points.py",
+}
 """Where code asks which form it has, as compiled kernels know only some."""
 
 OWN = {"core/model/forms.py", "tasks/dynamic/invisible.py"}

@@ -248,6 +248,12 @@ def check_device(settings: RenderSettings) -> None:
         why = no_card() if settings.backend == AUTO else hardware.card_missing()
         if why is not None:
             raise BackendUnavailable(f"renderer.device={hardware.CARD}: {why}; expected {hardware.PROCESSOR} or {AUTO}")
+    elif settings.device == AUTO and settings.backend != AUTO:
+        backend = find(settings.backend)
+        if backend.devices[0] == hardware.CARD and backend.lacking is not None:
+            raise BackendUnavailable(
+                f"renderer.backend={backend.name} cannot run here: {backend.lacking}; expected {AUTO} or the name of another backend"
+            )
 
 
 def at_hand(settings: RenderSettings) -> RenderSettings:

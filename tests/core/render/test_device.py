@@ -60,6 +60,14 @@ def test_a_card_that_is_asked_for_and_not_there_is_one_line(tmp_path: Path, monk
         render_lowered(low, camera, RenderSettings(device="cuda"))
 
 
+def test_so_is_a_backend_of_a_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device, "card_missing", lambda: "torch finds no CUDA device")
+    monkeypatch.setattr("neuprim.runs.fit.load_dataset", lambda *_, **__: pytest.fail("loaded"))
+    line = r"^renderer\.backend=cuda cannot run here: torch finds no CUDA device; expected auto or the name of another backend$"
+    with pytest.raises(BackendUnavailable, match=line):
+        start(compose(words(tmp_path, tmp_path / "run", 3, "renderer.backend=cuda")))
+
+
 def test_a_card_that_nothing_draws_on_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device, "card_missing", lambda: None)
     monkeypatch.setattr(backends, "TABLE", tuple(b for b in backends.TABLE if b.devices[0] == "cpu"))

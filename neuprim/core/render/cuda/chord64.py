@@ -11,7 +11,20 @@ from __future__ import annotations
 from neuprim.core.compute.warp import wp
 from neuprim.core.render.cpu import layout as W
 
-__all__ = ["Chord64", "Moments", "Weight", "chord64", "dot64", "moments", "neuron64", "phase64", "rate64", "vec6d", "weight_of"]
+__all__ = [
+    "Chord64",
+    "Moments",
+    "Weight",
+    "chord64",
+    "dot64",
+    "moments",
+    "neuron64",
+    "phase64",
+    "rate64",
+    "through64",
+    "vec6d",
+    "weight_of",
+]
 
 vec6d = wp.types.vector(length=6, dtype=wp.float64)
 vec5d = wp.types.vector(length=5, dtype=wp.float64)
@@ -191,4 +204,36 @@ def dot64(w: Weight, M: vec6d):
     out.odd = w.q[1] * M[1] + w.q[3] * M[3]
     out.d_even = -(w.q[0] * M[1] + w.q[2] * M[3] + w.q[4] * M[5])
     out.d_odd = w.q[1] * M[2] + w.q[3] * M[4]
+    return out
+
+
+@wp.struct
+class Pull64:
+    """dL/d(origin m, direction e) of a ray, and with respect to what grows with the pixel offset."""
+
+    m: wp.vec3d
+    e: wp.vec3d
+    G: wp.vec3d
+
+
+@wp.func
+def through64(
+    c: Chord64, tc: wp.float64, depth_floor: float, g_half: wp.float64, g_mid: wp.float64, g_tm: wp.float64, gD: wp.float64, gA: wp.float64,
+    gq: wp.vec3d, gv: wp.vec3d,
+):  # fmt: skip
+    """As :func:`~neuprim.core.render.cuda.chord.through`, with dh/dD from the floor on D; g_tm, gD, gA: on other ways than the chord's ends."""
+    half = wp.float64(0.5)
+    two = wp.float64(2.0)
+    gt1 = half * (g_mid + g_half)
+    gt0 = half * (g_mid - g_half) * c.uncut
+    tm = g_tm + gt0 + gt1
+    g_h = gt1 - gt0
+    D = gD + g_h * half * c.ia / wp.sqrt(wp.max(c.D, wp.float64(depth_floor)) * c.ia)
+    a = gA - (half * g_h * c.h + tm * c.tm) * c.ia
+    b = -tm * c.ia
+    m2 = -two * D
+    out = Pull64()
+    out.m = gq + m2 * c.x + b * c.e
+    out.e = c.half * gv + c.mid * gq + (c.tm * m2 + b) * c.x + (two * a - b * c.tm) * c.e
+    out.G = out.e + tc * out.m
     return out

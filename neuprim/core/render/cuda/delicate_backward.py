@@ -14,7 +14,7 @@ from neuprim.core.compute.warp import OPTIONS, wp
 from neuprim.core.render.cpu import layout as W
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.backward_pairs import pixel_of_slot
-from neuprim.core.render.cuda.chord64 import chord64, dot64, moments, neuron64, phase64, rate64, weight_of
+from neuprim.core.render.cuda.chord64 import chord64, dot64, moments, neuron64, phase64, rate64, through64, weight_of
 from neuprim.core.render.cuda.delicate import ray_norm
 from neuprim.core.render.cuda.forms import Form
 from neuprim.core.render.cuda.together import row_sums, row_type
@@ -60,7 +60,6 @@ def delicate_pairs_kernel(form: Form, depth: bool) -> Any:
             if n < reached[tile]:
                 across = (size[0] + L.TILE - 1) // L.TILE
                 zero = wp.float64(0.0)
-                half_ = wp.float64(0.5)
                 two = wp.float64(2.0)
                 turn = wp.float64(_TWO_PI)
                 begin = offsets[n]
@@ -127,22 +126,12 @@ def delicate_pairs_kernel(form: Form, depth: bool) -> Any:
                             gA = -gh * (shift * shift * rest0 + two * shift * c.half * rest1 + c.half * c.half * rest2)
                         if wp.static(depth):
                             g_mid += wp.float64(hit[1] * g_z[pixel]) * wide[r, W.UNIT]
-                        gt1 = half_ * (g_mid + g_half)
-                        gt0 = half_ * (g_mid - g_half) * c.uncut
-                        g_tm += gt0 + gt1
-                        g_h = gt1 - gt0
-                        gD += g_h * half_ * c.ia / wp.sqrt(wp.max(c.D, wp.float64(depth_floor)) * c.ia)
-                        gA -= (half_ * g_h * c.h + g_tm * c.tm) * c.ia
-                        gB = -g_tm * c.ia
-                        m2 = -two * gD
-                        gm = gq + m2 * c.x + gB * c.e
-                        ge = c.half * gv + c.mid * gq + (c.tm * m2 + gB) * c.x + (two * gA - gB * c.tm) * c.e
-                        gG = ge + wide[r, W.TC] * gm
+                        pull = through64(c, wide[r, W.TC], depth_floor, g_half, g_mid, g_tm, gD, gA, gq, gv)
                         for k in range(3):
-                            total[k] += float(ge[k])
-                            total[3 + k] += float(c.du * gG[k])
-                            total[6 + k] += float(c.dv * gG[k])
-                            total[9 + k] += float(gm[k])
+                            total[k] += float(pull.e[k])
+                            total[3 + k] += float(c.du * pull.G[k])
+                            total[6 + k] += float(c.dv * pull.G[k])
+                            total[9 + k] += float(pull.m[k])
             add_lanes(total, lane, out, n * width)
 
     return delicate_pairs

@@ -13,7 +13,7 @@ from neuprim.core.render.cpu import layout as W
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.backward_pairs import pixel_of_slot
 from neuprim.core.render.cuda.chord import chord, ray_of, through_chord, xyz
-from neuprim.core.render.cuda.chord64 import chord64
+from neuprim.core.render.cuda.chord64 import chord64, through64
 from neuprim.core.render.cuda.forms import Form
 from neuprim.core.render.cuda.functions import TAU, cos_turns, sin_turns
 from neuprim.core.render.cuda.together import row_sums, row_type
@@ -195,24 +195,13 @@ def delicate_net_kernel(form: Form) -> Any:
                         total[to + 2] += float(gu * c.q[2])
                         total[to + 3] += float(gu)
                         gq += gu * axes
-                    half = d(0.5)
-                    g_mid = wp.dot(gq, c.e)
-                    gt1 = half * g_mid
-                    gt0 = half * g_mid * c.uncut
-                    g_tm = gt0 + gt1
-                    g_h = gt1 - gt0
-                    gD = g_h * half * c.ia / wp.sqrt(wp.max(c.D, d(depth_floor)) * c.ia)
-                    gA = -(half * g_h * c.h + g_tm * c.tm) * c.ia
-                    gB = -g_tm * c.ia
-                    m2 = d(-2.0) * gD
-                    gm = gq + m2 * c.x + gB * c.e
-                    ge = c.mid * gq + (c.tm * m2 + gB) * c.x + (d(2.0) * gA - gB * c.tm) * c.e
-                    gG = ge + wide[r, W.TC] * gm
+                    zero = d(0.0)
+                    moved = through64(c, wide[r, W.TC], depth_floor, zero, wp.dot(gq, c.e), zero, zero, zero, gq, wp.vec3d())
                     for k in range(3):
-                        total[k] += float(ge[k])
-                        total[3 + k] += float(c.du * gG[k])
-                        total[6 + k] += float(c.dv * gG[k])
-                        total[9 + k] += float(gm[k])
+                        total[k] += float(moved.e[k])
+                        total[3 + k] += float(c.du * moved.G[k])
+                        total[6 + k] += float(c.dv * moved.G[k])
+                        total[9 + k] += float(moved.m[k])
         add_lanes(total, lane, out, n * width)
 
     return delicate_net

@@ -97,9 +97,10 @@ def test_a_benchmark_rewrites_its_tables_without_measuring(
             assert (table in written) == ("-baselines" not in table and "-environment" not in table), table[:40]
 
 
-def test_the_readme_is_a_page_with_one_large_picture() -> None:
+def test_the_readme_is_a_page_with_one_large_picture_and_one_of_curves() -> None:
     assert len(README.read_text(encoding="utf-8").splitlines()) <= 120
-    (picture,) = [target for target in links(README) if target.endswith(".png")]
+    picture, curves = [target for target in links(README) if target.endswith(".png")]
+    assert curves == "docs/pictures/budgets.png"
     with Image.open(ROOT / picture) as image:
         assert image.width >= 3 * 256 and image.height >= 2 * 256
     assert "generated data" in prose(README).lower()

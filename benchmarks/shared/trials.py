@@ -37,6 +37,8 @@ class Trial:
         hold_out: n > 1: judge by every n-th training view instead of the test views.
         facts: what the record says of it besides its numbers.
         keep: folder for configuration and model, or None.
+        interventions: into the population, spread evenly, so that short runs have as many as one of the preset's own length;
+            None leaves the steps between two of them to the preset.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Trial:
     hold_out: int = 0
     facts: tuple[tuple[str, Any], ...] = ()
     keep: Path | None = None
+    interventions: int | None = 20
 
 
 def held_out(dataset: Dataset, every: int) -> Dataset:
@@ -56,7 +59,7 @@ def held_out(dataset: Dataset, every: int) -> Dataset:
 
 
 def begin(trial: Trial) -> Fitted:
-    """Data and a fresh model; the population is looked at as often as in a run of the preset's own length."""
+    """Data and a fresh model."""
     words = [
         *trial.words,
         f"seed={trial.seed}",
@@ -65,8 +68,8 @@ def begin(trial: Trial) -> Fitted:
         "train.eval_every=0",
         "renderer.threads=1",
     ]
-    if not any(word.startswith("train.population.every=") for word in words):
-        words.append(f"train.population.every={max(trial.iterations // 20, 1)}")
+    if trial.interventions and not any(word.startswith("train.population.every=") for word in words):
+        words.append(f"train.population.every={max(trial.iterations // trial.interventions, 1)}")
     if trial.keep is not None:
         words.append(f"output_dir='{trial.keep.resolve()}'")
     config = compose(words, check_output=False)

@@ -93,6 +93,7 @@ def _estimate(planned: Sequence[Planned]) -> Iterator[str]:
             if key not in paces:
                 paces[key] = pace(one)
                 yield f"{one.row.name}, {one.scene}: {1e3 * paces[key]:.0f} ms a step at the start, {train.iterations:,} steps"
+            assert train.iterations is not None, "a run without seconds has steps"
             total += paces[key] * train.iterations
             grows = grows or train.population.strategy == "gradient"
         else:

@@ -112,7 +112,13 @@ def start(config: RunConfig, events: Events = silent, dataset: Dataset | None = 
     if channels.partial:
         events(Note(f"shown: {channels.shown}; task {task.name!r} has no display that shows them all"))
     events(Preparing("starting points"))
-    return Fitted(config, task, dataset, channels, make_trainer(config, task, dataset, loss), lpips)
+    trainer = make_trainer(config, task, dataset, loss)
+    asked, found = config.model.primitives, trainer.model.count
+    if found < asked:
+        grows = config.train.population.strategy == "relocate"
+        rest = "the rest is born where the error is largest" if grows else "there will be no more of them"
+        events(Note(f"{dataset.name} offers {found:,} starting points for model.primitives={asked:,}: {rest}"))
+    return Fitted(config, task, dataset, channels, trainer, lpips)
 
 
 def steps(trainer: Trainer, events: Events = silent) -> Iterator[tuple[StepReport, float | None]]:
@@ -167,7 +173,10 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss
     others = task.parameter_names() - model.params.keys()
     rates = {k: v for k, v in config.train.rates.items() if k not in others}
     units = {k: v for k, v in config.train.rate_units.items() if k not in others}
-    settings = replace(config.train, rates=rates, rate_units=units)
+    population = config.train.population
+    if population.grow_to is None:
+        population = replace(population, grow_to=config.model.primitives)
+    settings = replace(config.train, rates=rates, rate_units=units, population=population)
     return Trainer(model, dataset, loss or make_loss(config, task), settings, config.renderer, config.seed)
 
 
@@ -177,7 +186,8 @@ def compile_kernels(trainer: Trainer) -> None:
     rows = torch.arange(0, model.count, max(model.count // 64, 1))  # some of them live in the view
     few = Primitives(model.density, model.colour, model.rows(rows))
     trial = Trainer(few, trainer.dataset, trainer.loss, trainer.settings, trainer.renderer, 0)
-    trial.step = max(trial.settings.iterations, 1)  # at the end of the budget every band of colour is in use
+    trial.step = max(trial.settings.iterations or 1, 1)
+    trial.elapsed = trial.settings.max_seconds or 0.0  # at the end of the budget every band of colour is in use
     trial.train_step()
 
 

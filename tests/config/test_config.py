@@ -63,6 +63,18 @@ def test_values_in_other_spellings(toy: Path) -> None:
     assert toys("train.max_seconds=5", "train.max_seconds=null").train.max_seconds is None
 
 
+def test_typed_seconds_are_all_of_the_budget(toy: Path) -> None:
+    c = toys("train.max_seconds=5")
+    assert c.train.iterations is None, "or a fast machine would stop at the preset's steps before the seconds are over"
+    assert c.non_default["train.iterations"] == (7, None)
+    assert toys("train={max_seconds:5}").train.iterations is None
+    assert toys("train.max_seconds=5", "train.iterations=9").train.iterations == 9
+    assert toys("train={max_seconds:5,iterations:9}").train.iterations == 9
+    assert toys("train.max_seconds=5", "train.max_seconds=null").train.iterations == 7
+    with pytest.raises(ConfigError, match=r"train\.iterations and train\.max_seconds are both null; expected a budget"):
+        toys("train.iterations=null")
+
+
 def test_interpolation_follows_the_override(toy: Path) -> None:
     assert toys("seed=30", "train.log_every=${seed}").train.log_every == 30
 
@@ -361,10 +373,10 @@ def test_impossible_settings_in_a_file(toy: Path, old: str, new: str, text: str)
 
 
 @pytest.mark.parametrize("preset", ["quick", "paper", "paper_real", "paper_200", "paper_5k"])
-@pytest.mark.parametrize("scene", ["solids", "mesh", "blender", "nerfstudio", "colmap"])
+@pytest.mark.parametrize("scene", ["solids", "room", "mesh", "blender", "nerfstudio", "colmap"])
 def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str, scene: str) -> None:
     monkeypatch.chdir(tmp_path)
-    path = [] if scene == "solids" else ["scene.path=data"]
+    path = [] if scene in ("solids", "room") else ["scene.path=data"]
     c = compose([f"scene={scene}", f"preset={preset}", *path])
     assert (c.task, c.scene_name, c.preset) == ("static", scene, preset)
     gain = {"log_gain"} if preset == "quick" else set()

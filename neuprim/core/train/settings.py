@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from neuprim.core.checked import Range, text, verify
+from neuprim.core.errors import ConfigError
 from neuprim.core.model.schema import RateUnit
 
 __all__ = ["ModelSettings", "PopulationSettings", "TrainSettings"]
@@ -45,12 +46,14 @@ class PopulationSettings:
     """How primitives are born, moved and removed. ``start`` and ``stop`` are fractions of the training budget.
 
     Attributes:
-        strategy: "fixed", "relocate" (constant count: the least used move to where the error is) or "gradient" (clone,
+        strategy: "fixed", "relocate" (the least used move to where the error is; the count is constant once it is reached) or "gradient" (clone,
             split and prune by the density network's gradient norm, as the authors do).
         every: steps between two interventions.
         fraction: relocate: the largest share of primitives moved at once.
         idle: relocate: only primitives whose weight in the images since the last intervention is below this share of the mean
             primitive's move; null moves the least used ones, however much they do.
+        grow_to: relocate: how many primitives there are to be; where the start has fewer, those with the largest error split. null is
+            as many as ``model.primitives``, of which data may not offer enough points.
         grow_threshold, prune_threshold: gradient: on the mean norm of the density gradient.
         clone_scale, prune_scale: gradient: in units of the scene's extent.
         max_primitives: growth cap.
@@ -62,6 +65,7 @@ class PopulationSettings:
     stop: Share = 0.6
     fraction: Annotated[float, Range(0, 1)] = 0.05
     idle: NotNegative | None = None
+    grow_to: Annotated[int, Range(at_least=1)] | None = None
     grow_threshold: NotNegative = 1e-5
     prune_threshold: NotNegative = 1e-6
     clone_scale: NotNegative = 0.01
@@ -78,7 +82,8 @@ class TrainSettings:
     elapsed/max_seconds.
 
     Attributes:
-        iterations: steps.
+        iterations: steps, each of ``views_per_step`` views; null leaves the budget to ``max_seconds``. A command line that types ``max_seconds``
+            alone means that: all the seconds are used, however fast the machine.
         views_per_step: views that a step looks at; gradients are their mean. A card has room for several small images.
         max_seconds: stop after this many seconds of training, if given (such a run is not bit-reproducible).
         rates: learning rate by parameter name, over the specs' own.
@@ -107,7 +112,7 @@ class TrainSettings:
         eval_every: fraction of the budget between two evaluations on a few held-out views for the curve; 0 for none.
     """
 
-    iterations: Annotated[int, Range(at_least=0)] = 30_000
+    iterations: Annotated[int, Range(at_least=0)] | None = 30_000
     views_per_step: Annotated[int, Range(1, 1024)] = 1
     coarse: Literal[1, 2, 4, 8, 16] = 1
     coarse_until: Share = 0.3
@@ -136,3 +141,5 @@ class TrainSettings:
 
     def __post_init__(self) -> None:
         verify(self, "train")
+        if self.iterations is None and self.max_seconds is None:
+            raise ConfigError("train.iterations and train.max_seconds are both null; expected a budget, in steps, in seconds or both")

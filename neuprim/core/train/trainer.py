@@ -177,7 +177,8 @@ class Trainer:
     @property
     def progress(self) -> float:
         """Used fraction of the budget: the larger of steps and seconds. Every schedule runs on it."""
-        done = self.step / self.settings.iterations if self.settings.iterations else 1.0
+        steps = self.settings.iterations
+        done = 0.0 if steps is None else self.step / steps if steps else 1.0
         if self.settings.max_seconds is not None:
             done = max(done, self.elapsed / self.settings.max_seconds)
         return min(done, 1.0)

@@ -42,6 +42,12 @@ def _solids(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     return load(settings, context)
 
 
+def _room(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+    from neuprim.tasks.static.room import load
+
+    return load(settings, context)
+
+
 def _mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     try:
         import trimesh  # noqa: F401
@@ -82,6 +88,7 @@ TASK = TaskSpec(
     config_package="neuprim.tasks.static.conf",
     scenes=(
         SceneSpec("solids", "built in: sharp edges, thin rods, a curved handle; generated in seconds", _solids),
+        SceneSpec("room", "built in: the solids in a textured room, taken like photographs: lens, exposures, points", _room),
         SceneSpec("mesh", "your own model, ray-cast: a .glb, .gltf, .obj, .ply or .stl: scene.path=FILE", _mesh),
         SceneSpec("blender", "NeRF-synthetic layout: transforms_train.json, RGBA images", _blender),
         SceneSpec("nerfstudio", "instant-ngp / nerfstudio transforms.json", _nerfstudio),

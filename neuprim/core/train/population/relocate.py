@@ -1,4 +1,4 @@
-"""The strategy ``relocate``: as many primitives as at the start, moved to where they are missing."""
+"""The strategy ``relocate``: as many primitives as were asked for, moved to where they are missing."""
 
 from __future__ import annotations
 
@@ -13,12 +13,16 @@ from neuprim.core.train.settings import PopulationSettings
 
 __all__ = ["Relocate"]
 
+_GROWTH = 0.25
+"""Largest share of the primitives that is born at once: a split costs quality that training has to win back."""
+
 
 class Relocate(Population):
-    """Constant count: primitives with the least total weight move to where weight x error is largest.
+    """Primitives with the least total weight move to where weight x error is largest, and as many are born there as are still missing.
 
     The busiest primitive splits in two by the exact rule, one child in its own row and one in the idle row. A split costs more than it
-    brings once the idle ones are used up (children cover each other and not all of their parent): ``idle`` says who may move.
+    brings once the idle ones are used up (children cover each other and not all of their parent): ``idle`` says who may move. Where there are
+    fewer primitives than ``grow_to``, further ones split without an idle row, at most a quarter of all at a time.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:
@@ -40,27 +44,36 @@ class Relocate(Population):
         self.weight = self.error = None
         count = model.count
         budget = int(self.settings.fraction * count)
-        busiest = torch.argsort(error, descending=True, stable=True)[:budget]
+        births = min(max((self.settings.grow_to or 0) - count, 0), max(int(_GROWTH * count), 1))
+        busiest = torch.argsort(error, descending=True, stable=True)
         busy = torch.zeros(count, dtype=torch.bool, device=model.device)
-        busy[busiest] = True
+        busy[busiest[:budget]] = True
         idle = torch.argsort(weight, stable=True)
         idle = idle[~busy[idle]][:budget]
         if self.settings.idle is not None:
             idle = idle[weight[idle] < self.settings.idle * weight.mean()]
-        moves = min(len(idle), len(busiest))
-        if moves == 0:
+        moves = min(len(idle), budget)
+        idle = idle[:moves]
+        moved = torch.zeros_like(busy)
+        moved[idle] = True
+        busiest = busiest[~moved[busiest]]
+        births = max(min(births, int((error[busiest] > 0).sum()) - moves), 0)  # what no view showed has nothing to split for
+        busiest = busiest[: moves + births]
+        if len(busiest) == 0:
             return None
-        idle, busiest = idle[:moves], busiest[:moves]
         children = split(model, busiest, SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS)
-        params = {n: v.detach().clone() for n, v in model.params.items()}
-        target = torch.cat([busiest, idle])
-        for name, value in params.items():
-            value[target] = children[name]
-        origin = torch.arange(count, device=model.device)
-        origin[idle] = busiest
-        fresh = torch.zeros(count, dtype=torch.bool, device=model.device)
+        new = torch.arange(count, count + births, device=model.device)
+        target = torch.cat([busiest, idle, new])
+        params = {}
+        for name, value in model.params.items():
+            params[name] = torch.cat([value.detach(), value.detach()[busiest[moves:]]]) if births else value.detach().clone()
+            params[name][target] = children[name]
+        origin = torch.arange(count + births, device=model.device)
+        origin[torch.cat([idle, new])] = busiest
+        fresh = torch.zeros(count + births, dtype=torch.bool, device=model.device)
         fresh[target] = True
-        return Change(params, origin, fresh, f"moved {moves}")
+        said = [f"{what} {number}" for what, number in (("moved", moves), ("grew by", births)) if number]
+        return Change(params, origin, fresh, ", ".join(said))
 
     def state(self) -> dict[str, Tensor]:
         return {} if self.weight is None or self.error is None else {"weight": self.weight, "error": self.error}

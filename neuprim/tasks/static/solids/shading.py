@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neuprim.scenes.raycast import Scene
+from neuprim.scenes.raycast import Hits, Scene
 from neuprim.scenes.reflectance import dot, reflected
 
-__all__ = ["DAYLIGHT", "Daylight", "encode_srgb", "radiance"]
+__all__ = ["DAYLIGHT", "Colour", "Daylight", "add_surroundings", "encode_srgb", "radiance"]
 
 Array = NDArray[np.float32]
+Colour = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -26,9 +27,9 @@ class Daylight:
     """
 
     direction: tuple[float, float, float] = (0.42, -0.62, 0.92)
-    sun: tuple[float, float, float] = (2.3, 2.2, 2.0)
-    sky: tuple[float, float, float] = (0.42, 0.46, 0.53)
-    ground: tuple[float, float, float] = (0.22, 0.2, 0.18)
+    sun: Colour = (2.3, 2.2, 2.0)
+    sky: Colour = (0.42, 0.46, 0.53)
+    ground: Colour = (0.22, 0.2, 0.18)
 
 
 DAYLIGHT = Daylight()
@@ -50,12 +51,7 @@ def radiance(scene: Scene, origins: ArrayLike, directions: ArrayLike, light: Day
     starts = hits.lifted()[lit]
     lit[lit] = ~scene.occluded(starts, np.broadcast_to(to_sun, starts.shape))
     rgb = reflected(hits, to_eye, to_sun) * (np.array(light.sun, dtype=np.float32) * lit[:, None])
-    rgb += hits.albedo * _surroundings(light, hits.normal[:, 2])
-    # Polished things mirror the surroundings faintly, more so at grazing angles (Schlick).
-    facing = np.clip(dot(hits.normal, to_eye), 0, 1)
-    mirrored = 2 * facing * hits.normal[:, 2] - to_eye[:, 2]
-    strength = hits.gloss * (0.06 + 0.5 * (1 - facing) ** 5)
-    rgb += strength[:, None] * _surroundings(light, mirrored)
+    add_surroundings(rgb, hits, to_eye, light.sky, light.ground)
     image = np.zeros(d.shape, dtype=np.float32)
     image[hits.hit] = rgb
     return image, hits.hit
@@ -69,7 +65,22 @@ def encode_srgb(linear: Array) -> Array:
     )
 
 
-def _surroundings(light: Daylight, height: Array) -> Array:
+def add_surroundings(rgb: Array, hits: Hits, to_eye: Array, sky: Colour, ground: Colour) -> None:
+    """Add to ``rgb`` (M, 3) what soft light from all around, ``sky`` above and ``ground`` below, makes the surfaces send to the eye.
+
+    Args:
+        to_eye: (M, 3) unit vectors away from the surface.
+        sky, ground: (3,) linear RGB radiance from straight above and straight below, blended in between.
+    """
+    rgb += hits.albedo * _surroundings(sky, ground, hits.normal[:, 2])
+    # Polished things mirror the surroundings faintly, more so at grazing angles (Schlick).
+    facing = np.clip(dot(hits.normal, to_eye), 0, 1)
+    mirrored = 2 * facing * hits.normal[:, 2] - to_eye[:, 2]
+    strength = hits.gloss * (0.06 + 0.5 * (1 - facing) ** 5)
+    rgb += strength[:, None] * _surroundings(sky, ground, mirrored)
+
+
+def _surroundings(sky: Colour, ground: Colour, height: Array) -> Array:
     """(M, 3) radiance of sky and ground seen towards a direction of z component ``height`` (M,)."""
     t = (0.5 + 0.5 * height)[:, None]
-    return t * np.array(light.sky, dtype=np.float32) + (1 - t) * np.array(light.ground, dtype=np.float32)
+    return t * np.array(sky, dtype=np.float32) + (1 - t) * np.array(ground, dtype=np.float32)

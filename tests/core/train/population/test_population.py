@@ -65,8 +65,10 @@ def points_inside(params: dict[str, Tensor], rows: Tensor, each: int = 8) -> tup
     return many, g.means[many] + (g.rotations[many] @ (g.scales[many] * u)[:, :, None])[..., 0]
 
 
-def relocate(m: Primitives, weight: Tensor, error: Tensor, fraction: float = 0.25, idle: float | None = None):  # type: ignore[no-untyped-def]
-    population = Relocate(PopulationSettings(fraction=fraction, idle=idle))
+def relocate(  # type: ignore[no-untyped-def]
+    m: Primitives, weight: Tensor, error: Tensor, fraction: float = 0.25, idle: float | None = None, grow_to: int | None = None
+):
+    population = Relocate(PopulationSettings(fraction=fraction, idle=idle, grow_to=grow_to))
     population.observe(m, stats(weight, error))
     return population.intervene(m, 1.0)
 
@@ -140,6 +142,25 @@ def test_relocation_can_be_left_to_the_idle() -> None:
     assert relocate(m, weight, error, 0.05, 0.05).text == "moved 1", "the share still bounds it"
     assert relocate(m, torch.ones(COUNT), error, 0.25, 0.05) is None, "all are at work"
     assert relocate(m, torch.zeros(COUNT), error, 0.25, 0.05) is None, "a stretch of views without anything says nothing of anyone"
+
+
+def test_relocation_grows_to_what_was_asked_for_where_the_error_is() -> None:
+    m = model()
+    weight, error = torch.ones(COUNT), torch.arange(1.0, COUNT + 1)
+    weight[[2, 6]] = 0.0
+    change = relocate(m, weight, error, 0.1, 0.05, grow_to=COUNT + 3)
+    assert change is not None and change.text == "moved 2, grew by 3"
+    assert change.origin.tolist()[COUNT:] == [17, 16, 15] and sorted(change.origin[[2, 6]].tolist()) == [18, 19]
+    assert change.fresh.nonzero()[:, 0].tolist() == [2, 6, 15, 16, 17, 18, 19, 20, 21, 22]
+    rows, x = points_inside(change.params, change.fresh.nonzero()[:, 0])
+    before = sigma({k: v.detach() for k, v in m.params.items()}, 4, change.origin[rows], x)
+    assert torch.allclose(sigma(change.params, 4, rows, x), before, rtol=1e-10, atol=1e-10)
+    others = [i for i in range(COUNT) if i not in (2, 6, 15, 16, 17, 18, 19)]
+    assert all(torch.equal(v[others], m.params[k][others]) for k, v in change.params.items())
+    assert relocate(m, torch.ones(COUNT), error, 0.1, 0.05, grow_to=1000).text == f"grew by {COUNT // 4}", "a quarter at a time"
+    assert relocate(m, torch.ones(COUNT), error, 0.1, 0.05, grow_to=COUNT) is None, "nobody is missing"
+    error[:-2] = 0.0
+    assert relocate(m, torch.ones(COUNT), error, 0.1, 0.05, grow_to=1000).text == "grew by 2", "nothing is known of the others"
 
 
 def test_relocation_sums_over_views_and_starts_anew() -> None:

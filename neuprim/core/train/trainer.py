@@ -70,7 +70,8 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
     """Primitives on the data set's starting points, as large as their neighbours are far (RMS distance to the 3 nearest).
 
     ``model.init.points``: "matter" (the data set's own), "box" (anywhere in its box), or a .ply file of points or 3D Gaussians;
-    the latter bring sizes, orientations and opacities of their own. ``model.init.scale`` multiplies all sizes.
+    the latter bring sizes, orientations and opacities of their own. ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``:
+    share of the primitives that start where views show something and the data set has no points, for photographs; 0 unless said.
 
     Raises:
         ConfigError: no such setting, or a setting with an impossible value.
@@ -87,11 +88,7 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
         cloud = subset(points, settings.primitives, generator)
     elif where in ("matter", "box"):
         cloud = (dataset.uniform_points if where == "box" else dataset.initial_points)(settings.primitives, generator)
-        if share := float(settings.init.get("surroundings", 0.0)):
-            own = min(len(cloud.means), round((1.0 - share) * settings.primitives))
-            cloud = subset(cloud, own, generator)
-            more = surrounding_points(dataset.train, cloud, settings.primitives - own, generator)
-            cloud = PointCloud(torch.cat([cloud.means, more.means]), torch.cat([cloud.colors, more.colors]))
+        cloud = _surrounded(cloud, dataset, settings, generator)
     else:
         raise ConfigError(f"model.init.points={where!r}: expected matter, box or a .ply file")
     check_points(cloud, settings.primitives, dataset)
@@ -115,6 +112,18 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
     if axes is not None:
         context.axes = axes.clamp_min(1e-6 * dataset.extent) * factor
     return Primitives.initialise(density, colour, context)
+
+
+def _surrounded(cloud: PointCloud, dataset: Dataset, settings: ModelSettings, generator: torch.Generator) -> PointCloud:
+    """The points, a share of them (``model.init.surroundings``) replaced by what views show where there are none."""
+    share = settings.init.get("surroundings", 0.0)
+    if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
+        raise ConfigError(f"model.init.surroundings={share!r}: expected a share of the primitives, at least 0 and below 1")
+    if not share:
+        return cloud
+    own = subset(cloud, min(len(cloud.means), round((1.0 - share) * settings.primitives)), generator)
+    more = surrounding_points(dataset.train, own, settings.primitives - len(own.means), generator)
+    return PointCloud(torch.cat([own.means, more.means]), torch.cat([own.colors, more.colors]))
 
 
 @dataclass(frozen=True)
@@ -165,6 +174,11 @@ class Trainer:
         self.angles = None if settings.angular_size is None else AngularSize(dataset.train, settings.angular_size)
         self.exposures = None
         if settings.exposure_rate > 0:
+            if dataset.train.pixels(0).alpha is not None:
+                raise ConfigError(
+                    f"train.exposure_rate={settings.exposure_rate:g}: images of {dataset.name} have alpha; expected opaque photographs, "
+                    "as a gain would change the background that is put behind them"
+                )
             self.exposures = Exposures(len(dataset.train), dataset.channels, settings.exposure_rate, self.device)
         self.generator = torch.Generator().manual_seed(seed + 1)
         self.order = torch.empty(0, dtype=torch.int64)

@@ -153,7 +153,9 @@ def draw(rows: Sequence[Mapping[str, Any]]) -> None:
             found = values(rows, scene, measure)
             means = [statistics.mean(v) for v in found.values()]
             (line,) = axis.plot(list(found), means, marker="o", markersize=3.5, label=title)
-            axis.fill_between(list(found), [min(v) for v in found.values()], [max(v) for v in found.values()], color=line.get_color(), alpha=0.2)
+            axis.fill_between(
+                list(found), [min(v) for v in found.values()], [max(v) for v in found.values()], color=line.get_color(), alpha=0.2
+            )
         axis.set_xscale("log", base=2)
         axis.set_xticks(list(found), [f"{n:,}" for n in found], rotation=45, fontsize=7)
         axis.set_title(TITLES[scene].replace("`", ""), fontsize=9)

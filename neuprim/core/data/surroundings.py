@@ -119,7 +119,13 @@ def _shell(views: ViewSet, given: Tensor, count: int, generator: torch.Generator
     seen = torch.zeros(many, dtype=torch.bool)
     for camera in cameras:
         inside, depth = _projected(
-            means.numpy(), camera.viewmat[:3, :3].double().numpy(), camera.viewmat[:3, 3].double().numpy(), camera.fx, camera.fy, camera.cx, camera.cy
+            means.numpy(),
+            camera.viewmat[:3, :3].double().numpy(),
+            camera.viewmat[:3, 3].double().numpy(),
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
         )
         seen |= torch.from_numpy((depth > 0) & (inside >= 0).all(1) & (inside < (camera.width, camera.height)).all(1))
     rows = seen.nonzero()[:, 0]

@@ -27,7 +27,8 @@ class Room(ViewSet):
         eyes = [torch.tensor([1.5 * math.sin(t), -2.0 * math.cos(t), 0.3]) for t in torch.linspace(-0.6, 0.6, count).tolist()]
         width, height = SIZE
         self.cameras = [
-            Camera(look_at(e, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])), 40.0, 40.0, width / 2, height / 2, width, height) for e in eyes
+            Camera(look_at(e, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])), 40.0, 40.0, width / 2, height / 2, width, height)
+            for e in eyes
         ]
 
     def __len__(self) -> int:
@@ -92,7 +93,11 @@ def test_some_are_a_shell_far_behind_everything_where_some_view_looks() -> None:
     seen = torch.zeros(len(far), dtype=torch.bool)
     for camera in views.cameras:
         local = far.double() @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3]
-        seen |= (local[:, 2] > 0) & ((local[:, 0] / local[:, 2]).abs() * 40 <= SIZE[0] / 2) & ((local[:, 1] / local[:, 2]).abs() * 40 <= SIZE[1] / 2)
+        seen |= (
+            (local[:, 2] > 0)
+            & ((local[:, 0] / local[:, 2]).abs() * 40 <= SIZE[0] / 2)
+            & ((local[:, 1] / local[:, 2]).abs() * 40 <= SIZE[1] / 2)
+        )
     assert bool(seen.all())
 
 
@@ -122,6 +127,9 @@ def test_nothing_is_made_of_nothing() -> None:
 
 @pytest.mark.parametrize("share", ["1.5", "-0.1", "yes"])
 def test_a_share_is_a_share(share: str) -> None:
-    config = compose(["task=static", "scene=solids", "scene.size=16", "scene.train_views=4", "scene.test_views=1", f"model.init.surroundings={share}"], False)
+    config = compose(
+        ["task=static", "scene=solids", "scene.size=16", "scene.train_views=4", "scene.test_views=1", f"model.init.surroundings={share}"],
+        False,
+    )
     with pytest.raises(ConfigError, match=r"model\.init\.surroundings"):
         make_trainer(config, task_of(config), load_dataset(config, task_of(config)))

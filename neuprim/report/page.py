@@ -45,6 +45,7 @@ def render_page(run: RunRecord, conditions: Sequence[ConditionSpec] = ()) -> str
         headline=sections.headline(run),
         films=sections.films(run),
         held_out=sections.held_out(run),
+        regions=sections.regions(run),
         charts=sections.charts(run),
         view_table=sections.view_table(run),
         settings=sections.settings(run),

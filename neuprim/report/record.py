@@ -2,7 +2,7 @@
 
 Expected files, each of which may be missing: ``config.yaml`` (resolved settings), ``metrics.json`` (final numbers), ``metrics.jsonl``
 (one JSON object per logged step) and ``renders/`` (held-out views as ``test_<index>_<name>.png`` with ``_truth`` and ``_error``
-beside them, ``clip_<name>.webp`` with ground truth and render side by side, and ``orbit.webp``).
+beside them, ``worst.json`` and its pictures, ``clip_<name>.webp`` with ground truth and render side by side, and ``orbit.webp``).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 import yaml
 
 from neuprim.core.errors import DataError
+from neuprim.report.regions import RegionFile, read_regions
 
 __all__ = ["RunRecord", "ViewFiles", "number", "read_run"]
 
@@ -54,6 +55,7 @@ class RunRecord:
     views: list[ViewFiles]
     orbit: Path | None
     clips: list[Path]
+    regions: list[RegionFile]
 
     @property
     def finished(self) -> bool:
@@ -130,7 +132,8 @@ def read_run(run_dir: Path) -> RunRecord:
     log, unreadable = _log(_text(log_file) or "")
     views, orbit = _pictures(run_dir / "renders")
     clips = sorted((run_dir / "renders").glob("clip_*.webp"))
-    return RunRecord(run_dir, config_text, config, _metrics(metrics_file), log, unreadable, views, orbit, clips)
+    regions = read_regions(run_dir / "renders")
+    return RunRecord(run_dir, config_text, config, _metrics(metrics_file), log, unreadable, views, orbit, clips, regions)
 
 
 def _text(path: Path) -> str | None:

@@ -16,10 +16,26 @@ from neuprim.report.pictures import ERROR_SCALE, Inlined, color_bar, inline
 from neuprim.report.record import RunRecord, ViewFiles, number, per_view
 from neuprim.report.text import MISSING, byte_size, count, decimal, duration, escape, setting
 
-__all__ = ["banner", "charts", "commands", "config", "facts", "films", "headline", "heading", "held_out", "settings", "view_table"]
+__all__ = [
+    "banner",
+    "charts",
+    "commands",
+    "config",
+    "facts",
+    "films",
+    "headline",
+    "heading",
+    "held_out",
+    "regions",
+    "settings",
+    "view_table",
+]
 
 MAX_VIEWS = 24
 """Held-out views shown as pictures; of more, evenly spaced ones."""
+
+WORST_SHOWN = 12
+"""Worst regions that are shown unfolded."""
 
 PIXELATED_BELOW = 256
 """Pictures narrower than this many pixels are enlarged with hard pixel edges."""
@@ -204,6 +220,26 @@ def held_out(run: RunRecord) -> str:
     rows = "".join(_view_row(run, view, row) for view, row in pictures)
     note = f'<p class="note">{" ".join(notes)}</p>' if notes else ""
     return _section("Held-out views", f"{_shown(run)}{bar}{rows}{note}")
+
+
+def regions(run: RunRecord) -> str:
+    """Of every held-out view the square that came out worst, the worst first, folded after the first dozen."""
+    figures = []
+    for one in run.regions:
+        caption = f"<b>{decimal(one.psnr, 1)}</b> dB in {escape(one.place)} of {escape(one.name)}"
+        figures.append(
+            _figure(inline(one.path), caption, f"worst region of view {escape(one.name)}: ground truth, render, error", exists=True)
+        )
+    if not figures:
+        return ""
+    note = (
+        '<p class="note">Of every view the square of a quarter of its shorter side with the largest error: ground truth, render, error.</p>'
+    )
+    first, rest = figures[:WORST_SHOWN], figures[WORST_SHOWN:]
+    body = f'{note}<div class="regions">{"".join(first)}</div>'
+    if rest:
+        body += f'<details><summary>{count(len(rest))} more</summary><div class="regions">{"".join(rest)}</div></details>'
+    return _section("Worst regions", body)
 
 
 def _picture(view: ViewFiles, kind: str) -> Inlined | None:

@@ -11,6 +11,7 @@ from neuprim.core.io import images
 from neuprim.core.io.files import write_json
 from neuprim.plugins.judging import clips_of, orbit_of
 from neuprim.report import error_map, write_report
+from neuprim.report.regions import Regions
 from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import draw, measure, summary
 
@@ -32,6 +33,7 @@ def finish(fitted: Fitted, directory: Path) -> None:
     clips = clips_of(task, dataset)
     reels = {i: clip for clip in clips if clip.source is None for i in clip.views}
     pictures: list[torch.Tensor] = []
+    regions = Regions(channels.display)
 
     def film(clip: Clip, index: int, rendered: torch.Tensor, truth: torch.Tensor) -> None:
         pictures.append(images.to_uint8(torch.cat([channels.display(x) for x in (truth, rendered)], dim=1)))
@@ -40,6 +42,7 @@ def finish(fitted: Fitted, directory: Path) -> None:
             pictures.clear()
 
     def keep(index: int, view: View, rendered: torch.Tensor, truth: torch.Tensor) -> None:
+        regions.look(view.name, rendered, truth)
         clip = reels.get(index)
         if clip is not None:
             film(clip, index, rendered, truth)
@@ -50,6 +53,7 @@ def finish(fitted: Fitted, directory: Path) -> None:
             images.write_png(folder / f"{stem}_error.png", torch.from_numpy(error_map(rendered, truth)))
 
     views = measure(model, task, dataset, config.renderer, channels, keep, fitted.lpips)
+    regions.write(folder)
     for clip in clips:
         if clip.source is None:
             continue  # drawn above

@@ -123,7 +123,7 @@ def check_names(spec: TaskSpec, settings: RunSettings) -> None:
     classes = list((spec.fields or {}).values())
     if not classes:
         return
-    init = {"scale", "points", *(name for cls in classes for name in cls.init_settings)}
+    init = {"scale", "points", "surroundings", *(name for cls in classes for name in cls.init_settings)}
     refuse_unknown(settings.model.init, init, "model.init")
     try:
         parameters = {s.name for s in (*GEOMETRY_SPECS, *(s for cls in classes for s in cls.every_parameter()))}

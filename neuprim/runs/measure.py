@@ -27,7 +27,7 @@ from neuprim.core.compute import device
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.check import check_dataset, check_pixels
 from neuprim.core.io import images
-from neuprim.core.metrics import means, psnr, ssim, ssim_3dgs, to_json
+from neuprim.core.metrics import means, psnr, psnr_gain, ssim, ssim_3dgs, to_json
 from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
@@ -48,7 +48,7 @@ class ViewMetrics:
         psnr, ssim: in the data set's colour space.
         seconds: of the forward pass alone.
         more: further numbers by name: ``psnr_srgb``, ``ssim_srgb`` of linear images, or ``psnr_display``, ``ssim_display`` of what the
-            task's own display shows; ``ssim_3dgs``, ``lpips``; ``psnr_mask`` and ``mse_mask`` inside the task's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without
+            task's own display shows; ``psnr_gain`` of opaque photographs; ``ssim_3dgs``, ``lpips``; ``psnr_mask`` and ``mse_mask`` inside the task's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without
             anything on it; what the task's :attr:`~neuprim.core.task.TaskSpec.judge` adds.
     """
 
@@ -118,6 +118,8 @@ def measure(
             rendered = torch.where(pixels.mask[..., None], rendered, truth)
         counted = mask_of(task, dataset, i)
         more = _more(rendered, truth, dataset, channels, counted, pixels.mask) | _as_others(rendered, truth, channels, lpips)
+        if pixels.alpha is None:
+            more["psnr_gain"] = psnr_gain(rendered, truth, pixels.mask)
         more |= judged(task, dataset, i, rendered, truth)
         result.append(ViewMetrics(view.name, psnr(rendered, truth, pixels.mask), ssim(rendered, truth), seconds, more))
         if seen is not None:

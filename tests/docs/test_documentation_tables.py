@@ -203,3 +203,17 @@ def test_tables_of_a_card_show_every_number(benchmark: Callable[[str], ModuleTyp
     assert found.splitlines()[-1] == "| K=8 p=0 | 5,000 | 800×600 | 12,345 | 678,901 | 0.50 | 1.25 | 2.50 | 2000 | 123 |"
     assert script.training_table(records).splitlines()[-1] == "| lit solids | 900 | 2,000 | 3.14 | 31.23 (psnr) |"
     assert script.parity_table(records) == ""
+
+
+def test_the_tables_of_photographs_are_those_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
+    rows = json.loads((RESULTS / "photographs.json").read_text(encoding="utf-8"))["trials"]
+    script = benchmark("photographs")
+    for part in ("presets", "pieces"):
+        assert between("docs/static.md", f"photographs-{part}") == str(script.table(rows, part))
+
+
+def test_the_tables_of_photographs_are_those_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
+    rows = json.loads((RESULTS / "photographs.json").read_text(encoding="utf-8"))["trials"]
+    script = benchmark("photographs")
+    for part in ("presets", "pieces"):
+        assert between("docs/static.md", f"photographs-{part}") == str(script.table(rows, part))

@@ -21,7 +21,7 @@ from torch.nn.functional import pad
 
 from neuprim.core.errors import DataError, NonFiniteError
 
-__all__ = ["SSIM_SIGMA", "SSIM_WINDOW", "from_json", "matched", "means", "psnr", "ssim", "ssim_3dgs", "to_json"]
+__all__ = ["SSIM_SIGMA", "SSIM_WINDOW", "from_json", "matched", "means", "psnr", "psnr_gain", "ssim", "ssim_3dgs", "to_json"]
 
 SSIM_WINDOW = 11
 """Taps of the Gaussian window per axis (Wang et al. 2004)."""
@@ -76,6 +76,16 @@ def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: floa
             raise DataError("mask leaves no pixel to compare")
     error = squares.mean().item()
     return math.inf if error == 0.0 else 20.0 * math.log10(peak) - 10.0 * math.log10(error)
+
+
+def psnr_gain(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: float = 1.0) -> float:
+    """:func:`psnr` after the gain per channel that brings ``rendered`` closest to ``truth``: what is left when exposure and white balance are
+    taken away, which no model can know of a photograph that it has not seen. Arguments and errors as of :func:`psnr`."""
+    first, second = matched(rendered, truth)
+    counted = torch.ones(second.shape[:2], dtype=torch.bool) if mask is None else mask.cpu()
+    square = first[counted].square().sum(0)
+    gain = torch.where(square > 0, (first * second)[counted].sum(0) / square.clamp_min(1e-300), torch.ones_like(square))
+    return psnr(first * gain, second, mask, peak)
 
 
 def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:

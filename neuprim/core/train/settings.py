@@ -89,6 +89,11 @@ class TrainSettings:
         rates: learning rate by parameter name, over the specs' own.
         rate_units: unit of a parameter's rate by its name, over the spec's own: "absolute" (a position's is in scene units a step), or
             "extent" (the rate times the scene's extent, so that it does not depend on how large the scene is).
+        coarse: factor by which training views are reduced at first; a power of two, 1 for none. It halves step by step until
+            ``coarse_until``, a fraction of the budget, from which on views are as they are.
+        angular_size: no primitive's largest semi-axis is more than this share of its distance to the nearest training camera; null for no limit.
+        exposure_rate: learning rate of a gain per training view and channel, for photographs that are not exposed alike, per step in
+            which a view is seen; 0 for none. Held-out views are drawn with the training views' mean gain.
         final_rate: the rates decay exponentially to this fraction of themselves at the end of the budget; 1 is constant.
         adam_beta2: decay of Adam's second moment per step, in [0, 1).
         warmup_steps: steps over which the rates rise linearly from zero.
@@ -109,6 +114,10 @@ class TrainSettings:
 
     iterations: Annotated[int, Range(at_least=0)] | None = 30_000
     views_per_step: Annotated[int, Range(1, 1024)] = 1
+    coarse: Literal[1, 2, 4, 8, 16] = 1
+    coarse_until: Share = 0.3
+    angular_size: Annotated[float, Range(above=0)] | None = None
+    exposure_rate: NotNegative = 0.0
     max_seconds: Annotated[float, Range(above=0, says="a positive number of seconds")] | None = None
     rates: dict[str, NotNegative] = field(default_factory=dict)
     rate_units: dict[str, RateUnit] = field(default_factory=dict)

@@ -21,10 +21,11 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.compute.threads import limited
-from neuprim.core.data import Dataset, Pixels
+from neuprim.core.data import Dataset, Pixels, PointCloud
 from neuprim.core.data.check import check_pixels, check_points
 from neuprim.core.data.initial import subset
 from neuprim.core.data.points_file import read_points
+from neuprim.core.data.surroundings import surrounding_points
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, DeviceMemoryError, NonFiniteError, nearest
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
@@ -34,6 +35,9 @@ from neuprim.core.render.output import Tally, together
 from neuprim.core.render.place import device_of
 from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.ahead import Ahead
+from neuprim.core.train.angle import AngularSize
+from neuprim.core.train.coarse import reduced, reduction
+from neuprim.core.train.exposure import Exposures
 from neuprim.core.train.losses import scale_anisotropy
 from neuprim.core.train.optimizer import RowAdam
 from neuprim.core.train.points import PointStep, point_step
@@ -66,14 +70,15 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
     """Primitives on the data set's starting points, as large as their neighbours are far (RMS distance to the 3 nearest).
 
     ``model.init.points``: "matter" (the data set's own), "box" (anywhere in its box), or a .ply file of points or 3D Gaussians;
-    the latter bring sizes, orientations and opacities of their own. ``model.init.scale`` multiplies all sizes.
+    the latter bring sizes, orientations and opacities of their own. ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``:
+    share of the primitives that start where views show something and the data set has no points, for photographs; 0 unless said.
 
     Raises:
         ConfigError: no such setting, or a setting with an impossible value.
         DataError: the data set offers no starting point, or the file is damaged.
     """
     for key in settings.init:
-        known = ("scale", "points", *density.init_settings, *colour.init_settings)
+        known = ("scale", "points", "surroundings", *density.init_settings, *colour.init_settings)
         if key not in known:
             raise ConfigError(f"model.init.{key}: no such setting{nearest(key, known)}")
     generator = torch.Generator().manual_seed(seed)
@@ -83,6 +88,7 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
         cloud = subset(points, settings.primitives, generator)
     elif where in ("matter", "box"):
         cloud = (dataset.uniform_points if where == "box" else dataset.initial_points)(settings.primitives, generator)
+        cloud = _surrounded(cloud, dataset, settings, generator)
     else:
         raise ConfigError(f"model.init.points={where!r}: expected matter, box or a .ply file")
     check_points(cloud, settings.primitives, dataset)
@@ -106,6 +112,18 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
     if axes is not None:
         context.axes = axes.clamp_min(1e-6 * dataset.extent) * factor
     return Primitives.initialise(density, colour, context)
+
+
+def _surrounded(cloud: PointCloud, dataset: Dataset, settings: ModelSettings, generator: torch.Generator) -> PointCloud:
+    """The points, a share of them (``model.init.surroundings``) replaced by what views show where there are none."""
+    share = settings.init.get("surroundings", 0.0)
+    if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
+        raise ConfigError(f"model.init.surroundings={share!r}: expected a share of the primitives, at least 0 and below 1")
+    if not share:
+        return cloud
+    own = subset(cloud, min(len(cloud.means), round((1.0 - share) * settings.primitives)), generator)
+    more = surrounding_points(dataset.train, own, settings.primitives - len(own.means), generator)
+    return PointCloud(torch.cat([own.means, more.means]), torch.cat([own.colors, more.colors]))
 
 
 @dataclass(frozen=True)
@@ -153,6 +171,15 @@ class Trainer:
         self.optimizer = RowAdam(model.specs, model.params, settings.adam_beta2)
         self._ahead = Ahead(self._pixels, device.spare_memory(self.device) // 4) if self.device.type == device.CARD else None
         self.population = make_population(settings.population)
+        self.angles = None if settings.angular_size is None else AngularSize(dataset.train, settings.angular_size)
+        self.exposures = None
+        if settings.exposure_rate > 0:
+            if dataset.train.pixels(0).alpha is not None:
+                raise ConfigError(
+                    f"train.exposure_rate={settings.exposure_rate:g}: images of {dataset.name} have alpha; expected opaque photographs, "
+                    "as a gain would change the background that is put behind them"
+                )
+            self.exposures = Exposures(len(dataset.train), dataset.channels, settings.exposure_rate, self.device)
         self.generator = torch.Generator().manual_seed(seed + 1)
         self.order = torch.empty(0, dtype=torch.int64)
         self.step = 0
@@ -241,6 +268,10 @@ class Trainer:
         assert tally is not None
         self.population.observe(model, tally if not others else together([*(other.tally for other in others), tally], model.count))
         self.optimizer.step(model.params, self.rates())
+        if self.exposures is not None:
+            self.exposures.step()
+        if self.angles is not None:
+            self.angles.step(self.step, model.params["means"], model.params["log_scales"])
         self.step += 1
         change = None
         if self.population.due(self.step, progress):
@@ -266,12 +297,15 @@ class Trainer:
     def _look(self, progress: float) -> _ImageStep:
         """Draw the next view and compare."""
         index = self._next_view()
-        view = self.dataset.train.view(index)
         pixels = self._pixels(index) if self._ahead is None else self._ahead.take(index, self.order)
+        factor = reduction(progress, self.settings.coarse, self.settings.coarse_until)
+        view, pixels = reduced(self.dataset.train.view(index), pixels, factor)
         background = self._background().to(self.device, non_blocking=True)
         truth = pixels.over(background)
         output = render(self.model, view.camera, view.conditions, self.renderer, background)
-        rgb = output.rgb if pixels.mask is None else torch.where(pixels.mask[..., None], output.rgb, truth)
+        rgb = output.rgb if self.exposures is None else self.exposures.apply(index, output.rgb)
+        if pixels.mask is not None:
+            rgb = torch.where(pixels.mask[..., None], rgb, truth)
         loss, parts = self.loss(rgb, truth, Supervision(view, pixels.mask, pixels.alpha, progress))
         with torch.no_grad():
             difference = rgb - truth
@@ -343,6 +377,7 @@ class Trainer:
         tensors = {f"params.{k}": v.detach() for k, v in self.model.params.items()}
         tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
         tensors |= {f"population.{k}": v for k, v in self.population.state().items()}
+        tensors |= {f"exposure.{k}": v for k, v in (self.exposures.state() if self.exposures else {}).items()}
         tensors |= {"generator": self.generator.get_state(), "order": self.order}
         tensors = {name: value.cpu() for name, value in tensors.items()}
         return tensors, {"step": self.step, "elapsed": self.elapsed, "views": len(self.dataset.train), "names": self._names()}
@@ -389,6 +424,11 @@ class Trainer:
                 raise ValueError("the order of views is out of range")
             generator = torch.Generator()
             generator.set_state(tensors["generator"])
+            exposures = part("exposure.")
+            if bool(exposures) != (self.exposures is not None):
+                raise ValueError(f"it has {'' if exposures else 'no '}exposures, train.exposure_rate is {self.settings.exposure_rate:g}")
+            if self.exposures is not None:
+                self.exposures.load_state(exposures)
             population = part("population.")
             for name, value in population.items():
                 if value.dim() > 0 and value.shape != (model.count,):

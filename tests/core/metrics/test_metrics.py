@@ -11,7 +11,7 @@ import torch
 from scipy.signal import convolve2d
 
 from neuprim.core.errors import DataError, NonFiniteError
-from neuprim.core.metrics import SSIM_SIGMA, SSIM_WINDOW, from_json, psnr, ssim, ssim_3dgs, to_json
+from neuprim.core.metrics import SSIM_SIGMA, SSIM_WINDOW, from_json, psnr, psnr_gain, ssim, ssim_3dgs, to_json
 
 
 def pair(height: int, width: int, channels: int, noise: float = 0.1, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -195,3 +195,21 @@ def test_any_number_of_channels_is_the_mean_over_them(channels: int) -> None:
     errors = [10 ** (-psnr(a, b) / 10) for a, b in alone]
     assert psnr(rendered, truth) == pytest.approx(-10 * math.log10(float(np.mean(errors))), abs=1e-9)
     assert ssim(rendered, truth) == pytest.approx(plain_ssim(rendered.numpy(), truth.numpy(), SSIM_WINDOW), abs=1e-9)
+
+
+def test_psnr_after_the_best_gain() -> None:
+    generator = torch.Generator().manual_seed(2)
+    truth = torch.rand(20, 30, 3, generator=generator, dtype=torch.float64)
+    gain = torch.tensor([0.8, 1.1, 1.3], dtype=torch.float64)
+    noise = 0.01 * torch.randn(20, 30, 3, generator=generator, dtype=torch.float64)
+    assert psnr_gain((truth + noise) / gain, truth) == pytest.approx(psnr(truth + noise, truth), abs=0.1)
+    assert psnr((truth + noise) / gain, truth) < 20
+    found = psnr_gain(truth / gain + noise, truth)
+    for factor in (0.999, 1.001):
+        assert psnr((truth / gain + noise) * gain * factor, truth) <= found, "no other gain is better"
+    mask = torch.zeros(20, 30, dtype=torch.bool)
+    mask[:, :5] = True
+    spoiled = truth / gain
+    spoiled[:, 5:] = 0.0
+    assert psnr_gain(spoiled, truth, mask) > 200
+    assert psnr_gain(torch.zeros_like(truth), truth) == pytest.approx(psnr(torch.zeros_like(truth), truth)), "black has no gain"

@@ -1,0 +1,48 @@
+"""Views at a lower resolution: what a training looks at before details matter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from neuprim.core.data import Pixels, View
+
+__all__ = ["reduced", "reduction"]
+
+_SMALLEST = 16
+"""Pixels along a side that no reduction goes below."""
+
+
+def reduction(progress: float, coarse: int, until: float) -> int:
+    """Whole factor at this used share of the budget: ``coarse`` at first, then half of it and so on, each for an equal share, 1 from ``until`` on."""
+    if coarse <= 1 or progress >= until:
+        return 1
+    stages = coarse.bit_length() - 1
+    return coarse >> min(int(progress / until * stages), stages)
+
+
+def reduced(view: View, pixels: Pixels, factor: int) -> tuple[View, Pixels]:
+    """The view on pixels ``factor`` times as large, averaged; what is left over at the right and at the bottom is cut off.
+
+    Colours are premultiplied, so that the mean is that of what a camera would see. A large pixel counts where all of its parts do.
+    """
+    camera = view.camera
+    while factor > 1 and min(camera.width, camera.height) // factor < _SMALLEST:
+        factor //= 2
+    if factor == 1:
+        return view, pixels
+    width, height = camera.width // factor, camera.height // factor
+    small = replace(
+        camera, fx=camera.fx / factor, fy=camera.fy / factor, cx=camera.cx / factor, cy=camera.cy / factor, width=width, height=height
+    )
+    alpha = None if pixels.alpha is None else _averaged(pixels.alpha[..., None], factor)[..., 0]
+    mask = None if pixels.mask is None else _averaged(pixels.mask[..., None].float(), factor)[..., 0] > 0.999
+    return replace(view, camera=small), Pixels(_averaged(pixels.rgb, factor), alpha, mask)
+
+
+def _averaged(values: Tensor, factor: int) -> Tensor:
+    """(H // factor, W // factor, C) means of (H, W, C)."""
+    return F.avg_pool2d(values.permute(2, 0, 1)[None], factor)[0].permute(1, 2, 0).contiguous(memory_format=torch.contiguous_format)

@@ -1,0 +1,72 @@
+"""A gain for every training image: photographs of one scene are not all exposed alike."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+__all__ = ["Exposures"]
+
+_BETA1, _BETA2, _EPS = 0.9, 0.99, 1e-8
+
+
+class Exposures:
+    """A factor per training view and channel, with which a drawn image is multiplied before it is compared.
+
+    Factors are learned beside the model, by Adam, each when its view is seen. Their geometric mean over the views stays 1, so that the model keeps the
+    photographs' mean exposure, which is what held-out views are drawn with.
+
+    Args:
+        views: training views.
+        channels: colour channels.
+        rate: of the factors' logarithms, per step in which a view is seen.
+    """
+
+    def __init__(self, views: int, channels: int, rate: float, device: torch.device) -> None:
+        self.rate = rate
+        self.log_gain = torch.zeros(views, channels, device=device)
+        self.m, self.v = torch.zeros_like(self.log_gain), torch.zeros_like(self.log_gain)
+        self.seen = torch.zeros(views, dtype=torch.int64)
+        self._now: dict[int, Tensor] = {}
+
+    def apply(self, index: int, rgb: Tensor) -> Tensor:
+        """(H, W, C) as the camera of view ``index`` would have exposed it."""
+        gain = self.log_gain[index].clone().requires_grad_()
+        self._now[index] = gain
+        return rgb * gain.exp()
+
+    def step(self) -> None:
+        """Move the factors of the views applied since the last call by their gradients."""
+        for index, gain in self._now.items():
+            if gain.grad is None:
+                continue
+            self.seen[index] += 1
+            n = int(self.seen[index])
+            self.m[index] += (1 - _BETA1) * (gain.grad - self.m[index])
+            self.v[index] += (1 - _BETA2) * (gain.grad.square() - self.v[index])
+            scale = math.sqrt(1 - _BETA2**n) / (1 - _BETA1**n)
+            self.log_gain[index] -= self.rate * scale * self.m[index] / (self.v[index].sqrt() + _EPS)
+        if self._now:
+            self.log_gain -= self.log_gain.mean(0)
+        self._now = {}
+
+    def state(self) -> dict[str, Tensor]:
+        """Tensors from which :meth:`load_state` goes on."""
+        return {"log_gain": self.log_gain, "m": self.m, "v": self.v, "seen": self.seen}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Counterpart of :meth:`state`.
+
+        Raises:
+            ValueError: it is of other views, or not finite.
+        """
+        for name, own in self.state().items():
+            given = state.get(name)
+            if given is None or given.shape != own.shape or given.dtype != own.dtype or not bool(torch.isfinite(given.double()).all()):
+                found = "missing" if given is None else f"{given.dtype} {tuple(given.shape)}"
+                raise ValueError(f"exposure.{name} is {found}; expected finite {own.dtype} {tuple(own.shape)}")
+        device = self.log_gain.device
+        self.log_gain, self.m, self.v = (state[k].to(device, copy=True) for k in ("log_gain", "m", "v"))
+        self.seen = state["seen"].clone()

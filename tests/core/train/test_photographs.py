@@ -1,0 +1,171 @@
+"""What photographs need of a training: coarse views first, a gain per view, primitives that do not veil a camera."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from neuprim.core import checkpoint
+from neuprim.core.data import Dataset, Pixels, View, ViewSet
+from neuprim.core.errors import CheckpointError, ConfigError
+from neuprim.core.train import coarse
+from neuprim.core.train.angle import AngularSize
+from neuprim.core.train.coarse import reduced, reduction
+from neuprim.core.train.exposure import Exposures
+from neuprim.core.train.trainer import Trainer
+from tests.core import tiny
+
+
+@pytest.fixture(scope="module")
+def plain() -> Dataset:
+    return tiny.two_primitives()
+
+
+@pytest.fixture(autouse=True)
+def small_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The images here are tiny to begin with."""
+    monkeypatch.setattr(coarse, "_SMALLEST", 4)
+
+
+class Gained(ViewSet):
+    """The views of another set as opaque photographs before a white wall, each with a gain of its own."""
+
+    def __init__(self, views: ViewSet, gains: torch.Tensor) -> None:
+        self.views, self.gains = views, gains
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def view(self, index: int) -> View:
+        return self.views.view(index)
+
+    def pixels(self, index: int) -> Pixels:
+        found = self.views.pixels(index)
+        return Pixels(found.over(torch.ones(3)) * self.gains[index])
+
+
+def test_the_factor_halves_in_equal_shares() -> None:
+    at = [reduction(p, 8, 0.3) for p in (0.0, 0.09, 0.1, 0.19, 0.2, 0.29, 0.3, 1.0)]
+    assert at == [8, 8, 4, 4, 2, 2, 1, 1]
+    assert {reduction(p / 10, 1, 0.3) for p in range(11)} == {1}
+
+
+def test_a_coarse_view_is_the_mean_of_what_it_covers(plain: Dataset) -> None:
+    view, pixels = plain.train.view(0), plain.train.pixels(0)
+    height, width = pixels.rgb.shape[:2]
+    mask = torch.ones(height, width, dtype=torch.bool)
+    mask[1, 0] = False
+    small, rough = reduced(view, replace(pixels, mask=mask), 2)
+    assert rough.rgb.shape == (height // 2, width // 2, 3) == (small.camera.height, small.camera.width, 3)
+    assert torch.allclose(rough.rgb[3, 5], pixels.rgb[6:8, 10:12].mean((0, 1)), atol=1e-6)
+    if pixels.alpha is not None and rough.alpha is not None:
+        assert torch.allclose(rough.alpha[3, 5], pixels.alpha[6:8, 10:12].mean(), atol=1e-6)
+    assert rough.mask is not None and not rough.mask[0, 0] and int((~rough.mask).sum()) == 1
+    point = torch.tensor([0.05, -0.1, 0.2, 1.0], dtype=torch.float64)
+    fine, far = (camera.K @ (camera.viewmat @ point)[:3] for camera in (view.camera, small.camera))
+    assert torch.allclose(fine[:2] / fine[2], 2 * far[:2] / far[2]), "where a point is seen does not move"
+
+
+def test_a_view_is_never_reduced_to_nothing(plain: Dataset) -> None:
+    view, pixels = plain.train.view(0), plain.train.pixels(0)
+    small, few = reduced(view, pixels, 1024)
+    assert 4 <= small.camera.width < 8 and few.rgb.shape[1] == small.camera.width
+
+
+def test_coarse_steps_look_at_small_images(plain: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = []
+    from neuprim.core.train import trainer as module
+
+    drawn = module.render
+    monkeypatch.setattr(module, "render", lambda m, camera, *rest: sizes.append(camera.width) or drawn(m, camera, *rest))
+    for _ in tiny.trainer(plain, 20, coarse=2, coarse_until=0.5).run():
+        pass
+    full = plain.train.view(0).camera.width
+    assert sizes == [full // 2] * 10 + [full] * 10
+
+
+def test_gains_are_found_and_their_mean_is_one(plain: Dataset) -> None:
+    count = len(plain.train)
+    gains = torch.exp(torch.linspace(-0.2, 0.2, count)[:, None] * torch.tensor([1.0, 0.5, -0.5]))
+    data = replace(plain, train=Gained(plain.train, gains))
+    with_gains, without = tiny.trainer(data, 400, exposure_rate=0.01), tiny.trainer(data, 400)
+    errors = []
+    for trainer in (with_gains, without):
+        reports = list(trainer.run())
+        errors.append(sum(r.psnr for r in reports[-count:]) / count)
+    assert errors[0] > errors[1] + 1.0, errors
+    assert with_gains.exposures is not None
+    found = with_gains.exposures.log_gain
+    assert found.mean(0).abs().max() < 1e-6
+    assert (found - (gains.log() - gains.log().mean(0))).abs().max() < 0.06
+    assert without.exposures is None and not any(k.startswith("exposure") for k in without.state()[0])
+
+
+def test_gains_are_saved_and_go_on(plain: Dataset, tmp_path: Path) -> None:
+    plain = replace(plain, train=Gained(plain.train, torch.ones(len(plain.train), 3)))
+
+    def make() -> Trainer:
+        return tiny.trainer(plain, 30, exposure_rate=0.01)
+
+    whole, first, second = make(), make(), make()
+    reports = [r.loss for r in whole.run()]
+    begun = [first.train_step().loss for _ in range(13)]
+    tensors, header = first.state()
+    checkpoint.write(tmp_path / "c.safetensors", "checkpoint", tensors, header)
+    header, tensors = checkpoint.read(tmp_path / "c.safetensors", "checkpoint")
+    second.load_state(tensors, header, "c.safetensors")
+    assert begun + [r.loss for r in second.run()] == reports
+    with pytest.raises(CheckpointError, match=r"has exposures, train\.exposure_rate is 0\b"):
+        tiny.trainer(plain, 30).load_state(tensors, header, "c")
+    with pytest.raises(CheckpointError, match=r"exposure\.log_gain is torch\.float32 \(1, 3\); expected finite"):
+        make().load_state({**tensors, "exposure.log_gain": torch.zeros(1, 3)}, header, "c")
+    with pytest.raises(CheckpointError, match="it has no exposures"):
+        make().load_state({k: v for k, v in tensors.items() if not k.startswith("exposure")}, header, "c")
+
+
+def test_gains_are_for_photographs(plain: Dataset) -> None:
+    with pytest.raises(ConfigError, match=r"train\.exposure_rate=0\.01: images of two have alpha; expected opaque photographs"):
+        tiny.trainer(plain, 30, exposure_rate=0.01)
+
+
+def test_a_gain_moves_by_its_own_gradient_only() -> None:
+    exposures = Exposures(3, 3, 0.1, torch.device("cpu"))
+    image = torch.ones(4, 4, 3)
+    loss = (exposures.apply(1, image) - 2.0).abs().mean()
+    loss.backward()
+    exposures.step()
+    assert torch.allclose(exposures.log_gain[1] - exposures.log_gain[0], torch.tensor(0.1), atol=1e-4)
+    assert torch.equal(exposures.log_gain[0], exposures.log_gain[2]) and exposures.seen.tolist() == [0, 1, 0]
+    before = exposures.log_gain.clone()
+    exposures.step()
+    assert torch.equal(exposures.log_gain, before), "no view, no step"
+
+
+def test_no_primitive_looks_larger_than_it_may(plain: Dataset) -> None:
+    limit = AngularSize(plain.train, 0.25, every=5)
+    eyes = torch.stack([plain.train.view(i).camera.position for i in range(len(plain.train))]).float()
+    means = torch.cat([eyes[:1] + torch.tensor([0.4, 0.0, 0.0]), eyes[:1] * 50, eyes[:1]])
+    log_scales = torch.tensor([[-1.0, -2.0, -3.0], [1.0, 0.5, 0.0], [0.0, 0.0, 0.0]])
+    kept = log_scales.clone()
+    limit.step(4, means, kept)
+    assert torch.equal(kept, log_scales), "not due"
+    limit.step(5, means, kept)
+    distance = torch.cdist(means, eyes).min(1).values
+    assert kept[0].max().exp() == pytest.approx(0.25 * distance[0].item(), rel=1e-5)
+    assert torch.allclose(kept[0] - kept[0].max(), log_scales[0] - log_scales[0].max()), "shapes stay"
+    assert torch.equal(kept[1], log_scales[1]), "far away is large enough"
+    assert bool(torch.isfinite(kept).all()), "even inside a camera"
+
+
+def test_a_training_keeps_the_limit(plain: Dataset) -> None:
+    trainer = tiny.trainer(plain, 40, angular_size=0.02)
+    for _ in trainer.run():
+        pass
+    eyes = torch.stack([plain.train.view(i).camera.position for i in range(len(plain.train))]).float()
+    distance = torch.cdist(trainer.model.params["means"].detach(), eyes).min(1).values
+    size = trainer.model.params["log_scales"].detach().max(1).values.exp()
+    assert float((size / distance).max()) <= 0.02 * math.exp(0.7), "a few steps may have passed since the last look"

@@ -27,9 +27,10 @@ from neuprim.core.model.colours import sh
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.train import population
+from neuprim.core.train.initial import initial_model
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import ModelSettings, TrainSettings
-from neuprim.core.train.trainer import Trainer, initial_model
+from neuprim.core.train.trainer import Trainer
 from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity

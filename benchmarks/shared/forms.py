@@ -91,7 +91,7 @@ SCENES = {
     "solids": Scene("static", ("scene=solids", "scene.size=200", "train.background=white")),
     "chair": Scene("static", ("scene=blender", "train.background=white"), "scene.path"),
     "fire": Scene("dynamic", _FIRE, "scene.vdb", ("scene.cameras=38",), "psnr_mask"),
-    "smoke_fire": Scene("dynamic", ("scene=smoke_fire",), None, ("scene.cameras=38",), "psnr_mask"),
+    "smoke_fire": Scene("dynamic", ("scene=smoke_fire", "scene.size=64"), None, ("scene.cameras=38",), "psnr_mask"),
     "lit_solids": Scene("relight", ("scene=lit_solids", "scene.size=128"), None, ("scene.hold_out=8",), "psnr_linear_clamped"),
 }
 

@@ -23,8 +23,9 @@ from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.backends import ORACLE
 from neuprim.core.task import TaskSpec
+from neuprim.core.train.initial import initial_model
 from neuprim.core.train.settings import PopulationSettings, TrainSettings
-from neuprim.core.train.trainer import Trainer, initial_model
+from neuprim.core.train.trainer import Trainer
 from neuprim.core.uses import build_settings, loss_settings
 
 __all__ = ["EXACT", "PRIMITIVES", "ConformanceError", "Frozen", "Subject", "watched"]

@@ -17,7 +17,8 @@ from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
 from neuprim.core.task import Loss, TaskSpec
-from neuprim.core.train.trainer import StepReport, Trainer, initial_model
+from neuprim.core.train.initial import initial_model
+from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.core.uses import build_settings, loss_settings
 from neuprim.plugins.blame import Suspects, blamed
 from neuprim.plugins.checked import check_fields, checked_loss

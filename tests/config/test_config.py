@@ -381,7 +381,14 @@ def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pr
     assert (c.task, c.scene_name, c.preset) == ("static", scene, preset)
     gain = {"log_gain"} if preset in ("quick", "photographs") else set()
     assert set(c.train.rates) == {"means", "log_scales", "quats", "W1", "b1", "w2", "b2", "sh_dc", "sh_rest"} | gain
-    strategies = {"quick": "relocate", "photographs": "relocate", "paper": "gradient", "paper_real": "gradient", "paper_200": "fixed", "paper_5k": "fixed"}
+    strategies = {
+        "quick": "relocate",
+        "photographs": "relocate",
+        "paper": "gradient",
+        "paper_real": "gradient",
+        "paper_200": "fixed",
+        "paper_5k": "fixed",
+    }
     assert c.train.population.strategy == strategies[preset]
 
 

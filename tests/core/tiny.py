@@ -20,9 +20,10 @@ from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered
+from neuprim.core.train.initial import initial_model
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
-from neuprim.core.train.trainer import Trainer, initial_model
+from neuprim.core.train.trainer import Trainer
 from neuprim.tasks.static.fields import SphericalHarmonics
 
 SIZE = 24

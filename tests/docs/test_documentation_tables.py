@@ -210,10 +210,3 @@ def test_the_tables_of_photographs_are_those_of_the_recorded_results(benchmark: 
     script = benchmark("photographs")
     for part in ("presets", "pieces"):
         assert between("docs/static.md", f"photographs-{part}") == str(script.table(rows, part))
-
-
-def test_the_tables_of_photographs_are_those_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
-    rows = json.loads((RESULTS / "photographs.json").read_text(encoding="utf-8"))["trials"]
-    script = benchmark("photographs")
-    for part in ("presets", "pieces"):
-        assert between("docs/static.md", f"photographs-{part}") == str(script.table(rows, part))

@@ -17,8 +17,8 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.edge import NORMS
 from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.train.initial import initial_model
 from neuprim.core.train.settings import ModelSettings
-from neuprim.core.train.trainer import initial_model
 from neuprim.plugins.export import appearance
 from neuprim.plugins.export.appearance import Harmonics, harmonics_of
 from neuprim.plugins.export.gaussian_ply import LAYOUT

@@ -12,24 +12,17 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.compute.threads import limited
-from neuprim.core.data import Dataset, Pixels, PointCloud
-from neuprim.core.data.check import check_pixels, check_points
-from neuprim.core.data.initial import subset
-from neuprim.core.data.points_file import read_points
-from neuprim.core.data.surroundings import surrounding_points
+from neuprim.core.data import Dataset, Pixels
+from neuprim.core.data.check import check_pixels
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, DeviceMemoryError, NonFiniteError, nearest
-from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.output import Tally, together
 from neuprim.core.render.place import device_of
@@ -42,13 +35,9 @@ from neuprim.core.train.losses import scale_anisotropy
 from neuprim.core.train.optimizer import RowAdam
 from neuprim.core.train.points import PointStep, point_step
 from neuprim.core.train.population import Change, make_population
-from neuprim.core.train.settings import ModelSettings, TrainSettings
+from neuprim.core.train.settings import TrainSettings
 
-__all__ = ["StepReport", "Trainer", "initial_model"]
-
-
-_USUAL_OPACITY = 0.5
-"""Of Gaussians that say how large they are, but not how opaque."""
+__all__ = ["StepReport", "Trainer"]
 
 
 @dataclass(frozen=True)
@@ -64,66 +53,6 @@ class StepReport:
     primitives: int
     view: str
     change: str | None
-
-
-def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, settings: ModelSettings, seed: int) -> Primitives:
-    """Primitives on the data set's starting points, as large as their neighbours are far (RMS distance to the 3 nearest).
-
-    ``model.init.points``: "matter" (the data set's own), "box" (anywhere in its box), or a .ply file of points or 3D Gaussians;
-    the latter bring sizes, orientations and opacities of their own. ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``:
-    share of the primitives that start where views show something and the data set has no points, for photographs; 0 unless said.
-
-    Raises:
-        ConfigError: no such setting, or a setting with an impossible value.
-        DataError: the data set offers no starting point, or the file is damaged.
-    """
-    for key in settings.init:
-        known = ("scale", "points", "surroundings", *density.init_settings, *colour.init_settings)
-        if key not in known:
-            raise ConfigError(f"model.init.{key}: no such setting{nearest(key, known)}")
-    generator = torch.Generator().manual_seed(seed)
-    where = settings.init.get("points", "matter")
-    if isinstance(where, str) and where.lower().endswith(".ply"):
-        points = read_points(Path(where).expanduser(), dataset.channels, dataset.color_space)
-        cloud = subset(points, settings.primitives, generator)
-    elif where in ("matter", "box"):
-        cloud = (dataset.uniform_points if where == "box" else dataset.initial_points)(settings.primitives, generator)
-        cloud = _surrounded(cloud, dataset, settings, generator)
-    else:
-        raise ConfigError(f"model.init.points={where!r}: expected matter, box or a .ply file")
-    check_points(cloud, settings.primitives, dataset)
-    if len(cloud.means) == 0:
-        raise DataError(f"{dataset.name}: no starting points found; expected points or images with visible content")
-    if len(cloud.means) == 1:
-        scales = torch.full((1,), 0.1 * dataset.extent)
-    else:
-        neighbours = min(3, len(cloud.means) - 1)
-        distance = torch.from_numpy(cKDTree(cloud.means.numpy()).query(cloud.means.numpy(), k=neighbours + 1)[0][:, 1:])
-        scales = distance.square().mean(dim=1).sqrt().clamp_min(1e-6 * dataset.extent).float()
-    context = InitContext(cloud.means.float(), scales, cloud.colors.float(), generator, settings.init, cloud.conditions)
-    factor = context.number("scale", 1.0, 0)
-    context.scales, context.quats, context.alphas = scales * factor, cloud.quats, cloud.alphas
-    axes = cloud.axes
-    if cloud.deviations is not None:
-        opacities = torch.full((len(cloud.means),), _USUAL_OPACITY) if cloud.alphas is None else cloud.alphas
-        support, opacities = density.from_gaussians(opacities.clamp(0, 1))
-        axes = cloud.deviations * support[:, None]
-        context.alphas = None if cloud.alphas is None else opacities
-    if axes is not None:
-        context.axes = axes.clamp_min(1e-6 * dataset.extent) * factor
-    return Primitives.initialise(density, colour, context)
-
-
-def _surrounded(cloud: PointCloud, dataset: Dataset, settings: ModelSettings, generator: torch.Generator) -> PointCloud:
-    """The points, a share of them (``model.init.surroundings``) replaced by what views show where there are none."""
-    share = settings.init.get("surroundings", 0.0)
-    if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
-        raise ConfigError(f"model.init.surroundings={share!r}: expected a share of the primitives, at least 0 and below 1")
-    if not share:
-        return cloud
-    own = subset(cloud, min(len(cloud.means), round((1.0 - share) * settings.primitives)), generator)
-    more = surrounding_points(dataset.train, own, settings.primitives - len(own.means), generator)
-    return PointCloud(torch.cat([own.means, more.means]), torch.cat([own.colors, more.colors]))
 
 
 @dataclass(frozen=True)
@@ -424,15 +353,15 @@ class Trainer:
                 raise ValueError("the order of views is out of range")
             generator = torch.Generator()
             generator.set_state(tensors["generator"])
+            population = part("population.")
+            for name, value in population.items():
+                if value.dim() > 0 and value.shape != (model.count,):
+                    raise ValueError(f"statistic {name} has shape {tuple(value.shape)}; expected ({model.count},)")
             exposures = part("exposure.")
             if bool(exposures) != (self.exposures is not None):
                 raise ValueError(f"it has {'' if exposures else 'no '}exposures, train.exposure_rate is {self.settings.exposure_rate:g}")
             if self.exposures is not None:
                 self.exposures.load_state(exposures)
-            population = part("population.")
-            for name, value in population.items():
-                if value.dim() > 0 and value.shape != (model.count,):
-                    raise ValueError(f"statistic {name} has shape {tuple(value.shape)}; expected ({model.count},)")
         except (ValueError, KeyError, RuntimeError, TypeError, IndexError) as error:
             raise CheckpointError(f"{where}: does not fit this run's settings ({error})") from error
         self.model.params = model.to(self.device).params

@@ -18,8 +18,8 @@ from neuprim.core.data.check import DatasetFault, check_dataset, check_mask, che
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import ConditionSpec
+from neuprim.core.train.initial import initial_model
 from neuprim.core.train.settings import ModelSettings
-from neuprim.core.train.trainer import initial_model
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.core import tiny
 

@@ -20,8 +20,8 @@ from neuprim.core.model.edge import EDGES, NORMS
 from neuprim.core.model.footprint import gaussian_support
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.train.initial import initial_model
 from neuprim.core.train.settings import ModelSettings
-from neuprim.core.train.trainer import initial_model
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.core import tiny
 

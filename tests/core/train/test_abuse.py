@@ -15,9 +15,10 @@ from neuprim.core.data import Dataset, Pixels, PointCloud, ViewSet
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.render import RenderSettings
+from neuprim.core.train.initial import initial_model
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
-from neuprim.core.train.trainer import StepReport, Trainer, initial_model
+from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.core import tiny
 from tests.short_runs import fit, words

@@ -19,9 +19,10 @@ from neuprim.core.metrics import psnr
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import Tally
 from neuprim.core.task import Supervision
+from neuprim.core.train.initial import initial_model
 from neuprim.core.train.population.fixed import Fixed
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
-from neuprim.core.train.trainer import StepReport, Trainer, initial_model
+from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.runs.measure import draw
 from tests.core import tiny
 

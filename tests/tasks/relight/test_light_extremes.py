@@ -15,9 +15,10 @@ from neuprim.core.model.fields import RayNet
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.task import Supervision
+from neuprim.core.train.initial import initial_model
 from neuprim.core.train.losses import compressed, l1, relative
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
-from neuprim.core.train.trainer import Trainer, initial_model
+from neuprim.core.train.trainer import Trainer
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.relight.directions import unit
 from neuprim.tasks.relight.harmonics import LightHarmonics

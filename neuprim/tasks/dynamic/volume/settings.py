@@ -62,7 +62,7 @@ class VolumeSettings:
     grids: Mapping[Meaning, Annotated[str, text("the name of a grid")]] = field(default_factory=dict)
     look: str = "auto"
     optics: Mapping[str, Any] = field(default_factory=dict)
-    size: Annotated[int, Range(8, 4096)] = 64
+    size: Annotated[int, Range(8, 4096)] = 160
     cameras: Annotated[int, Range(4, 1000)] = 40
     field_of_view: Annotated[float, Range(1, 120, says="degrees from 1 to 120")] = 27.0
     samples: Annotated[int, Range(1, 16)] = 2

@@ -58,7 +58,7 @@ class LitSettings:
         supersampling: rays per pixel along each axis.
     """
 
-    size: ImageSize = 128
+    size: ImageSize = 160
     train_views: Annotated[int, Range(1, 100000)] = 500
     test_views: Annotated[int, Range(1, 10000)] = 100
     supersampling: Supersampling = 2

@@ -138,5 +138,7 @@ def test_a_share_is_a_share(share: str) -> None:
 def test_matter_that_moves_has_no_surroundings() -> None:
     words = ["task=dynamic", "scene=smoke_fire", "scene.size=8", "scene.resolution=16", "scene.timesteps=2", "model.init.surroundings=0.2"]
     config = compose(words, False)
-    with pytest.raises(ConfigError, match=r"model\.init\.surroundings=0\.2: matter of smoke_fire \(simulated\) depends on time; expected a scene at rest"):
+    with pytest.raises(
+        ConfigError, match=r"model\.init\.surroundings=0\.2: matter of smoke_fire \(simulated\) depends on time; expected a scene at rest"
+    ):
         make_trainer(config, task_of(config), load_dataset(config, task_of(config)))

@@ -383,7 +383,6 @@ def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pr
     assert set(c.train.rates) == {"means", "log_scales", "quats", "W1", "b1", "w2", "b2", "sh_dc", "sh_rest"} | gain
     strategies = {
         "quick": "relocate",
-        "photographs": "relocate",
         "paper": "gradient",
         "paper_real": "gradient",
         "paper_200": "fixed",

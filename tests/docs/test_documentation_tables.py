@@ -205,8 +205,7 @@ def test_tables_of_a_card_show_every_number(benchmark: Callable[[str], ModuleTyp
     assert script.parity_table(records) == ""
 
 
-def test_the_tables_of_photographs_are_those_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
+def test_the_table_of_photographs_is_that_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
     rows = json.loads((RESULTS / "photographs.json").read_text(encoding="utf-8"))["trials"]
     script = benchmark("photographs")
-    for part in ("presets", "pieces"):
-        assert between("docs/static.md", f"photographs-{part}") == str(script.table(rows, part))
+    assert between("docs/static.md", "photographs") == f"{script.table(rows)}\n\n{script.caption(rows)}"

@@ -45,4 +45,4 @@ def reduced(view: View, pixels: Pixels, factor: int) -> tuple[View, Pixels]:
 
 def _averaged(values: Tensor, factor: int) -> Tensor:
     """(H // factor, W // factor, C) means of (H, W, C)."""
-    return F.avg_pool2d(values.permute(2, 0, 1)[None], factor)[0].permute(1, 2, 0).contiguous(memory_format=torch.contiguous_format)
+    return F.avg_pool2d(values.permute(2, 0, 1)[None], factor)[0].permute(1, 2, 0).contiguous()

@@ -162,7 +162,10 @@ def draw(rows: Sequence[Mapping[str, Any]]) -> None:
         axis.set_xlabel("steps", fontsize=8)
         axis.tick_params(axis="y", labelsize=7)
         axis.grid(True, alpha=0.3)
-        axis.legend(frameon=False, fontsize=7)
+        if len(MEASURES[scene]) > 3:  # room for them all below the curves
+            low, high = axis.get_ylim()
+            axis.set_ylim(low - 0.25 * (high - low), high)
+        axis.legend(frameon=False, fontsize=7, loc="lower right", ncols=2 if len(MEASURES[scene]) > 3 else 1)
     axes[0][0].set_ylabel("dB, test views", fontsize=8)
     PICTURE.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(PICTURE, dpi=120)

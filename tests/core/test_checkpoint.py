@@ -44,11 +44,11 @@ def saved(tmp_path: Path) -> Path:
 
 
 def refused(path: Path, task: TaskSpec = TASK) -> str:
-    """The message with which a model is refused, which names the file; within a second."""
-    start = time.perf_counter()
+    """The message with which a model is refused, which names the file; within a second of computing, whatever else the machine does."""
+    start = time.thread_time()
     with pytest.raises(CheckpointError) as caught:
         checkpoint.load_model(path, task)
-    assert time.perf_counter() - start < 1.0
+    assert time.thread_time() - start < 1.0
     assert str(path) in str(caught.value)
     return str(caught.value)
 

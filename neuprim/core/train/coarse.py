@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -17,7 +16,8 @@ _SMALLEST = 16
 
 
 def reduction(progress: float, coarse: int, until: float) -> int:
-    """Whole factor at this used share of the budget: ``coarse`` at first, then half of it and so on, each for an equal share, 1 from ``until`` on."""
+    """Whole factor at this used share of the budget: ``coarse`` at first, then half of it, rounded down, and so on, each for an equal
+    share, 1 from ``until`` on."""
     if coarse <= 1 or progress >= until:
         return 1
     stages = coarse.bit_length() - 1

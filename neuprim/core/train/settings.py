@@ -89,7 +89,7 @@ class TrainSettings:
         rates: learning rate by parameter name, over the specs' own.
         rate_units: unit of a parameter's rate by its name, over the spec's own: "absolute" (a position's is in scene units a step), or
             "extent" (the rate times the scene's extent, so that it does not depend on how large the scene is).
-        coarse: factor by which training views are reduced at first; a power of two, 1 for none. It halves step by step until
+        coarse: factor by which training views are reduced at first; 1 for none. It is halved, rounded down, until
             ``coarse_until``, a fraction of the budget, from which on views are as they are.
         angular_size: no primitive's largest semi-axis is more than this share of its distance to the nearest training camera; null for no limit.
         exposure_rate: learning rate of a gain per training view and channel, for photographs that are not exposed alike, per step in
@@ -114,7 +114,7 @@ class TrainSettings:
 
     iterations: Annotated[int, Range(at_least=0)] | None = 30_000
     views_per_step: Annotated[int, Range(1, 1024)] = 1
-    coarse: Literal[1, 2, 4, 8, 16] = 1
+    coarse: Annotated[int, Range(1, 64)] = 1
     coarse_until: Share = 0.3
     angular_size: Annotated[float, Range(above=0)] | None = None
     exposure_rate: NotNegative = 0.0

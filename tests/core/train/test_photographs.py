@@ -51,6 +51,7 @@ class Gained(ViewSet):
 def test_the_factor_halves_in_equal_shares() -> None:
     at = [reduction(p, 8, 0.3) for p in (0.0, 0.09, 0.1, 0.19, 0.2, 0.29, 0.3, 1.0)]
     assert at == [8, 8, 4, 4, 2, 2, 1, 1]
+    assert [reduction(p, 6, 0.4) for p in (0.0, 0.2, 0.4)] == [6, 3, 1]
     assert {reduction(p / 10, 1, 0.3) for p in range(11)} == {1}
 
 

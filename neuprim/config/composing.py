@@ -251,20 +251,16 @@ def _merge(base: Mapping[str, Any], values: Sequence[Assignment]) -> tuple[dict[
             OmegaConf.update(tree, a.key, a.value, merge=True, force_add=True)
         except (OmegaConfBaseException, ValueError, TypeError, AssertionError) as error:
             raise ConfigError(f"{a.text}: {' '.join(str(error).split())}") from error
-    if _typed_last(values, "max_seconds") is not None and not _types(values, "iterations"):
+    seconds = _said(values, "max_seconds")
+    if seconds and seconds[-1] is not None and not _said(values, "iterations"):
         OmegaConf.update(tree, "train.iterations", None)  # a budget in seconds is used up, however fast the machine
     return _plain(OmegaConf.create(dict(base))), _plain(tree)
 
 
-def _types(values: Sequence[Assignment], name: str) -> bool:
-    """Whether one of the user's words sets ``train.name``."""
-    return any(a.key == f"train.{name}" or (a.key == "train" and isinstance(a.value, Mapping) and name in a.value) for a in values)
-
-
-def _typed_last(values: Sequence[Assignment], name: str) -> Any:
-    """What the last of the user's words that sets ``train.name`` says, None where none does."""
-    found = [a.value if a.key != "train" else a.value[name] for a in values if _types([a], name)]
-    return found[-1] if found else None
+def _said(values: Sequence[Assignment], name: str) -> list[Any]:
+    """What the user's words say of ``train.name``, in their order."""
+    whole = [{name: a.value} if a.key == f"train.{name}" else a.value if a.key == "train" else {} for a in values]
+    return [given[name] for given in whole if isinstance(given, Mapping) and name in given]
 
 
 def _another_form(base: Mapping[str, Any], values: Sequence[Assignment]) -> bool:

@@ -52,9 +52,10 @@ def worst_region(rendered: Tensor, truth: Tensor) -> Region:
     height, width = truth.shape[:2]
     side = min(max(round(SHARE * min(height, width)), LEAST), height, width)
     error = (rendered.double() - truth.double()).square().mean(-1)[None, None]
-    means = F.avg_pool2d(error, side, stride=max(side // _STEPS, 1))[0, 0]
+    stride = max(side // _STEPS, 1)
+    means = F.avg_pool2d(error, side, stride)[0, 0]
     row, column = divmod(int(means.argmax()), means.shape[1])
-    stride, mse = max(side // _STEPS, 1), float(means.max())
+    mse = float(means[row, column])
     return Region(column * stride, row * stride, side, -10 * math.log10(mse) if mse > 0 else math.inf)
 
 

@@ -46,6 +46,22 @@ class Camera:
         sx, sy = width / self.width, height / self.height
         return replace(self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height)
 
+    def reduced(self, factor: int) -> Camera:
+        """The view on pixels exactly ``factor`` times as large; what is left over at the right and at the bottom is cut off, not squeezed in."""
+        fx, fy, cx, cy = (value / factor for value in (self.fx, self.fy, self.cx, self.cy))
+        return Camera(self.viewmat, fx, fy, cx, cy, self.width // factor, self.height // factor)
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 2) pixel positions x, y and (N,) depths of (N, 3) points, float64; positions mean nothing where the depth is not positive."""
+        view = self.viewmat.double()
+        x, y, z = (points.double() @ view[:3, :3].T + view[:3, 3]).unbind(-1)
+        return torch.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], dim=-1), z
+
+    def sees(self, points: Tensor) -> Tensor:
+        """(N,) bool of the (N, 3) points that lie before the camera and inside its image."""
+        pixels, z = self.project(points)
+        return (z > 0) & (pixels >= 0).all(1) & (pixels < torch.tensor([self.width, self.height])).all(1)
+
     def validate(self, where: str) -> Camera:
         """Return self, or raise :class:`DataError` naming ``where`` for non-finite, singular, scaled or mirrored cameras."""
         numbers = torch.tensor([self.fx, self.fy, self.cx, self.cy], dtype=torch.float64)

@@ -177,9 +177,8 @@ def median_colors(views: ViewSet, means: Tensor, matter: float = 0.5) -> Tensor:
 
 def _sample(views: ViewSet, index: int, means: Tensor, matter: float) -> Tensor:
     camera, pixels = views.view(index).camera, views.pixels(index)
-    view = camera.viewmat.double()
-    x, y, z = (means.double() @ view[:3, :3].T + view[:3, 3]).unbind(-1)
-    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    spots, z = camera.project(means)
+    u, v = spots.unbind(-1)
     inside = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     flat = torch.where(inside, v, 0.0).long() * camera.width + torch.where(inside, u, 0.0).long()
     color = pixels.rgb.reshape(-1, pixels.rgb.shape[-1])[flat].clone()

@@ -71,7 +71,7 @@ def _gaps(views: ViewSet, index: int, known: NDArray[np.float64], cell: float) -
         counts &= image.mask.numpy()[rows, cols]
     if image.alpha is not None:
         counts &= image.alpha.numpy()[rows, cols] > 0.5
-    inside, depth = _projected(known, rotation, shift, camera.fx, camera.fy, camera.cx, camera.cy)
+    inside, depth = (x.numpy() for x in camera.project(torch.from_numpy(known)))
     near = (depth > 0) & (inside > -cell).all(1) & (inside < (camera.width + cell, camera.height + cell)).all(1)
     inside, depth = inside[near], depth[near]
     if len(depth) < _NEAREST:
@@ -93,16 +93,6 @@ def _grid(width: int, height: int, cell: float) -> NDArray[np.float64]:
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-def _projected(
-    points: NDArray[np.float64], rotation: NDArray[np.float64], shift: NDArray[np.float64], fx: float, fy: float, cx: float, cy: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(N, 2) pixels and (N,) depths; pixels of points behind the camera mean nothing."""
-    local = points @ rotation.T + shift
-    z = local[:, 2]
-    safe = np.where(z > 0, z, 1.0)
-    return np.stack([fx * local[:, 0] / safe + cx, fy * local[:, 1] / safe + cy], axis=1), z
-
-
 def _shell(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
     """At most ``count`` points of a sphere around cameras and points, as far as some view shows them."""
     cameras = [views.view(i).camera for i in range(len(views))]
@@ -118,16 +108,7 @@ def _shell(views: ViewSet, given: Tensor, count: int, generator: torch.Generator
     means = center + radius * torch.stack([ring * turn.cos(), ring * turn.sin(), z], dim=-1)
     seen = torch.zeros(many, dtype=torch.bool)
     for camera in cameras:
-        inside, depth = _projected(
-            means.numpy(),
-            camera.viewmat[:3, :3].double().numpy(),
-            camera.viewmat[:3, 3].double().numpy(),
-            camera.fx,
-            camera.fy,
-            camera.cx,
-            camera.cy,
-        )
-        seen |= torch.from_numpy((depth > 0) & (inside >= 0).all(1) & (inside < (camera.width, camera.height)).all(1))
+        seen |= camera.sees(means)
     rows = seen.nonzero()[:, 0]
     if len(rows) > count:
         rows = rows[torch.randperm(len(rows), generator=generator)[:count]].sort().values

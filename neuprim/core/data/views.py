@@ -5,18 +5,18 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.data import Pixels, View, ViewSet
 from neuprim.core.data.distortion import Distortion, resample, source_grid
+from neuprim.core.data.reduction import averaged, whole
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import ImageInfo, read_image, read_mask, srgb_to_linear
 from neuprim.core.model.fields import Conditions
@@ -208,8 +208,8 @@ class ImageViews(ViewSet):
             mask = valid if mask is None else valid & (resample(mask[..., None].float(), source)[..., 0] > 0.999)
         n = self._factor
         if n > 1:
-            values = F.avg_pool2d(values.permute(2, 0, 1), n).permute(1, 2, 0).contiguous()
-            mask = None if mask is None else F.avg_pool2d(mask[None].float(), n)[0] > 0.999
+            values = averaged(values, n)
+            mask = None if mask is None else whole(mask, n)
         return (values.round().clamp(0.0, 255.0).to(torch.uint8) if eight_bit else values), mask
 
     def _grid(self, camera: Camera, distortion: Distortion) -> tuple[Tensor, Tensor]:
@@ -244,13 +244,8 @@ class SomeViews(ViewSet):
 
 
 def _reduced(frame: ImageFrame, factor: int) -> Camera:
-    """The camera of a frame after area reduction: exactly 1/factor, as the remainder is cut off and not squeezed in."""
+    """The camera of a frame after area reduction."""
     camera = frame.camera
-    if factor == 1:
-        return camera
-    width, height = camera.width // factor, camera.height // factor
-    if width == 0 or height == 0:
+    if min(camera.width, camera.height) < factor:
         raise ConfigError(f"scene.downsample is {factor}, but {frame.path} has only {camera.width}x{camera.height} pixels")
-    return replace(
-        camera, fx=camera.fx / factor, fy=camera.fy / factor, cx=camera.cx / factor, cy=camera.cy / factor, width=width, height=height
-    )
+    return camera.reduced(factor)

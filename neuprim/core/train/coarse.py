@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import torch.nn.functional as F
-from torch import Tensor
-
 from neuprim.core.data import Pixels, View
+from neuprim.core.data.reduction import averaged, whole
 
 __all__ = ["reduced", "reduction"]
 
@@ -34,15 +32,6 @@ def reduced(view: View, pixels: Pixels, factor: int) -> tuple[View, Pixels]:
         factor //= 2
     if factor == 1:
         return view, pixels
-    width, height = camera.width // factor, camera.height // factor
-    small = replace(
-        camera, fx=camera.fx / factor, fy=camera.fy / factor, cx=camera.cx / factor, cy=camera.cy / factor, width=width, height=height
-    )
-    alpha = None if pixels.alpha is None else _averaged(pixels.alpha[..., None], factor)[..., 0]
-    mask = None if pixels.mask is None else _averaged(pixels.mask[..., None].float(), factor)[..., 0] > 0.999
-    return replace(view, camera=small), Pixels(_averaged(pixels.rgb, factor), alpha, mask)
-
-
-def _averaged(values: Tensor, factor: int) -> Tensor:
-    """(H // factor, W // factor, C) means of (H, W, C)."""
-    return F.avg_pool2d(values.permute(2, 0, 1)[None], factor)[0].permute(1, 2, 0).contiguous()
+    alpha = None if pixels.alpha is None else averaged(pixels.alpha[..., None], factor)[..., 0]
+    mask = None if pixels.mask is None else whole(pixels.mask, factor)
+    return replace(view, camera=camera.reduced(factor)), Pixels(averaged(pixels.rgb, factor), alpha, mask)

@@ -142,3 +142,17 @@ def test_matter_that_moves_has_no_surroundings() -> None:
         ConfigError, match=r"model\.init\.surroundings=0\.2: matter of smoke_fire \(simulated\) depends on time; expected a scene at rest"
     ):
         make_trainer(config, task_of(config), load_dataset(config, task_of(config)))
+
+
+def test_a_camera_sees_what_lies_before_it_and_inside_its_image() -> None:
+    camera = Room(1).cameras[0]
+    hit = on_the_wall(camera)
+    spots, depth = camera.project(hit.reshape(-1, 3))
+    y, x = torch.meshgrid(torch.arange(SIZE[1]) + 0.5, torch.arange(SIZE[0]) + 0.5, indexing="ij")
+    assert torch.allclose(spots, torch.stack([x, y], -1).reshape(-1, 2).double(), atol=1e-9) and bool((depth > 0).all())
+    assert bool(camera.sees(hit.reshape(-1, 3)).all())
+    behind = 2 * camera.position - hit.reshape(-1, 3)
+    assert not bool(camera.sees(behind).any())
+    small = camera.reduced(5)
+    assert (small.width, small.height) == (SIZE[0] // 5, SIZE[1] // 5)
+    assert torch.allclose(small.project(hit.reshape(-1, 3))[0] * 5, spots)

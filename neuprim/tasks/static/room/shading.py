@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from neuprim.scenes.reflectance import dot, reflected
 from neuprim.tasks.static.room.layout import BULB, LAMP
 from neuprim.tasks.static.room.scene import Room
-from neuprim.tasks.static.solids.shading import Colour, add_surroundings
+from neuprim.tasks.static.solids.shading import Colour, add_surroundings, unshadowed
 
 __all__ = ["LAMPLIGHT", "Lamplight", "radiance"]
 
@@ -47,9 +47,7 @@ def radiance(room: Room, origins: ArrayLike, directions: ArrayLike, light: Lampl
     to_lamp = np.array(light.position, dtype=np.float32) - hits.position
     away = np.sqrt(dot(to_lamp, to_lamp))
     to_lamp /= away[:, None]
-    lit = dot(hits.face, to_lamp) > 0  # what faces away is in its own shadow: no ray needed
-    short = np.maximum(away[lit] - np.float32(1.2 * BULB), 0)  # the bulb itself is no obstacle
-    lit[lit] = ~room.occluded(hits.lifted()[lit], to_lamp[lit], short)
+    lit = unshadowed(room, hits, to_lamp, np.maximum(away - np.float32(1.2 * BULB), 0))  # the bulb itself is no obstacle
     rgb = reflected(hits, to_eye, to_lamp) * (np.array(light.power, dtype=np.float32) * (lit / away**2)[:, None])
     add_surroundings(rgb, hits, to_eye, light.above, light.below)
     glow = room.glow[hits.solid][:, None]

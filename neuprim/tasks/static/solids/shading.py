@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from neuprim.scenes.raycast import Hits, Scene
 from neuprim.scenes.reflectance import dot, reflected
 
-__all__ = ["DAYLIGHT", "Colour", "Daylight", "add_surroundings", "encode_srgb", "radiance"]
+__all__ = ["DAYLIGHT", "Colour", "Daylight", "add_surroundings", "encode_srgb", "radiance", "unshadowed"]
 
 Array = NDArray[np.float32]
 Colour = tuple[float, float, float]
@@ -47,14 +47,19 @@ def radiance(scene: Scene, origins: ArrayLike, directions: ArrayLike, light: Day
     to_eye = -d[hits.hit]
     to_sun = np.array(light.direction, dtype=np.float32)
     to_sun /= np.linalg.norm(to_sun)
-    lit = dot(hits.face, to_sun) > 0  # what faces away is in its own shadow: no ray needed
-    starts = hits.lifted()[lit]
-    lit[lit] = ~scene.occluded(starts, np.broadcast_to(to_sun, starts.shape))
+    lit = unshadowed(scene, hits, np.broadcast_to(to_sun, hits.position.shape), np.inf)
     rgb = reflected(hits, to_eye, to_sun) * (np.array(light.sun, dtype=np.float32) * lit[:, None])
     add_surroundings(rgb, hits, to_eye, light.sky, light.ground)
     image = np.zeros(d.shape, dtype=np.float32)
     image[hits.hit] = rgb
     return image, hits.hit
+
+
+def unshadowed(scene: Scene, hits: Hits, to_light: Array, away: ArrayLike) -> NDArray[np.bool_]:
+    """(M,) whether light from ``to_light`` (M, 3), ``away`` lengths of it far, reaches the surfaces."""
+    lit: NDArray[np.bool_] = dot(hits.face, to_light) > 0  # what faces away is in its own shadow: no ray needed
+    lit[lit] = ~scene.occluded(hits.lifted()[lit], to_light[lit], np.broadcast_to(away, len(lit))[lit])
+    return lit
 
 
 def encode_srgb(linear: Array) -> Array:

@@ -115,7 +115,7 @@ def start(config: RunConfig, events: Events = silent, dataset: Dataset | None = 
     events(Preparing("starting points"))
     trainer = make_trainer(config, task, dataset, loss)
     asked, found = config.model.primitives, trainer.model.count
-    if found < asked:
+    if found < max(round(config.train.population.grow_from * asked), 1):
         grows = config.train.population.strategy == "relocate"
         rest = "the rest is born where the error is largest" if grows else "there will be no more of them"
         events(Note(f"{dataset.name} offers {found:,} starting points for model.primitives={asked:,}: {rest}"))
@@ -136,6 +136,14 @@ def steps(trainer: Trainer, events: Events = silent) -> Iterator[tuple[StepRepor
             events(Evaluated(held_out))
             next_eval = next_evaluation(trainer)
         yield report, held_out
+    asked = trainer.settings.population.grow_to or 0
+    if trainer.settings.population.strategy == "relocate" and trainer.model.count < asked:
+        events(
+            Note(
+                f"{trainer.model.count:,} primitives of model.primitives={asked:,}: too few interventions, or places with an error, to split for the others; "
+                "see train.population.every"
+            )
+        )
 
 
 def make_loss(config: RunConfig, task: TaskSpec) -> Loss:
@@ -169,7 +177,8 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss
     with blamed(origin, f"build of task {task.name!r}", config.output_dir / LOGS):
         density, colour = task.build(build_settings(task, config.model, config.options), dataset)
     check_fields(density, colour, dataset, f"build of task {task.name!r} of {origin.origin}")
-    model = initial_model(density, colour, dataset, config.model, config.seed)
+    first = replace(config.model, primitives=max(round(config.train.population.grow_from * config.model.primitives), 1))
+    model = initial_model(density, colour, dataset, first, config.seed)
     # A preset has rates for every density and colour of its task; the trainer refuses names that the model does not have.
     others = task.parameter_names() - model.params.keys()
     rates = {k: v for k, v in config.train.rates.items() if k not in others}

@@ -54,6 +54,8 @@ class PopulationSettings:
             primitive's move; null moves the least used ones, however much they do.
         grow_to: relocate: how many primitives there are to be; where the start has fewer, those with the largest error split. null is
             as many as ``model.primitives``, of which data may not offer enough points.
+        grow_from: relocate: how many of ``model.primitives`` there are at the start, as a share; the others are born where the error turns
+            out to be largest. 1 starts with all that the data offer points for.
         grow_threshold, prune_threshold: gradient: on the mean norm of the density gradient.
         clone_scale, prune_scale: gradient: in units of the scene's extent.
         max_primitives: growth cap.
@@ -66,6 +68,7 @@ class PopulationSettings:
     fraction: Annotated[float, Range(0, 1)] = 0.05
     idle: NotNegative | None = None
     grow_to: Annotated[int, Range(at_least=1)] | None = None
+    grow_from: Annotated[float, Range(above=0, at_most=1, says="a share of model.primitives, above 0 and at most 1")] = 1.0
     grow_threshold: NotNegative = 1e-5
     prune_threshold: NotNegative = 1e-6
     clone_scale: NotNegative = 0.01
@@ -74,6 +77,10 @@ class PopulationSettings:
 
     def __post_init__(self) -> None:
         verify(self, "train.population")
+        if self.grow_from < 1 and self.strategy != "relocate":
+            raise ConfigError(
+                f"train.population.grow_from={self.grow_from:g}: {self.strategy} does not grow that way; expected train.population.strategy=relocate"
+            )
 
 
 @dataclass
@@ -92,6 +99,8 @@ class TrainSettings:
         coarse: factor by which training views are reduced at first; 1 for none. It is halved, rounded down, until
             ``coarse_until``, a fraction of the budget, from which on views are as they are.
         angular_size: no primitive's largest semi-axis is more than this share of its distance to the nearest training camera; null for no limit.
+        size_weight: weight of the mean semi-axis over distance to the camera of the view (:func:`~neuprim.core.train.losses.seen_size`): primitives
+            that are as small as their pixels let them be, which are faster to draw and veil less; 0 for none.
         exposure_rate: learning rate of a gain per training view and channel, for photographs that are not exposed alike, per step in
             which a view is seen; 0 for none. Held-out views are drawn with the training views' mean gain.
         final_rate: the rates decay exponentially to this fraction of themselves at the end of the budget; 1 is constant.
@@ -117,6 +126,7 @@ class TrainSettings:
     coarse: Annotated[int, Range(1, 64)] = 1
     coarse_until: Share = 0.3
     angular_size: Annotated[float, Range(above=0)] | None = None
+    size_weight: NotNegative = 0.0
     exposure_rate: NotNegative = 0.0
     max_seconds: Annotated[float, Range(above=0, says="a positive number of seconds")] | None = None
     rates: dict[str, NotNegative] = field(default_factory=dict)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -14,7 +16,7 @@ from neuprim.core.train.settings import PopulationSettings
 __all__ = ["Relocate"]
 
 _GROWTH = 0.25
-"""Largest share of the primitives that is born at once: a split costs quality that training has to win back."""
+"""Share of the primitives that is born at once: a split costs quality that training has to win back. It is more where the count would else not be reached."""
 
 
 class Relocate(Population):
@@ -22,13 +24,23 @@ class Relocate(Population):
 
     The busiest primitive splits in two by the exact rule, one child in its own row and one in the idle row. A split costs more than it
     brings once the idle ones are used up (children cover each other and not all of their parent): ``idle`` says who may move. Where there are
-    fewer primitives than ``grow_to``, further ones split without an idle row, at most a quarter of all at a time.
+    fewer primitives than ``grow_to``, further ones split without an idle row, a quarter of all at a time, or as many as the interventions that are
+    left need to reach it.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:
         super().__init__(settings)
         self.weight: Tensor | None = None
         self.error: Tensor | None = None
+        self._left = math.inf
+
+    def due(self, step: int, progress: float) -> bool:
+        due = super().due(step, progress)
+        if due:
+            further = (self.settings.stop - progress) / progress * step / self.settings.every if progress > 0 else math.inf
+            # the schedule ends before ``stop``, so that an intervention just then does not happen
+            self._left = math.inf if math.isinf(further) else max(math.ceil(further - 1e-6) - 1, 0)
+        return due
 
     def observe(self, model: Primitives, tally: Tally) -> None:
         if self.weight is None or self.error is None:
@@ -44,7 +56,9 @@ class Relocate(Population):
         self.weight = self.error = None
         count = model.count
         budget = int(self.settings.fraction * count)
-        births = min(max((self.settings.grow_to or 0) - count, 0), max(int(_GROWTH * count), 1))
+        missing = max((self.settings.grow_to or 0) - count, 0)
+        due = math.ceil(count * ((1 + missing / count) ** (1 / (self._left + 1)) - 1) - 1e-9)  # by the same factor each time that is left
+        births = min(missing, max(int(_GROWTH * count), due, 1))
         busiest = torch.argsort(error, descending=True, stable=True)
         busy = torch.zeros(count, dtype=torch.bool, device=model.device)
         busy[busiest[:budget]] = True

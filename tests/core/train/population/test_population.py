@@ -163,6 +163,23 @@ def test_relocation_grows_to_what_was_asked_for_where_the_error_is() -> None:
     assert relocate(m, torch.ones(COUNT), error, 0.1, 0.05, grow_to=1000).text == "grew by 2", "nothing is known of the others"
 
 
+@pytest.mark.parametrize("grow_from", [0.5, 0.2])
+def test_relocation_reaches_its_count_however_few_interventions_there_are(grow_from: float) -> None:
+    m = model()
+    target, steps = round(COUNT / grow_from), 1000
+    settings = PopulationSettings(start=0.02, stop=0.35, every=100, grow_to=target)
+    population, counts = Relocate(settings), []
+    for step in range(1, steps + 1):
+        population.observe(m, stats(torch.ones(m.count), torch.rand(m.count) + 0.1))
+        if population.due(step, step / steps):
+            change = population.intervene(m, 1.0)
+            if change is not None:
+                m = Primitives(m.density, m.colour, change.params)
+                counts.append(m.count)
+    assert counts[-1] == target and len(counts) <= 3
+    assert counts[0] <= 1 + COUNT * grow_from ** (-1 / 3), "no more at once than is needed"
+
+
 def test_relocation_sums_over_views_and_starts_anew() -> None:
     m = model()
     population = Relocate(PopulationSettings(fraction=0.05))

@@ -44,7 +44,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "always": ("train.population.strategy=relocate", "train.population.idle=null"),
     "idle": IDLE,
     "weight": ("train.population.strategy=by_weight", "train.population.idle=0.05"),
-    "grown": IDLE,
+    "grown": (*IDLE, "train.population.grow_from=0.5"),
 }
 TITLES = {
     "fixed": "nobody moves",
@@ -71,11 +71,7 @@ class ByWeight(Relocate):
 
 
 def words_of(args: argparse.Namespace, scene: str, variant: str) -> tuple[str, ...]:
-    words = (*SCENES[scene].all_words(vars(args), scene), *VARIANTS[variant])
-    if variant == "grown":
-        whole = begin(Trial("", words, 1)).config.model.primitives
-        words += (f"model.primitives={whole // 2}", f"train.population.grow_to={whole}")
-    return words
+    return (*SCENES[scene].all_words(vars(args), scene), *VARIANTS[variant])
 
 
 def run(args: argparse.Namespace) -> None:
@@ -108,18 +104,21 @@ def run(args: argparse.Namespace) -> None:
 def table(rows: Sequence[Mapping[str, Any]]) -> Table:
     scenes = [scene for scene in SCENES if any(row["scene"] == scene for row in rows)]
     budget = max(row["steps"] for row in rows)
-    made = Table(
-        f"population, the time of {budget:,} steps",
-        *(f"{scene} ({SCENES[scene].judged.removeprefix('psnr_') or 'psnr'})" for scene in scenes),
-    )
+    judged = {scene: "inside the mask" if SCENES[scene].judged == "psnr_mask" else "all pixels" for scene in scenes}
+    made = Table("population", *(f"{scene}, {judged[scene]}" for scene in scenes))
     for variant, title in TITLES.items():
         cells = []
         for scene in scenes:
             own = [row for row in rows if (row["scene"], row["variant"], row["steps"]) == (scene, variant, budget)]
-            text = f"{spread([row[SCENES[scene].judged] for row in own], 2)} dB" if own else ""
-            cells.append(text)
+            cells.append(f"{spread([row[SCENES[scene].judged] for row in own], 2)} dB" if own else "")
         made.row(title, *cells)
     return made
+
+
+def caption(rows: Sequence[Mapping[str, Any]]) -> str:
+    seeds = {row["scene"]: len({other["seed"] for other in rows if other["scene"] == row["scene"]}) for row in rows}
+    counts = ", ".join(f"{scene}: {number} seed(s)" for scene, number in seeds.items())
+    return f"The time of {max(row['steps'] for row in rows):,} steps of the preset, one thread of {json.loads(RESULTS.read_text())['cpu']}; {counts}."
 
 
 def main() -> None:
@@ -139,7 +138,7 @@ def main() -> None:
         run(args)
     made = table(recorded(RESULTS))
     if args.docs:
-        between_markers(ROOT / "docs" / "budgets.md", "population", str(made))
+        between_markers(ROOT / "docs" / "budgets.md", "population", f"{made}\n\n{caption(recorded(RESULTS))}")
 
 
 if __name__ == "__main__":

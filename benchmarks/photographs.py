@@ -68,7 +68,7 @@ def trials(args: argparse.Namespace) -> list[Trial]:
                 steps = round(args.steps * MORE.get(row, 1.0))
                 name = f"{scene}-{row.replace('`', '')}-{primitives}-{steps}-{seed}"
                 every = ("task=static", *data, *PIECES[row], f"model.primitives={primitives}")
-                made.append(Trial(name, every, steps, seed, facts=(("scene", scene), ("row", row))))
+                made.append(Trial(name, every, steps, seed, facts=(("scene", scene), ("row", row)), interventions=None))
     return made
 
 

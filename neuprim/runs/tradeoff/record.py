@@ -185,13 +185,14 @@ def read_record(path: Path) -> Record | None:
 
 
 def write_csv(path: Path, record: Record, primitives: int) -> None:
-    """The table, a row per point; empty cells are not measured."""
+    """The table, a row per point; empty cells are not measured. LPIPS is the survey's, of VGG; another network's is left out."""
+    perceived = "lpips_3dgs" if record.same.get("lpips") == "vgg" else ""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow((*COLUMNS, *_MORE))
     for number, point in enumerate(record.points):
         q = point.quality
-        own = (point.name, _cell(q.get("psnr")), _cell(q.get("ssim_3dgs")), _cell(q.get("lpips_3dgs")), point.bytes, primitives)
+        own = (point.name, _cell(q.get("psnr")), _cell(q.get("ssim_3dgs")), _cell(q.get(perceived)), point.bytes, primitives)
         times = (f"{point.ratio:.4f}", f"{point.time:.4f}", f"{1e3 / point.time:.2f}") if point.ms else ("", "", "")
         peak = "" if point.peak_bytes is None else point.peak_bytes
         fronts = (int(number in record.speed), int(number in record.size))

@@ -63,7 +63,7 @@ def _table(title: str, record: Record, numbers: Sequence[int]) -> Table:
     from rich.text import Text
 
     table = Table(title=title, title_justify="left", box=box.SIMPLE, padding=(0, 1, 0, 0))
-    for name in ("#", "time", "ms", "frames/s", "PSNR", "SSIM", "exact, dB", "bytes", "MB"):
+    for name in ("#", "time", "ms", "frames/s", "PSNR", "SSIM", "exact", "bytes", "MB"):
         table.add_column(name, justify="right", no_wrap=True)
     for place, number in (("ref.", 0), *((str(k), number) for k, number in enumerate(numbers, 1))):
         table.add_row(*(Text(cell) for cell in (place, *_cells(record.points[number]))))

@@ -22,6 +22,9 @@ WIDTH, HEIGHT = 540, 300
 COLOURS = {INK: "#5d6670", GRID: "#e2e4e3", TRAINING: "#6884a6", HELD_OUT: "#c9551c"}
 """What stands for the page's colours in a picture of its own."""
 
+LEAST = 0.4
+"""Decibels that a chart spans at least: smaller differences are none that one sees."""
+
 LINEAR_BELOW = 1.5
 """Costs whose greatest is less than this many times the least have a linear axis."""
 
@@ -122,6 +125,10 @@ def _draw(axes: Axes, chart: Chart, colours: dict[str, str]) -> None:
     axes.set_xlabel(chart.axis, color=colours[INK])
     axes.yaxis.label.set_color(colours[INK])
     axes.margins(x=0.05, y=0.12)
+    axes.ticklabel_format(axis="y", useOffset=False)
+    bottom, top = axes.get_ylim()
+    if top - bottom < LEAST:
+        axes.set_ylim((bottom + top - LEAST) / 2, (bottom + top + LEAST) / 2)
     axes.tick_params(colors=colours[GRID], labelcolor=colours[INK])
     axes.grid(True, color=colours[GRID])
     for spine in axes.spines.values():

@@ -187,10 +187,12 @@ class _Page:
 
     def _cards(self, title: str, note: str, front: str, gain: Any) -> str:
         cards = [self._card(None, -1, "ground truth", "")] if -1 in self.pictures else []
+        if 0 not in self.front_of[front]:
+            cards.append(self._card(None, 0, self.name(0), "the reference"))
         for k, number in enumerate(self.front_of[front]):
             cards.append(self._card(k + 1, number, self.name(number), gain(number)))
         ticks = f'<p class="note">Difference: 0<span class="bar" style="background: {color_bar()}"></span>{DIFFERENCE:g} or more.</p>'
-        return _section(title, f'<p class="note">{note}</p>{ticks}<div class="points">{"".join(cards)}</div>') if cards[1:] else ""
+        return _section(title, f'<p class="note">{note}</p>{ticks}<div class="points">{"".join(cards)}</div>')
 
     def _card(self, place: int | None, number: int, name: str, gain: str) -> str:
         head = f"{place}. {escape(name)}" if place else escape(name)

@@ -332,11 +332,12 @@ def test_the_page_stands_alone_with_the_pictures_of_both_fronts(measured: tuple[
     assert "$" not in re.sub(r'"data:[^"]*"', "", page)
     assert not re.search(r'(?:src|href)="(?!data:|#)', page) and page.count("<svg") >= 3
     shown = re.findall(r'<img src="data:image/png;base64,[^"]+" width="24" height="24"', page)
-    # ground truth once per front; every other point with its difference, the reference alone
-    alone = [record.speed, record.size]
-    assert len(shown) == sum(1 + 2 * len(front) - (0 in front) for front in alone)
+    # on each front ground truth and reference, alone, and every other point with its difference
+    points = [len({0, *front}) - 1 for front in (record.speed, record.size)]
+    assert len(shown) == sum(2 + 2 * count for count in points)
     commands = [html.unescape(line) for line in re.findall(r"<code>(.*?)</code>", page)]
-    assert commands == [command(str(run_dir), record.points[i].words) for i in (*record.speed, *record.size)]
+    fronts = [[*([] if 0 in front else [0]), *front] for front in (record.speed, record.size)]
+    assert commands == [command(str(run_dir), record.points[i].words) for front in fronts for i in front]
     assert all(html.escape(point.name) in page for point in record.points)
     assert "Not measured" not in page or record.left_out
     with Image.open(run_dir / "tradeoff" / "front.png") as picture:

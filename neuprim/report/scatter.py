@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from neuprim.core.io.files import atomic_path
 from neuprim.report.curves import GRID, HELD_OUT, INK, TRAINING, look, short_number, svg
@@ -108,7 +108,7 @@ def _draw(axes: Axes, chart: Chart, colours: dict[str, str]) -> None:
         _log_axis(axes, low, high)
     marked = [d for d in dots if d.mark is not None]
     others = [d for d in dots if d.mark is None]
-    kind = {"linestyle": "none", "capsize": 0, "elinewidth": 1, "zorder": 3}
+    kind: dict[str, Any] = {"linestyle": "none", "capsize": 0, "elinewidth": 1, "zorder": 3}
     for group, colour, size, alpha in ((others, TRAINING, 4.5, 0.75), (marked, HELD_OUT, 6.0, 1.0)):
         if group:
             x, y, e = ([getattr(d, name) for d in group] for name in ("cost", "good", "spread"))

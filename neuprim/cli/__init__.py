@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from neuprim.cli import arguments
 from neuprim.cli.environment_flags import add_environment_flags, environment_of
 from neuprim.cli.export_help import export_help
+from neuprim.cli.operating_words import DRAWN, OPERATING, operating_words
+from neuprim.cli.tradeoff import for_tradeoff, tradeoff
 from neuprim.core.errors import DISK, ConfigError, NeuprimError, nearest
 from neuprim.core.notices import warnings_as_lines
 from neuprim.version import __version__
@@ -92,6 +94,8 @@ def _dispatch(words: list[str]) -> int:
     if args.command in ("run", "bench"):
         args.overrides += [word for word in rest if not word.startswith("-")]  # argparse gives up on words after a flag
         rest = [word for word in rest if word.startswith("-")]
+    if args.command in DRAWN:
+        args.words, rest = operating_words(rest)
     if args.command in ("render", "inspect"):
         args.conditions, rest = _conditions(args.run_dir, rest, args.command, commands[args.command])
     if args.command == "export":
@@ -119,7 +123,7 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
     run.add_argument("-m", "--multirun", action="store_true", help="run every combination of values separated by commas")
     run.add_argument("--cfg", action="store_true", help="print the resolved configuration and stop")
 
-    evaluate = command("eval", _eval, "measure a run on its test views")
+    evaluate = command("eval", _eval, "measure a run on its test views", OPERATING)
     evaluate.add_argument("run_dir", type=Path, metavar="RUN_DIR")
     evaluate.add_argument("--lpips", type=Path, metavar="FILE", help="measure LPIPS with these weights of your own, a file or a folder")
 
@@ -128,18 +132,13 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
         _render,
         "draw images of a run",
         "Each condition of the run's task (time, light, ...) is a flag, given after RUN_DIR: --time 0.5; a number may also be a list or a "
-        "range, --time 0.2,0.8 or --time 0:1:20, one frame each.",
+        "range, --time 0.2,0.8 or --time 0:1:20, one frame each.\n\n" + OPERATING,
     )
-    render.add_argument("run_dir", type=Path, metavar="RUN_DIR")
-    render.add_argument("--camera", required=True, metavar="orbit|test|FILE.json", help="which cameras")
-    render.add_argument("--size", type=arguments.size, metavar="WxH", help="pixels (default: the data set's)")
-    render.add_argument("--format", choices=("png", "exr", "npy", "webp", "gif", "mp4"), help="default: png, or webp for an animation")
-    render.add_argument(
-        "--fps", type=arguments.rate, metavar="F", help="frames per second of an animation (default: about four seconds in all)"
-    )
-    render.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
-    render.add_argument("--frames", type=arguments.count, default=60, metavar="N", help="frames of an orbit (default: 60)")
+    arguments.for_render(render)
     add_environment_flags(render)
+
+    trade = command("tradeoff", _tradeoff, "measure what speed and size cost in accuracy, of a run", OPERATING)
+    for_tradeoff(trade)
 
     export = command("export", _export, "write a run's model in another format", export_help(asked))
     export.usage = "neuprim export RUN_DIR --format NAME [KEY=VALUE ...] [--CONDITION TEXT ...] [--out PATH] [--force] [--json]"
@@ -159,27 +158,7 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
         "look inside a run's density",
         "Each condition of the run's task is a flag, given after RUN_DIR: --time 0.5, or several frames: --time 0:1:20, --time 0.2,0.8.",
     )
-    inspect.add_argument("run_dir", type=Path, metavar="RUN_DIR")
-    inspect.add_argument(
-        "--show", default="", metavar="NAME,...", help="volume, isosurface, slices, primitives, primitive, difference, ..."
-    )
-    inspect.add_argument("--primitives", action="store_true", help="the ellipsoids in their own colours; as --show primitives")
-    inspect.add_argument("--primitive", type=arguments.row, metavar="INDEX", help="look into this one; as --show primitive")
-    inspect.add_argument("--against", metavar="FILE.vdb|DIR|scene", help="ground truth to compare with")
-    inspect.add_argument(
-        "--grid", type=arguments.count, default=128, metavar="N", help="points along the box's longest side (default: 128)"
-    )
-    inspect.add_argument(
-        "--box",
-        type=arguments.numbers,
-        metavar="X,Y,Z,X,Y,Z",
-        help="two corners, scene units, as --box=-1,-1,-1,1,1,1 (default: around all matter)",
-    )
-    inspect.add_argument("--level", type=arguments.numbers, default=[], metavar="S,...", help="extinctions of isosurfaces, 1/scene unit")
-    inspect.add_argument("--up", choices=("x", "y", "z"), help="the upward axis (default: the scene's, or z)")
-    inspect.add_argument("--size", type=arguments.size, metavar="WxH", help="pixels of the picture or window")
-    inspect.add_argument("--out", type=Path, metavar="FILE", help=".png, .webp, .gif, .mp4, .html or .vdb (default: a window)")
-    inspect.add_argument("--force", action="store_true", help="replace files that exist")
+    arguments.for_inspect(inspect)
 
     vdb = command("vdb", _vdb, "look into OpenVDB files", "`info` lists grids: type, transform, bounds, active voxels, values, memory.")
     vdb.add_argument("action", choices=("info",), metavar="info", help="what to do")
@@ -245,7 +224,7 @@ def _eval(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
     from neuprim.runs.measure import evaluate_run
 
-    _print_metrics(evaluate_run(run_dir, args.lpips))
+    _print_metrics(evaluate_run(run_dir, args.lpips, args.words))
     return 0
 
 
@@ -267,10 +246,16 @@ def _render(args: argparse.Namespace) -> int:
             environment=environment,
             tell=progress.note,
             progress=progress.show,
+            words=args.words,
         )
     for path in paths:
         print(path)
     return 0
+
+
+def _tradeoff(args: argparse.Namespace) -> int:
+    _run_directory(args.run_dir)
+    return tradeoff(args)
 
 
 def _export(args: argparse.Namespace) -> int:

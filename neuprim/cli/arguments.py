@@ -1,4 +1,4 @@
-"""Values of command-line flags, from their text; and the flags of ``bench``, which are many."""
+"""Values of command-line flags, from their text; and the flags of commands that have many."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import re
 from pathlib import Path
 
-__all__ = ["count", "for_bench", "numbers", "rate", "row", "size"]
+__all__ = ["count", "for_bench", "for_inspect", "for_render", "numbers", "rate", "row", "size"]
 
 
 def for_bench(parser: argparse.ArgumentParser) -> None:
@@ -22,6 +22,38 @@ def for_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", type=count, default=1, metavar="N", help="runs of each, with seeds from 0 (default: 1)")
     parser.add_argument("--out", type=Path, default=Path("outputs/paper"), metavar="DIR", help="gets a run directory each")
     parser.add_argument("--estimate", action="store_true", help="only say what would run, and for how long")
+
+
+def for_render(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of ``neuprim render``, but those of light from all around."""
+    parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    parser.add_argument("--camera", required=True, metavar="orbit|test|FILE.json", help="which cameras")
+    parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the data set's)")
+    parser.add_argument("--format", choices=("png", "exr", "npy", "webp", "gif", "mp4"), help="default: png, or webp for an animation")
+    parser.add_argument("--fps", type=rate, metavar="F", help="frames per second of an animation (default: about four seconds in all)")
+    parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
+    parser.add_argument("--frames", type=count, default=60, metavar="N", help="frames of an orbit (default: 60)")
+
+
+def for_inspect(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of ``neuprim inspect``."""
+    parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    parser.add_argument("--show", default="", metavar="NAME,...", help="volume, isosurface, slices, primitives, primitive, difference, ...")
+    parser.add_argument("--primitives", action="store_true", help="the ellipsoids in their own colours; as --show primitives")
+    parser.add_argument("--primitive", type=row, metavar="INDEX", help="look into this one; as --show primitive")
+    parser.add_argument("--against", metavar="FILE.vdb|DIR|scene", help="ground truth to compare with")
+    parser.add_argument("--grid", type=count, default=128, metavar="N", help="points along the box's longest side (default: 128)")
+    parser.add_argument(
+        "--box",
+        type=numbers,
+        metavar="X,Y,Z,X,Y,Z",
+        help="two corners, scene units, as --box=-1,-1,-1,1,1,1 (default: around all matter)",
+    )
+    parser.add_argument("--level", type=numbers, default=[], metavar="S,...", help="extinctions of isosurfaces, 1/scene unit")
+    parser.add_argument("--up", choices=("x", "y", "z"), help="the upward axis (default: the scene's, or z)")
+    parser.add_argument("--size", type=size, metavar="WxH", help="pixels of the picture or window")
+    parser.add_argument("--out", type=Path, metavar="FILE", help=".png, .webp, .gif, .mp4, .html or .vdb (default: a window)")
+    parser.add_argument("--force", action="store_true", help="replace files that exist")
 
 
 def size(text: str) -> tuple[int, int]:

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from neuprim.cli.console import plain_console
+from neuprim.core.compute.machine import cpu_name
 from neuprim.version import __version__
 
 __all__ = ["doctor"]
@@ -51,21 +52,11 @@ def _machine() -> Rows:
         ("neuprim", __version__),
         ("python", f"{platform.python_version()} ({platform.python_implementation()})"),
         ("platform", platform.platform()),
-        ("cpu", _cpu_name()),
+        ("cpu", cpu_name()),
         ("cores", _cores()),
         ("simd", _simd()),
         ("memory", _memory()),
     ]
-
-
-def _cpu_name() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass  # not Linux
-    return platform.processor() or platform.machine() or "unknown"
 
 
 def _cores() -> str:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.ticker import Locator
 
-__all__ = ["Series", "curve", "dots", "series"]
+__all__ = ["GRID", "HELD_OUT", "INK", "TRAINING", "Series", "curve", "dots", "look", "series", "short_number", "svg"]
 
 # Colours no chart uses otherwise: matplotlib draws with them, and the page's CSS variables take their place in the SVG.
 INK, GRID, TRAINING, HELD_OUT = "#010203", "#010204", "#010205", "#010206"
@@ -61,7 +61,7 @@ def curve(training: Series, held_out: Series | None, x: str, label: str, log: bo
     if not drawn:
         return None
     unit, divisor = _time_unit(max(float(s[0].max()) for s in drawn)) if x == "seconds" else (UNITS[x], 1.0)
-    with _look():
+    with look():
         figure, axes = _axes()
         if training[0].size:
             _line(axes, training[0] / divisor, training[1])
@@ -74,7 +74,7 @@ def curve(training: Series, held_out: Series | None, x: str, label: str, log: bo
         axes.set_xlabel(unit)
         right = max(float(s[0].max()) for s in drawn) / divisor
         axes.set_xlim(0, right * 1.02 if right > 0 else 1)
-        return _svg(figure, label)
+        return svg(figure, label)
 
 
 def dots(values: Sequence[float | None], mean: float | None, worst: str | None, label: str) -> str | None:
@@ -87,7 +87,7 @@ def dots(values: Sequence[float | None], mean: float | None, worst: str | None, 
     if not known:
         return None
     xs, ys = (np.array(column, dtype=np.float64) for column in zip(*known, strict=True))
-    with _look():
+    with look():
         figure, axes = _axes()
         if mean is not None and math.isfinite(mean):
             axes.axhline(mean, color=INK, linewidth=1, linestyle=(0, (4, 3)), zorder=2)
@@ -112,7 +112,7 @@ def dots(values: Sequence[float | None], mean: float | None, worst: str | None, 
         axes.set_xlim(-0.7, len(values) - 0.3)
         axes.xaxis.set_major_locator(_ticks(6, integer=True))
         axes.margins(y=0.14)
-        return _svg(figure, label)
+        return svg(figure, label)
 
 
 def _line(axes: Axes, x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
@@ -131,10 +131,10 @@ def _log_axis(axes: Axes, low: float, high: float) -> None:
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0,) if high / low > 300 else (1.0, 2.0, 5.0)))
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short_number(value)))
 
 
-def _short(value: float) -> str:
+def short_number(value: float) -> str:
     """Tick labels without powers of ten: 12k, 0.002, 3M."""
     for size, suffix in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
@@ -148,7 +148,7 @@ def _time_unit(seconds: float) -> tuple[str, float]:
     return ("minutes", 60.0) if seconds < 3 * 3600 else ("hours", 3600.0)
 
 
-def _look() -> AbstractContextManager[None]:
+def look() -> AbstractContextManager[None]:
     """Settings of every chart, to hold from its axes' creation to its SVG."""
     import matplotlib  # slow to import, and only reports need it
 
@@ -183,7 +183,7 @@ def _axes() -> tuple[Figure, Axes]:
     figure = Figure(figsize=(WIDTH / 72, HEIGHT / 72))
     axes = figure.add_axes((0.115, 0.2, 0.865, 0.76))
     for axis, most in ((axes.xaxis, 6), (axes.yaxis, 5)):
-        axis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: short_number(value)))
         axis.set_major_locator(_ticks(most))
     return figure, axes
 
@@ -194,13 +194,14 @@ def _ticks(most: int, integer: bool = False) -> Locator:
     return MaxNLocator(nbins=most, steps=[1, 2, 2.5, 5, 10], integer=integer)
 
 
-def _svg(figure: Figure, label: str) -> str:
+def svg(figure: Figure, label: str) -> str:
     """The chart as an element of the page: no outside addresses, no global styles, own ids, the page's font and colours."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", transparent=True)
     body = buffer.getvalue()
     body = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->|<style.*?</style>", "", body[body.index("<svg") :], flags=re.DOTALL)
-    opening = f'<svg class="chart" role="img" aria-label="{html.escape(label, quote=True)}" viewBox="0 0 {WIDTH} {HEIGHT}">'
+    width, height = 72 * figure.get_size_inches()
+    opening = f'<svg class="chart" role="img" aria-label="{html.escape(label, quote=True)}" viewBox="0 0 {width:g} {height:g}">'
     body = opening + body[body.index(">") + 1 :]
     body = re.sub(r'\bfont: ([\d.]+px) [^;"]*', r"font-size: \1", body)
     body = re.sub(r'\bfont-family: [^;"]*;? ?', "", body)

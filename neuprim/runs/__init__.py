@@ -1,4 +1,4 @@
-"""What the commands do, for Python too: fit, measure, draw, export and inspect runs. Nothing here parses arguments or prints."""
+"""What the commands do, for Python too: fit, measure, draw, export and inspect runs, and weigh speed against accuracy. Nothing here parses arguments or prints."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from neuprim.runs.open import load_dataset as load_dataset
     from neuprim.runs.open import load_run as load_run
     from neuprim.runs.open import read_metrics as read_metrics
+    from neuprim.runs.tradeoff.run import tradeoff_run as tradeoff_run
 
 _HOMES = {
     "Fitted": "fit",
@@ -22,6 +23,7 @@ _HOMES = {
     "load_run": "open",
     "read_metrics": "open",
     "render_run": "draw",
+    "tradeoff_run": "tradeoff.run",
 }
 __all__ = [*_HOMES]
 

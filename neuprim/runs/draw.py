@@ -23,8 +23,9 @@ from neuprim.core.io.film import write_film
 from neuprim.core.model.fields import Conditions
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import facts_of, orbit_of
-from neuprim.runs.measure import draw, draw_sum
+from neuprim.runs.measure import draw_sum
 from neuprim.runs.open import LOGS, load_dataset, load_run, placed
+from neuprim.runs.operating import read_point
 
 __all__ = ["FORMATS", "render_run", "with_conditions"]
 
@@ -46,6 +47,7 @@ def render_run(
     environment: EnvironmentFile | None = None,
     tell: Callable[[str], None] = lambda text: None,
     progress: Callable[[str, float], None] = lambda text, fraction: None,
+    words: Sequence[str] = (),
 ) -> list[Path]:
     """Draw a run's model: ``camera`` is "orbit", "test" or a JSON file of cameras (see :mod:`neuprim.core.cameras.file`).
 
@@ -58,12 +60,14 @@ def render_run(
         environment: light from all around instead of the task's light.
         tell: called with lines for the user, e.g. what the model never saw.
         progress: called with (text, fraction 0..1) while images are drawn.
+        words: of an operating point (:mod:`neuprim.runs.operating`), over how the run draws.
 
     Raises:
         DataError, ConfigError, CheckpointError: bad cameras, conditions, or run directory.
         BackendUnavailable: a format whose package is missing.
     """
     config, task, model, header = load_run(run_dir)
+    point = read_point(words, config.renderer, model)
     suspects = suspects_of(config)
     watch = suspects.watch(run_dir / LOGS)
     background = torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)])
@@ -91,7 +95,8 @@ def render_run(
         views = [replace(v, conditions={**v.conditions, **lights[0]}) for v in views]
     with watch:
         views, animated = with_conditions(views, task, conditions, tell)
-    model = placed(model, config.renderer, views[0])
+        model = point.applied(model)
+    model = placed(model, point.settings, views[0])
     format = format or _format_of(out, animated)
     if channels.partial and format not in _RAW:
         tell(f"shown: {channels.shown}; --format exr and npy hold all channels")
@@ -114,8 +119,8 @@ def render_run(
         each = max(len(lights), 1)
         with watch:
             if lights:
-                return draw_sum(model, view, lights, config.renderer, background, drawn)
-            result = draw(model, view, config.renderer, background)
+                return point.enlarged(draw_sum(model, point.seen(view), lights, point.settings, background, drawn), view.camera)
+            result = point.draw(model, view, background)
         drawn()
         return result
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,8 @@ from neuprim.core.render import RenderSettings, choose, render
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import clips_of, diagnosed, judged, mask_of
 from neuprim.runs.open import LOGS, load_dataset, load_run, placed
+from neuprim.runs.operating import read_point
+from neuprim.runs.storage import stored_bytes
 from neuprim.version import __version__
 
 __all__ = ["ViewMetrics", "draw", "draw_sum", "evaluate_run", "measure", "summary"]
@@ -98,12 +100,14 @@ def measure(
     channels: Channels,
     seen: Callable[[int, View, Tensor, Tensor], None] | None = None,
     lpips: Lpips | None = None,
+    paint: Callable[[Primitives, View, Tensor], Tensor] | None = None,
 ) -> list[ViewMetrics]:
     """Every view of the test split, composited over the data set's background.
 
     Args:
         seen: called as ``seen(index, view, rendered, truth)`` for each, e.g. to keep pictures.
         lpips: measured too, where there are weights for it.
+        paint: draws (model, view, background) in place of :func:`draw` with the settings.
     """
     views, background = dataset.test, dataset.background
     result = []
@@ -112,7 +116,7 @@ def measure(
         check_pixels("test", view, pixels, dataset.channels)
         truth = pixels.over(background)
         start = time.perf_counter()
-        rendered = draw(model, view, settings, background)
+        rendered = draw(model, view, settings, background) if paint is None else paint(model, view, background)
         seconds = time.perf_counter() - start
         if pixels.mask is not None:
             rendered = torch.where(pixels.mask[..., None], rendered, truth)
@@ -154,13 +158,17 @@ def _as_others(rendered: Tensor, truth: Tensor, channels: Channels, lpips: Lpips
     return found
 
 
-def evaluate_run(run_dir: Path, lpips: str | Path | None = None) -> dict[str, Any]:
+def evaluate_run(run_dir: Path, lpips: str | Path | None = None, words: Sequence[str] = ()) -> dict[str, Any]:
     """The metrics of a run's last checkpoint, measured again from disk alone; the same numbers as the run's own.
 
     Args:
         lpips: weights for LPIPS; without, those that the run names.
+        words: of an operating point (:mod:`neuprim.runs.operating`), over how the run draws; ``model_bytes`` is the size of the run's file
+            but for what these change.
     """
     config, task, model, header = load_run(run_dir)
+    point = read_point(words, config.renderer, model)
+    config = replace(config, renderer=point.settings)
     weights = lpips or config.metrics.lpips
     distance = None if weights is None else Lpips.load(weights)
     suspects = suspects_of(config)
@@ -171,9 +179,12 @@ def evaluate_run(run_dir: Path, lpips: str | Path | None = None) -> dict[str, An
         path = run_dir / "model.safetensors"
         training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
         channels = channels_of(task, dataset)
+        size = path.stat().st_size - stored_bytes(model, {})
+        model = point.applied(model)
+        size += point.bytes(model)
         model = placed(model, config.renderer, dataset.test.view(0))
-        views = measure(model, task, dataset, config.renderer, channels, lpips=distance)
-        return summary(config, model, task, dataset, channels, views, path.stat().st_size, training, distance)
+        views = measure(model, task, dataset, config.renderer, channels, lpips=distance, paint=point.draw)
+        return summary(config, model, task, dataset, channels, views, size, training, distance)
 
 
 def summary(

@@ -31,12 +31,12 @@ def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         (config.output_dir / "config.yaml").write_text(config.to_yaml())
         return config.output_dir
 
-    def evaluate_run(run_dir: Path, lpips: Path | None = None) -> dict[str, Any]:
-        made.append(run_dir)
+    def evaluate_run(run_dir: Path, lpips: Path | None = None, words: Any = ()) -> dict[str, Any]:
+        made.append((run_dir, *words) if words else run_dir)
         return {"psnr": 31.23456, "views": 20, "worst": {"name": "r_3", "psnr": 27.0}}
 
-    def render_run(*args: Any, environment: Any = None, tell: Any = None, progress: Any = None) -> list[Path]:
-        made.append(args if environment is None else (*args, environment))
+    def render_run(*args: Any, environment: Any = None, tell: Any = None, progress: Any = None, words: Any = ()) -> list[Path]:
+        made.append((*args, *words) if environment is None else (*args, environment))
         return [Path("a.png"), Path("b.png")]
 
     homes = (("run", {"run": run}), ("measure", {"evaluate_run": evaluate_run}), ("draw", {"render_run": render_run}))

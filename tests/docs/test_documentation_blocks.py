@@ -15,6 +15,7 @@ import torch
 import trimesh
 
 from neuprim.cli import _parsers
+from neuprim.cli.operating_words import DRAWN, operating_words
 from neuprim.config import compose, compose_all
 from neuprim.core.cameras.file import read_cameras
 from neuprim.core.conditions import read_conditions, split_words
@@ -195,6 +196,8 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
         rest += args.overrides
         compose(["scene=blender", "scene.path=DIR", *(word for word in rest if not word.startswith("-"))], False)
         rest = [word for word in rest if word.startswith("-")]
+    if args.command in DRAWN:
+        _, rest = operating_words(rest)
     if args.command in ("render", "inspect", "export"):
         given, rest = split_words(rest, conditions)
         assert (

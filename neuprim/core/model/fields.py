@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor
@@ -107,6 +107,19 @@ class Field(ABC):
             tensors of the same shapes, such that each child continues its parent's field inside its own support.
         """
         return dict(params)
+
+    def reductions(self) -> dict[str, tuple[int, ...]]:
+        """Settings of which a fitted model can do with less, and the smaller values, the largest first: ``{"degree": (2, 1, 0)}``."""
+        return {}
+
+    def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[Self, dict[str, Tensor]]:
+        """A field with less of one of :meth:`reductions`, and its tensors: what is closest to this one's without training again.
+
+        Args:
+            params, geometry: of all primitives.
+            name, value: a setting, and one of the values that it can have.
+        """
+        raise NotImplementedError(f"{type(self).__name__} names {name} in reductions() and does not know how to reduce it")
 
 
 class DensityField(Field):

@@ -22,6 +22,15 @@ FREQUENCIES = {"periods": 2 * math.pi, "printed": 1.0}
 """Angle of the first Fourier term at xi = 1. The paper prints i xi, whose basis is nearly rank-deficient on [0, 1] (condition
 5e13); whole periods are well conditioned (2e5)."""
 
+_TIME = ("time_poly", "time_cos", "time_sin")
+"""The tensors of the terms in time."""
+
+_TIMES = 256
+"""At which fewer terms are fitted to all of them."""
+
+_CONDITION = 1e-7
+"""Directions of the terms that are weaker than this are left out of a fit: their coefficients would not survive float32."""
+
 RENAMED = {"turns": "periods"}
 """Words of before, which configurations and models on disk still hold."""
 
@@ -65,19 +74,43 @@ class TimeHarmonics(ColourField):
     def parameters(self) -> list[ParameterSpec]:
         C, rest = self.channels, sh.coefficient_count(self.degree) - 1
         specs = [ParameterSpec("sh_dc", (C,), 1e-2, lambda c: sh.initial_dc(c.colors))]
-        for name, terms in (("time_poly", self.powers), ("time_cos", self.waves), ("time_sin", self.waves)):
+        for name, terms in zip(_TIME, (self.powers, self.waves, self.waves), strict=True):
             if terms:
                 specs.append(ParameterSpec(name, (terms, C), 5e-3, _zeros(terms, C)))
         if rest:
             specs.append(ParameterSpec("sh_rest", (rest, C), 2e-3, _zeros(rest, C)))
         return specs
 
-    def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:
-        dc = params["sh_dc"]
-        xi = time_of(conditions)
+    def reductions(self) -> dict[str, tuple[int, ...]]:
+        most = {"degree": self.degree, "powers": self.powers, "waves": self.waves}
+        return {name: tuple(range(value - 1, -1, -1)) for name, value in most.items() if value}
+
+    def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[TimeHarmonics, dict[str, Tensor]]:
+        """Fewer terms in time are those that are closest to all of them, by least squares over the sequence."""
+        field = TimeHarmonics(**{**self.settings(), name: value})
+        if name == "degree":
+            return field, sh.fewer_bands(params, "sh_rest", value)
+        times = (torch.arange(_TIMES, dtype=torch.float64) + 0.5) / _TIMES
+        all_terms, fewer = (
+            torch.stack([torch.cat([torch.ones_like(x)[None], *f._terms(x).values()]) for x in times]) for f in (self, field)
+        )
+        fit = torch.linalg.pinv(fewer, rtol=_CONDITION) @ all_terms  # coefficients of all terms -> of those that stay
+        stored = torch.cat([params["sh_dc"][:, None], *(params[key] for key in _TIME if key in params)], 1)
+        sizes = {key: len(basis) for key, basis in field._terms(times[0]).items()}
+        dc, *rest = (device.beside(fit, stored.double()) @ stored.double()).to(stored).split([1, *sizes.values()], 1)
+        others = {key: value for key, value in params.items() if key not in _TIME}
+        kept = {key: part.contiguous() for key, part in zip(sizes, rest, strict=True) if sizes[key]}
+        return field, {**others, **kept, "sh_dc": dc[:, 0].contiguous()}
+
+    def _terms(self, xi: Tensor) -> dict[str, Tensor]:
+        """Basis of each tensor at a time, float64."""
         waves = FREQUENCIES[self.frequencies] * xi * torch.arange(1, self.waves + 1, dtype=torch.float64, device=xi.device)
         powers = xi ** torch.arange(1, self.powers + 1, dtype=torch.float64, device=xi.device)
-        for name, basis in (("time_poly", powers), ("time_cos", waves.cos()), ("time_sin", waves.sin())):
+        return dict(zip(_TIME, (powers, waves.cos(), waves.sin()), strict=True))
+
+    def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:
+        dc = params["sh_dc"]
+        for name, basis in self._terms(time_of(conditions)).items():
             if name in params:
                 dc = dc + (params[name] * device.beside(basis, dc)[:, None]).sum(1)
         return dc, params.get("sh_rest")

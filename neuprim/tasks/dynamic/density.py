@@ -20,6 +20,7 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity, amplified, cosine_density, split_cosine, split_scale
+from neuprim.core.model.densities.fewer import fewer_neurons
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
@@ -162,6 +163,13 @@ class TimeDensity(DensityField):
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
         return self.static.from_gaussians(alphas)
+
+    def reductions(self) -> dict[str, tuple[int, ...]]:
+        return self.static.reductions()
+
+    def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[TimeDensity, dict[str, Tensor]]:
+        field = TimeDensity(**{**self.settings(), "neurons": value})
+        return field, fewer_neurons(params, geometry, value, self.static.omega0)
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         scaled = self.static.scale_density(params, factor)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.compute import device
+from neuprim.core.model.colours.sh import fewer_bands
 from neuprim.core.model.fields import ColourField, Conditions, Constant
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import ParameterSpec, Params
@@ -40,6 +41,12 @@ class LightHarmonics(ColourField):
         if rest:
             specs.append(ParameterSpec("light_sh", (rest, C), 1e-2, lambda c: torch.zeros(c.count, rest, C)))
         return specs
+
+    def reductions(self) -> dict[str, tuple[int, ...]]:
+        return {"degree": tuple(range(self.degree - 1, -1, -1))} if self.degree else {}
+
+    def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[LightHarmonics, dict[str, Tensor]]:
+        return LightHarmonics(**{**self.settings(), "degree": value}), fewer_bands(params, "light_sh", value)
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         color = params["c_dc"]

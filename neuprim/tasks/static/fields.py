@@ -43,6 +43,12 @@ class SphericalHarmonics(ColourField):
             specs.append(ParameterSpec("sh_rest", (rest, C), 2e-3, lambda c: torch.zeros(c.count, rest, C)))
         return specs
 
+    def reductions(self) -> dict[str, tuple[int, ...]]:
+        return {"degree": tuple(range(self.degree - 1, -1, -1))} if self.degree else {}
+
+    def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[SphericalHarmonics, dict[str, Tensor]]:
+        return SphericalHarmonics(value, self.channels), sh.fewer_bands(params, "sh_rest", value)
+
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:
         return params["sh_dc"], params.get("sh_rest")
 

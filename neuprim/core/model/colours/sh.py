@@ -10,9 +10,10 @@ from torch import Tensor
 from neuprim.core.compute import device
 from neuprim.core.errors import FormError
 from neuprim.core.model.colours.sh_constants import C0, C1, C2, C3
+from neuprim.core.model.schema import Params
 from neuprim.core.model.tensors import Shape, Sizes, tensors_fault
 
-__all__ = ["C0", "basis", "coefficient_count", "colors", "initial_dc"]
+__all__ = ["C0", "basis", "coefficient_count", "colors", "fewer_bands", "initial_dc"]
 
 
 def coefficient_count(degree: int) -> int:
@@ -93,6 +94,15 @@ def _check(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degre
         fault = f"rest has {sizes['bands'][0]} bands; expected at least {needed} for degree {degree}"
     if fault is not None:
         raise FormError(f"sh.colors: {fault}")
+
+
+def fewer_bands(params: Params, name: str, degree: int) -> dict[str, Tensor]:
+    """The tensors with the bands above ``degree`` gone from the one called ``name``, (N, bands but the first, C); it goes with the last of them.
+
+    What is left is the closest there is, as bands are orthogonal: no other coefficients are nearer on average over all directions.
+    """
+    kept = {key: value for key, value in params.items() if key != name}
+    return {**kept, name: params[name][:, : coefficient_count(degree) - 1].contiguous()} if degree else kept
 
 
 _DARKEST = 1e-3

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.checked import Range
+from neuprim.core.model.densities.fewer import fewer_neurons, smaller_counts
 from neuprim.core.model.edge import EDGES, NORMS, fade
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
 from neuprim.core.model.footprint import gaussian_support
@@ -100,6 +101,12 @@ class CosineDensity(DensityField):
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
         support, depth = gaussian_support(self.edge, alphas)
         return support.to(alphas), -torch.expm1(-depth).to(alphas)
+
+    def reductions(self) -> dict[str, tuple[int, ...]]:
+        return {"neurons": smaller_counts(self.neurons)} if self.neurons else {}
+
+    def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[CosineDensity, dict[str, Tensor]]:
+        return CosineDensity(value, self.omega0, self.edge, self.gain), fewer_neurons(params, geometry, value, self.omega0)
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         return {**params, "w2": params["w2"] * factor[:, None], "b2": params["b2"] * factor[:, None]}

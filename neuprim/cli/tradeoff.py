@@ -1,0 +1,80 @@
+"""``neuprim tradeoff``: what speed and size cost in accuracy, of a finished run."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from neuprim.cli import arguments
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from neuprim.runs.tradeoff.record import Measured, Record
+
+__all__ = ["for_tradeoff", "tradeoff"]
+
+
+def for_tradeoff(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments."""
+    parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    parser.add_argument("--views", type=arguments.count, default=5, metavar="N", help="held-out views, evenly spread (default: 5)")
+    parser.add_argument("--repeats", type=arguments.count, default=15, metavar="N", help="rounds of timing (default: 15)")
+    parser.add_argument("--knobs", nargs="+", default=[], metavar="NAME", help="some of them, e.g. alpha_min sort (default: all)")
+    parser.add_argument("--budget", default="5m", metavar="TIME", help="about how long, e.g. 90s or 10m; what does not fit is left out")
+    parser.add_argument("--lpips", type=Path, metavar="FILE", help="measure LPIPS with these weights of your own, a file or a folder")
+
+
+def tradeoff(args: argparse.Namespace) -> int:
+    """Measures, writes RUN_DIR/tradeoff and prints the fronts."""
+    from neuprim.cli.console import plain_console
+    from neuprim.cli.progress import DrawProgress
+    from neuprim.runs.tradeoff.record import command
+    from neuprim.runs.tradeoff.run import FOLDER, Request, seconds_of, tradeoff_run
+
+    words = [*args.words, *(word for word in args.knobs if "=" in word)]  # after --knobs they look like names
+    knobs = [word for word in args.knobs if "=" not in word]
+    request = Request(args.run_dir, args.views, args.repeats, knobs, seconds_of(args.budget), words, args.lpips)
+    folder = args.run_dir / FOLDER
+    try:
+        with DrawProgress(plain_console(stderr=True)) as progress:
+            record = tradeoff_run(request, progress.note, progress.show)
+    except KeyboardInterrupt:
+        if not (folder / "tradeoff.json").exists():
+            raise
+        raise KeyboardInterrupt(f"; {folder / 'tradeoff.json'} has the points up to here; the same command goes on") from None
+    console = plain_console()
+    for title, numbers in (("front of speed", record.speed), ("front of size", record.size)):
+        console.print(_table(title, record, numbers))
+        for place, number in enumerate(numbers, 1):
+            console.print(f"{command(str(args.run_dir), record.points[number].words)}  # {place}")
+        console.print()
+    for name in ("tradeoff.json", "tradeoff.csv", "tradeoff.html", "front.png"):
+        console.print(folder / name)
+    return 0
+
+
+def _table(title: str, record: Record, numbers: Sequence[int]) -> Table:
+    """The reference, and the points of a front under the numbers that their commands have."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title, title_justify="left", box=box.SIMPLE, padding=(0, 1, 0, 0))
+    for name in ("#", "time", "ms", "frames/s", "PSNR", "SSIM", "exact", "bytes", "MB"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for place, number in (("ref.", 0), *((str(k), number) for k, number in enumerate(numbers, 1))):
+        table.add_row(*(Text(cell) for cell in (place, *_cells(record.points[number]))))
+    return table
+
+
+def _cells(point: Measured) -> tuple[str, ...]:
+    q = point.quality
+    about = "" if point.spread is None else f" ± {point.spread:.3f}"
+    return (
+        *((f"{point.ratio:.3f}{about}", f"{point.time:.2f}", f"{1e3 / point.time:.1f}") if point.ms else ("–", "–", "–")),
+        *(f"{q['psnr']:.2f}", f"{q['ssim']:.4f}", f"{q['psnr_exact']:.1f}", f"{point.bytes:,}"),
+        "–" if point.peak_bytes is None else f"{point.peak_bytes / 1e6:.1f}",
+    )

@@ -1,0 +1,303 @@
+"""The page of ``neuprim tradeoff``: charts with the front marked, pictures of its points side by side, and every point's numbers."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.core.io.files import write_text
+from neuprim.core.io.images import write_png
+from neuprim.core.metrics import from_json
+from neuprim.report.pictures import Inlined, color_bar, error_map, inline
+from neuprim.report.scatter import Chart, Dot, chart_svg, write_charts
+from neuprim.report.text import byte_size, count, decimal, escape
+
+__all__ = ["Picture", "write_tradeoff"]
+
+DIFFERENCE = 0.05
+"""Difference from the reference point at the bright end of its colours."""
+
+PIXELATED_BELOW = 200
+"""Pictures narrower than this many pixels are enlarged with hard pixel edges."""
+
+TIME = "time of a frame, as a multiple of the reference’s"
+
+SLOWEST = 12.0
+"""Multiples of the reference's time beyond which points are off the charts."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What a point shows: (H, W, 3) sRGB values, and those of the reference point that it is compared with, if any."""
+
+    image: Tensor
+    against: Tensor | None
+
+
+def write_tradeoff(
+    folder: Path, record: Mapping[str, Any], pictures: Mapping[int, Picture], command: Callable[[Sequence[str]], str]
+) -> None:
+    """Write ``tradeoff.html`` and ``front.png`` into ``folder``.
+
+    Args:
+        record: content of ``tradeoff.json``.
+        pictures: of points by their number in it; -1 is the ground truth.
+        command: the words of a point -> the command that draws it, ready to paste.
+    """
+    page = _Page(record, pictures, command)
+    template = Template(files("neuprim.report").joinpath("tradeoff.html").read_text(encoding="utf-8"))
+    title = f"{record['task']} / {record['scene']}"
+    sections = {name: getattr(page, name)() for name in ("heading", "headline", "charts", "speed", "size", "table", "left_out", "facts")}
+    write_charts(folder / "front.png", page.fronts())
+    write_text(folder / "tradeoff.html", template.substitute(title=escape(title), style=_style(), **sections))
+
+
+def _style() -> str:
+    """The style sheet of a run's report."""
+    text = files("neuprim.report").joinpath("template.html").read_text(encoding="utf-8")
+    return text.partition("<style>")[2].partition("</style>")[0]
+
+
+class _Page:
+    def __init__(self, record: Mapping[str, Any], pictures: Mapping[int, Picture], command: Callable[[Sequence[str]], str]) -> None:
+        self.record, self.points, self.command = record, record["points"], command
+        self.front_of: dict[str, list[int]] = {name: list(record["front"][name]) for name in ("speed", "size")}
+        self.pictures = pictures
+
+    # ------------------------------------------------------------ numbers
+
+    def quality(self, number: int, name: str = "psnr") -> float:
+        found = from_json(self.points[number]["quality"], name)
+        return math.nan if found is None else found
+
+    def ratio(self, number: int) -> float:
+        return float(self.points[number].get("time_ratio", math.nan))
+
+    def spread(self, number: int) -> float:
+        return float(self.points[number].get("time_ratio_spread") or 0.0)
+
+    def name(self, number: int) -> str:
+        words = self.points[number]["words"]
+        return " ".join(word.removeprefix("renderer.") for word in words) or "as the run draws"
+
+    def lost(self, number: int) -> str:
+        change = self.quality(number) - self.quality(0)
+        return f"{'+' if change >= 0.005 else '−' if change <= -0.005 else '±'}{abs(change):.2f} dB"
+
+    # ------------------------------------------------------------ sections
+
+    def heading(self) -> str:
+        r = self.record
+        html = f'<p class="eyebrow">speed and accuracy of a finished run</p>\n<h1>{escape(r["task"])} / {escape(r["scene"])}</h1>'
+        if r["data_source"] != "real":
+            html += f'\n<p class="badge"><strong>{escape(r["data_source"])} data</strong></p>'
+        return html
+
+    def headline(self) -> str:
+        base = self.points[0]
+        size, unit = byte_size(base["bytes"])
+        tiles = [
+            ("As compared with", decimal(base.get("ms_per_frame"), 2), "ms a frame", escape(self.name(0))),
+            ("PSNR", decimal(self.quality(0), 2), "dB", f"{len(self.record['same']['views'])} held-out views"),
+            ("Model file", size, unit, f"{count(self.record['primitives'])} primitives"),
+            *self._within("speed", "Fastest", lambda i: f"{1 / self.ratio(i):.2f}"),
+            *self._within("size", "Smallest", lambda i: f"{base['bytes'] / self.points[i]['bytes']:.2f}"),
+        ]
+        cells = "".join(
+            f'<div class="tile{" lead" if i > 2 else ""}"><dt>{label}</dt><dd>{value}<small>{unit}</small></dd>'
+            f'<dd class="note" title="{note}">{note}</dd></div>'
+            for i, (label, value, unit, note) in enumerate(tiles)
+        )
+        return f'<dl class="tiles">{cells}</dl>'
+
+    def _within(self, front: str, label: str, value: Any) -> list[tuple[str, str, str, str]]:
+        """The last point of a front that loses at most a tenth of a decibel."""
+        good = [i for i in self.front_of[front] if self.quality(i) >= self.quality(0) - 0.1]
+        if not good:
+            return []
+        what = "times as fast" if front == "speed" else "times smaller"
+        return [(f"{label} within 0.1 dB", value(good[-1]), what, escape(self.name(good[-1])))]
+
+    def fronts(self) -> list[Chart]:
+        """Quality against time and against bytes; the latter of points that are smaller, or the reference."""
+        bytes_of = [float(p["bytes"]) for p in self.points]
+        smaller = [i for i in range(len(self.points)) if i == 0 or bytes_of[i] < bytes_of[0]]
+        in_time = self._dots("speed", range(len(self.points)), self.ratio, self.spread, "psnr")
+        in_bytes = self._dots("size", smaller, lambda i: bytes_of[i], lambda i: 0.0, "psnr")
+        return [
+            Chart("PSNR against time", TIME, "PSNR, dB", in_time, most=SLOWEST),
+            Chart("PSNR against size", "bytes of the model file", "PSNR, dB", in_bytes),
+        ]
+
+    def _dots(
+        self, front: str, numbers: Sequence[int], cost: Callable[[int], float], spread: Callable[[int], float], good: str
+    ) -> list[Dot]:
+        place = {number: str(k + 1) for k, number in enumerate(self.front_of[front])}
+        return [Dot(cost(i), self.quality(i, good), spread(i), place.get(i), i == 0) for i in numbers]
+
+    def charts(self) -> str:
+        near = self._dots("speed", range(len(self.points)), self.ratio, self.spread, "psnr_exact")
+        more = [Chart("PSNR against the exact image", TIME, "dB", near, joined=False, most=SLOWEST), *self._marching()]
+        panels = ""
+        for chart in [*self.fronts(), *more]:
+            drawn = chart_svg(chart)
+            if drawn is not None:
+                panels += f'<figure class="panel"><figcaption>{escape(chart.title)}, dB</figcaption>{drawn}</figure>'
+        note = (
+            '<p class="note">Ringed: the reference. Orange and numbered: the front. Bars: half the range between the quartiles of all rounds.'
+            f"{self._march_note()}</p>"
+        )
+        return _section("Fronts", f'<div class="charts">{panels}</div>{note}')
+
+    def _marching(self) -> list[Chart]:
+        rows = self.record["marching"].get("rows", [])
+        if not rows:
+            return []
+        closed = rows[0]["seconds"]
+        dots = [Dot(row["seconds"] / closed, row["psnr"], 0.0, str(row["samples"])) for row in rows[1:] if row["psnr"] is not None]
+        return [Chart("Sampled chords against the closed form", "time of the integrals, as a multiple of the closed form's", "dB", dots)]
+
+    def _march_note(self) -> str:
+        marching = self.record["marching"]
+        if "rows" not in marching:
+            return f" Sampling of chords: not measured, {escape(marching.get('not_measured'))}."
+        width, height = marching["image_size"]
+        return (
+            f" Sampled chords: n midpoint samples on each of {count(marching['chords'])} chords of an image of {width}×{height}, in float64 torch; "
+            "numbers are n, and the closed form takes 1."
+        )
+
+    def speed(self) -> str:
+        note = "Each is faster than all that are as good. Beside the picture: its difference from the reference’s."
+        return self._cards("The front of speed", note, "speed", lambda i: f"{1 / self.ratio(i):.2f}× as fast")
+
+    def size(self) -> str:
+        base = self.points[0]["bytes"]
+        note = "Each is smaller than all that are as good; bytes are those of a model file that stores it so."
+        return self._cards("The front of size", note, "size", lambda i: f"{base / self.points[i]['bytes']:.2f}× smaller")
+
+    def _cards(self, title: str, note: str, front: str, gain: Any) -> str:
+        cards = [self._card(None, -1, "ground truth", "")] if -1 in self.pictures else []
+        if 0 not in self.front_of[front]:
+            cards.append(self._card(None, 0, self.name(0), "the reference"))
+        for k, number in enumerate(self.front_of[front]):
+            cards.append(self._card(k + 1, number, self.name(number), gain(number)))
+        ticks = f'<p class="note">Difference: 0<span class="bar" style="background: {color_bar()}"></span>{DIFFERENCE:g} or more.</p>'
+        return _section(title, f'<p class="note">{note}</p>{ticks}<div class="points">{"".join(cards)}</div>')
+
+    def _card(self, place: int | None, number: int, name: str, gain: str) -> str:
+        head = f"{place}. {escape(name)}" if place else escape(name)
+        html = f'<article class="point"><header><span class="gain">{gain}</span><h3>{head}</h3></header>'
+        if number in self.pictures:
+            html += self._pair(self.pictures[number], name)
+        if number < 0:
+            return html + "</article>"
+        point, (size, unit) = self.points[number], byte_size(self.points[number]["bytes"])
+        numbers = (
+            f"{decimal(self.quality(number), 2)} dB ({self.lost(number)}), SSIM {decimal(self.quality(number, 'ssim'), 4)}; "
+            f"{decimal(point.get('ms_per_frame'), 2)} ms, {decimal(point.get('frames_per_second'), 1)} frames/s; {size} {unit}"
+        )
+        return f"{html}<p>{numbers}</p><code>{escape(self.command(point['words']))}</code></article>"
+
+    def _pair(self, picture: Picture, name: str) -> str:
+        images = [picture.image]
+        if picture.against is not None:
+            images.append(torch.from_numpy(error_map(picture.image, picture.against, DIFFERENCE)).float() / 255)
+        drawn = [_inlined(image) for image in images]
+        captions = (escape(name), f"difference of {escape(name)}")
+        return '<div class="pair">' + "".join(_figure(one, text) for one, text in zip(drawn, captions, strict=False)) + "</div>"
+
+    def table(self) -> str:
+        head = "".join(
+            f"<th>{title}</th>"
+            for title in (
+                "point",
+                "time",
+                "±",
+                "ms",
+                "frames/s",
+                "PSNR",
+                "change",
+                "SSIM",
+                "against exact, dB",
+                "bytes",
+                "memory, MB",
+                "rounds",
+            )
+        )
+        marked = set(self.front_of["speed"]) | set(self.front_of["size"])
+        rows = "".join(self._row(i, i in marked) for i in range(len(self.points)))
+        table = f'<div class="scroll"><table class="numbers"><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
+        note = '<p class="note">Time and ± are multiples of the reference’s of the same round; orange: on a front.</p>'
+        return _section(f"All {count(len(self.points))} points", table + note)
+
+    def _row(self, i: int, marked: bool) -> str:
+        p = self.points[i]
+        peak = None if p["peak_bytes"] is None else p["peak_bytes"] / 1e6
+        cells = (
+            *(decimal(p.get("time_ratio"), 3), decimal(self.spread(i), 3) if len(p["ratios"]) > 2 else "–"),
+            *(decimal(p.get("ms_per_frame"), 2), decimal(p.get("frames_per_second"), 1)),
+            *(decimal(self.quality(i), 3), self.lost(i), decimal(self.quality(i, "ssim"), 4), decimal(self.quality(i, "psnr_exact"), 1)),
+            *(count(p["bytes"]), decimal(peak, 1), count(len(p["ms"]))),
+        )
+        kind = ' class="front"' if marked else ""
+        return f"<tr{kind}><th scope=row>{escape(self.name(i))}</th>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+
+    def left_out(self) -> str:
+        rows = "".join(
+            f"<tr><th scope=row>{escape(one['knob'])}</th><td>{escape(' '.join(one['words']))}</td><td>{escape(one['reason'])}</td></tr>"
+            for one in self.record["left_out"]
+        )
+        if not rows:
+            return ""
+        head = "<tr><th>knob</th><th>point</th><th>why</th></tr>"
+        return _section("Not measured", f'<div class="scroll"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>')
+
+    def facts(self) -> str:
+        r, same = self.record, self.record["same"]
+        width, height = same["image_size"]
+        exact = r.get("exact", {})
+        checked = (
+            ""
+            if exact.get("float64", True)
+            else (f"; {decimal(exact['psnr_against_float64'], 0)} dB from float64 at {'×'.join(map(str, exact['checked_size']))}")
+        )
+        pairs = [
+            ("views", ", ".join(same["views"])),
+            ("image size", f"{width}×{height}"),
+            ("exact images", f"{exact.get('drawn_by', '–')}{checked}"),
+            ("backend", r["backend"]),
+            *((name, str(value)) for name, value in same["machine"].items()),
+            *((name, str(value)) for name, value in same["versions"].items()),
+            ("model", same["model"][:16]),
+            *((f"{name} not measured", str(why)) for name, why in r.get("not_measured", {}).items()),
+        ]
+        cells = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in pairs)
+        return _section("Where the numbers come from", f'<dl class="facts">{cells}</dl>')
+
+
+def _inlined(image: Tensor) -> Inlined | None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "picture.png"
+        write_png(path, image)
+        return inline(path)
+
+
+def _figure(picture: Inlined | None, text: str) -> str:
+    if picture is None:
+        return ""
+    kind = ' class="pixelated"' if picture.width < PIXELATED_BELOW else ""
+    return f'<figure><img src="{picture.url}" width="{picture.width}" height="{picture.height}" alt="{text}"{kind}></figure>'
+
+
+def _section(title: str, body: str) -> str:
+    return f"<section><h2>{title}</h2>{body}</section>\n"

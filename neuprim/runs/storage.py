@@ -1,0 +1,81 @@
+"""How a model's numbers may be stored, and what comes back of them: the one table of formats. A new one is a row here.
+
+A model file of neuprim holds float32. What it would be otherwise is tried in memory: values are rounded to what the format brings back, and
+its bytes are counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neuprim.core.errors import ConfigError
+from neuprim.core.model.geometry import GEOMETRY_SPECS
+from neuprim.core.model.primitives import Primitives
+
+__all__ = ["ALL", "FORMATS", "FULL", "GROUPS", "Format", "parameters_of", "rounded", "stored_bytes"]
+
+
+@dataclass(frozen=True)
+class Format:
+    """One way to store a tensor.
+
+    Attributes:
+        summary: one line for messages.
+        round: what is read back of an (N, ...) float32 tensor, of the same type and shape.
+        bytes: of a tensor so stored.
+    """
+
+    summary: str
+    round: Callable[[Tensor], Tensor]
+    bytes: Callable[[Tensor], int]
+
+
+FULL = "float32"
+"""What model files hold."""
+
+FORMATS: Mapping[str, Format] = {
+    FULL: Format("32-bit floats, as model files hold them", lambda value: value, lambda value: 4 * value.numel()),
+    "float16": Format("16-bit floats, 11 bits of precision", lambda value: value.half().float(), lambda value: 2 * value.numel()),
+}
+
+
+GROUPS = ("means", "shape", "density", "colour")
+"""Of parameters: the centres, the other numbers of the ellipsoids, and those of both fields."""
+
+ALL = "all"
+"""In words: every group."""
+
+
+def parameters_of(model: Primitives, group: str) -> tuple[str, ...]:
+    """Names of a group's parameters."""
+    if group == "means":
+        return ("means",)
+    if group == "shape":
+        return tuple(spec.name for spec in GEOMETRY_SPECS if spec.name != "means")
+    return tuple(spec.name for spec in (model.density if group == "density" else model.colour).parameters())
+
+
+def rounded(model: Primitives, stored: Mapping[str, str]) -> Primitives:
+    """The model as it is read back when groups are stored in formats; itself if all are as they are.
+
+    Raises:
+        ConfigError: a value is beyond what its format holds.
+    """
+    if all(name == FULL for name in stored.values()):
+        return model
+    params = dict(model.params)
+    for group, name in stored.items():
+        for parameter in parameters_of(model, group):
+            params[parameter] = FORMATS[name].round(params[parameter].detach())
+            if not bool(torch.isfinite(params[parameter]).all()):
+                raise ConfigError(f"store.{group}={name}: {parameter} has values that {name} does not hold")
+    return Primitives(model.density, model.colour, params)
+
+
+def stored_bytes(model: Primitives, stored: Mapping[str, str]) -> int:
+    """Bytes of the model's tensors, each group in its format."""
+    return sum(FORMATS[stored.get(group, FULL)].bytes(model.params[name]) for group in GROUPS for name in parameters_of(model, group))

@@ -1,0 +1,204 @@
+"""Fields that do with less of something: what stays is as it was, and as close to the whole as it can be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera, look_at
+from neuprim.core.model.colours import sh
+from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity, cosine_density
+from neuprim.core.model.densities.fewer import fewer_neurons, smaller_counts
+from neuprim.core.model.densities.gaussian import GaussianDensity
+from neuprim.core.model.fields import Field
+from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import InitContext
+from neuprim.tasks.dynamic.colour import TimeHarmonics
+from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.relight.colour import LightNetwork
+from neuprim.tasks.relight.harmonics import LightHarmonics
+from neuprim.tasks.static.fields import SphericalHarmonics
+
+COUNT = 40
+CONDITIONS = {"time": torch.tensor(0.3), "light": torch.tensor([2.0, 1.0, 3.0]), "light_intensity": torch.tensor(1.0)}
+
+
+def camera() -> Camera:
+    view = look_at(torch.tensor([0.0, -3.0, 0.5]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    return Camera(view, 20.0, 20.0, 8.0, 8.0, 16, 16)
+
+
+def made(density: Field, colour: Field, noise: float = 0.3, seed: int = 1) -> Primitives:
+    """A model of both fields with every number moved, so that nothing is at a start value that hides a mistake."""
+    generator = torch.Generator().manual_seed(seed)
+    means = torch.rand((COUNT, 3), generator=generator) - 0.5
+    context = InitContext(means, torch.full((COUNT,), 0.3), torch.rand((COUNT, 3), generator=generator), generator)
+    specs = [*GEOMETRY_SPECS, *density.parameters(), *colour.parameters()]
+    moved = {s.name: s.init(context).float() for s in specs}
+    return Primitives(
+        density,  # type: ignore[arg-type]
+        colour,  # type: ignore[arg-type]
+        {name: value + noise * torch.randn(value.shape, generator=generator) for name, value in moved.items()},
+    )
+
+
+PAIRS = [
+    (CosineDensity(8, edge=2, gain=True), SphericalHarmonics(3)),
+    (TimeDensity(6, "phase+offset+window+motion"), TimeHarmonics(2)),
+    (CosineDensity(5), LightHarmonics(4)),
+    (GaussianDensity(), LightNetwork(4, visibility="none")),
+]
+
+
+def reduced(model: Primitives) -> Iterator[tuple[str, str, int, Primitives]]:
+    for kind in ("density", "colour"):
+        field = getattr(model, kind)
+        for name, values in field.reductions().items():
+            for value in values:
+                fewer, tensors = field.reduced(model.of(field), model.geometry, name, value)
+                own = {spec.name for spec in field.parameters()}
+                others = {key: tensor for key, tensor in model.params.items() if key not in own}
+                fields = (fewer, model.colour) if kind == "density" else (model.density, fewer)
+                yield kind, name, value, Primitives(*fields, {**others, **tensors})
+
+
+@pytest.mark.parametrize(("density", "colour"), PAIRS, ids=lambda field: type(field).__name__)
+def test_every_reduction_is_a_model_that_can_be_stored_and_drawn(density: Field, colour: Field) -> None:
+    model = made(density, colour)
+    found = list(reduced(model))
+    for kind, name, value, smaller in found:
+        field = getattr(smaller, kind)
+        assert field.settings()[name] == value, (kind, name)
+        again = type(field)(**field.settings())
+        assert [(s.name, s.shape) for s in again.parameters()] == [(s.name, s.shape) for s in field.parameters()]
+        assert smaller.parameters_per_primitive < model.parameters_per_primitive
+        smaller.lower(camera(), CONDITIONS).check()
+        values = getattr(model, kind).reductions()[name]
+        assert values == tuple(sorted(values, reverse=True)) and all(v < getattr(model, kind).settings()[name] for v in values)
+    offered = {(kind, name) for kind, name, _, _ in found}
+    assert offered == {(kind, name) for kind in ("density", "colour") for name in getattr(model, kind).reductions()}
+
+
+def test_what_has_nothing_to_spare_offers_nothing() -> None:
+    assert GaussianDensity().reductions() == {} == LightNetwork(4).reductions()
+    assert SphericalHarmonics(0).reductions() == {} == CosineDensity(0).reductions()
+    with pytest.raises(NotImplementedError, match="GaussianDensity"):
+        GaussianDensity().reduced({}, made(*PAIRS[3]).geometry, "neurons", 1)
+
+
+# ---------------------------------------------------------------- bands
+
+
+def test_dropped_bands_are_the_basis_cut_off() -> None:
+    model = made(*PAIRS[0])
+    field, params = SphericalHarmonics(3).reduced(model.of(model.colour), model.geometry, "degree", 1)
+    origin = camera().position
+    seen = field.lower(params, model.geometry, camera(), {}).rgb
+    whole = sh.colors(model.params["means"], model.params["sh_dc"], model.params["sh_rest"], origin, 1)
+    assert torch.equal(seen, whole) and params["sh_rest"].shape == (COUNT, 3, 3)
+
+
+# ---------------------------------------------------------------- neurons
+
+
+def test_counts() -> None:
+    assert (
+        smaller_counts(8) == (6, 4, 2, 0) and smaller_counts(2) == (1, 0) and smaller_counts(1) == (0,) and smaller_counts(3) == (2, 1, 0)
+    )
+
+
+def inside(geometry: Geometry, count: int, generator: torch.Generator) -> Tensor:
+    """(N, count, 3) points, uniform in each ellipsoid."""
+    y = torch.randn((geometry.count, count, 3), generator=generator, dtype=torch.float64)
+    y = y / y.norm(dim=-1, keepdim=True) * torch.rand((geometry.count, count, 1), generator=generator, dtype=torch.float64) ** (1 / 3)
+    return (
+        geometry.means.double()[:, None]
+        + (geometry.rotations.double()[:, None] @ (geometry.scales.double()[:, None] * y)[..., None])[..., 0]
+    )
+
+
+def sigma(model: Primitives, x: Tensor) -> Tensor:
+    """(N, count) densities."""
+    n, count, _ = x.shape
+    form = model.density.lower(model.of(model.density), model.geometry, CONDITIONS)
+    wide = Geometry(*(t.double() for t in (model.params["means"], model.params["log_scales"], model.params["quats"])))
+    prim = torch.arange(n).repeat_interleave(count)
+    return cosine_density(form, wide, prim, x.reshape(-1, 3)).reshape(n, count)
+
+
+def test_dropped_neurons_leave_their_mean_and_those_that_stay_matter_most() -> None:
+    model = made(CosineDensity(8), SphericalHarmonics(0), noise=0.05)
+    model.params["log_scales"] += torch.tensor([0.0, -0.7, 0.4])
+    x = inside(model.geometry, 4000, torch.Generator().manual_seed(2))
+    whole = sigma(model, x)
+    for keep in (6, 4, 2, 0):
+        params = fewer_neurons(model.of(model.density), model.geometry, keep, OMEGA0)
+        smaller = Primitives(CosineDensity(keep), model.colour, {**model.params, **params})
+        left = sigma(smaller, x)
+        scale = whole.std(1)
+        assert ((left - whole).mean(1) / scale).abs().max() < 0.1, "the mean over the ellipsoid stays, but for sampling"
+        first = {name: model.params[name][:, :keep] for name in ("b1", "w2")} | {"W1": model.params["W1"][:, :keep]}
+        naive = Primitives(CosineDensity(keep), model.colour, {**model.params, **first})
+        assert (left - whole).square().mean() < (0.8 if keep else 1.0) * (sigma(naive, x) - whole).square().mean()
+
+
+def test_all_neurons_are_the_model_itself() -> None:
+    model = made(CosineDensity(4), SphericalHarmonics(0))
+    params = fewer_neurons(model.of(model.density), model.geometry, 4, OMEGA0)
+    assert all(torch.equal(params[name], model.params[name]) for name in params)
+
+
+def test_means_of_phases_that_advance_are_those_over_the_sequence() -> None:
+    model = made(TimeDensity(3, "phase"), SphericalHarmonics(0), noise=0.02)
+    model.params["W_t"] *= 3
+    x = inside(model.geometry, 1500, torch.Generator().manual_seed(2))
+    params = fewer_neurons(model.of(model.density), model.geometry, 0, OMEGA0)
+    form = [
+        TimeDensity(3, "phase").lower(model.of(model.density), model.geometry, {"time": torch.tensor(t)})
+        for t in torch.linspace(0, 1, 41).tolist()
+    ]
+    prim = torch.arange(COUNT).repeat_interleave(1500)
+    wide = Geometry(*(t.double() for t in (model.params["means"], model.params["log_scales"], model.params["quats"])))
+    weights = torch.ones(41, dtype=torch.float64)
+    weights[0] = weights[-1] = 0.5
+    mean = (
+        sum(w * cosine_density(f, wide, prim, x.reshape(-1, 3)).reshape(COUNT, -1).mean(1) for w, f in zip(weights, form, strict=True)) / 40
+    )
+    amplitude = model.params["w2"].abs().sum(1) / model.geometry.length_scale
+    assert ((mean * model.geometry.length_scale - params["b2"][:, 0]).abs() / amplitude.clamp_min(1e-6)).median() < 0.05
+
+
+# ---------------------------------------------------------------- time
+
+
+@pytest.mark.parametrize("name", ["powers", "waves"])
+def test_fewer_terms_in_time_are_closer_than_terms_cut_off(name: str) -> None:
+    model = made(*PAIRS[1])
+    colour = model.colour
+    assert isinstance(colour, TimeHarmonics)
+    whole = model.of(colour)
+    field, params = colour.reduced(whole, model.geometry, name, 2)
+    cut = TimeHarmonics(**{**colour.settings(), name: 2})
+    rows = {"time_poly": 2} if name == "powers" else {"time_cos": 2, "time_sin": 2}
+    naive = {key: value[:, : rows[key]] if key in rows else value for key, value in whole.items()}
+    fitted = plain = 0.0
+    for time in torch.linspace(0.01, 0.99, 50):
+        there, _ = colour.harmonics(whole, {"time": time})
+        fitted += float((field.harmonics(params, {"time": time})[0] - there).square().mean())
+        plain += float((cut.harmonics(naive, {"time": time})[0] - there).square().mean())
+    assert fitted < 0.5 * plain
+
+
+def test_no_terms_in_time_leave_the_mean_over_the_sequence() -> None:
+    model = made(*PAIRS[1])
+    colour = model.colour
+    assert isinstance(colour, TimeHarmonics)
+    field, params = colour.reduced(model.of(colour), model.geometry, "powers", 0)
+    field, params = field.reduced(params, model.geometry, "waves", 0)
+    times = torch.linspace(0, 1, 401)
+    mean = torch.stack([colour.harmonics(model.of(colour), {"time": t})[0] for t in times]).mean(0)
+    assert torch.allclose(field.harmonics(params, CONDITIONS)[0], mean, atol=5e-3)

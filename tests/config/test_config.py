@@ -372,18 +372,17 @@ def test_impossible_settings_in_a_file(toy: Path, old: str, new: str, text: str)
 # ---------------------------------------------------------------- the static task's files
 
 
-@pytest.mark.parametrize("preset", ["quick", "photographs", "paper", "paper_real", "paper_200", "paper_5k"])
+@pytest.mark.parametrize("preset", ["quick", "paper", "paper_real", "paper_200", "paper_5k"])
 @pytest.mark.parametrize("scene", ["solids", "room", "mesh", "blender", "nerfstudio", "colmap"])
 def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str, scene: str) -> None:
     monkeypatch.chdir(tmp_path)
     path = [] if scene in ("solids", "room") else ["scene.path=data"]
     c = compose([f"scene={scene}", f"preset={preset}", *path])
     assert (c.task, c.scene_name, c.preset) == ("static", scene, preset)
-    gain = {"log_gain"} if preset in ("quick", "photographs") else set()
+    gain = {"log_gain"} if preset == "quick" else set()
     assert set(c.train.rates) == {"means", "log_scales", "quats", "W1", "b1", "w2", "b2", "sh_dc", "sh_rest"} | gain
     strategies = {
         "quick": "relocate",
-        "photographs": "relocate",
         "paper": "gradient",
         "paper_real": "gradient",
         "paper_200": "fixed",

@@ -17,7 +17,7 @@ from neuprim.core.compute import device
 from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.ssim_torch import photometric_torch
 
-__all__ = ["compressed", "l1", "photometric", "photometric_reference", "relative", "scale_anisotropy", "seen_size"]
+__all__ = ["compressed", "l1", "photometric", "photometric_reference", "relative", "scale_anisotropy"]
 
 _MU = 16.0
 _DARK = 0.05
@@ -90,18 +90,3 @@ def scale_anisotropy(log_scales: Tensor) -> Tensor:
     """mean over primitives of std over axes of s / min s (the authors' regulariser); 0 for spheres."""
     ratio = (log_scales - log_scales.min(dim=-1, keepdim=True).values).exp()
     return ratio.std(dim=-1).mean()
-
-
-def seen_size(means: Tensor, log_scales: Tensor, eye: Tensor) -> Tensor:
-    """mean over primitives and axes of semi-axis / distance to the eye, at most 1 each: how large a primitive looks.
-
-    Every pixel pays for every primitive before it, and what is large without need veils what is behind it.
-
-    Args:
-        means, log_scales: (N, 3); gradients go to the latter alone, as a primitive is to shrink and not to flee.
-        eye: (3,) position of the camera.
-    """
-    scales = log_scales.exp()
-    with torch.no_grad():
-        distance = torch.maximum((means - eye.to(means)).norm(dim=-1), scales.max(dim=-1).values)[:, None]
-    return (scales / distance).mean()

@@ -99,8 +99,6 @@ class TrainSettings:
         coarse: factor by which training views are reduced at first; 1 for none. It is halved, rounded down, until
             ``coarse_until``, a fraction of the budget, from which on views are as they are.
         angular_size: no primitive's largest semi-axis is more than this share of its distance to the nearest training camera; null for no limit.
-        size_weight: weight of the mean semi-axis over distance to the camera of the view (:func:`~neuprim.core.train.losses.seen_size`): primitives
-            that are as small as their pixels let them be, which are faster to draw and veil less; 0 for none.
         exposure_rate: learning rate of a gain per training view and channel, for photographs that are not exposed alike, per step in
             which a view is seen; 0 for none. Held-out views are drawn with the training views' mean gain.
         final_rate: the rates decay exponentially to this fraction of themselves at the end of the budget; 1 is constant.
@@ -126,7 +124,6 @@ class TrainSettings:
     coarse: Annotated[int, Range(1, 64)] = 1
     coarse_until: Share = 0.3
     angular_size: Annotated[float, Range(above=0)] | None = None
-    size_weight: NotNegative = 0.0
     exposure_rate: NotNegative = 0.0
     max_seconds: Annotated[float, Range(above=0, says="a positive number of seconds")] | None = None
     rates: dict[str, NotNegative] = field(default_factory=dict)

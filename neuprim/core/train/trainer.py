@@ -31,7 +31,7 @@ from neuprim.core.train.ahead import Ahead
 from neuprim.core.train.angle import AngularSize
 from neuprim.core.train.coarse import reduced, reduction
 from neuprim.core.train.exposure import Exposures
-from neuprim.core.train.losses import scale_anisotropy, seen_size
+from neuprim.core.train.losses import scale_anisotropy
 from neuprim.core.train.optimizer import RowAdam
 from neuprim.core.train.points import PointStep, point_step
 from neuprim.core.train.population import Change, make_population
@@ -236,9 +236,6 @@ class Trainer:
         if pixels.mask is not None:
             rgb = torch.where(pixels.mask[..., None], rgb, truth)
         loss, parts = self.loss(rgb, truth, Supervision(view, pixels.mask, pixels.alpha, progress))
-        if self.settings.size_weight > 0:
-            params = self.model.params
-            loss = loss + self.settings.size_weight * seen_size(params["means"], params["log_scales"], view.camera.position)
         with torch.no_grad():
             difference = rgb - truth
             channels = difference.shape[-1]

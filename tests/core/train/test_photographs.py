@@ -16,7 +16,6 @@ from neuprim.core.train import coarse
 from neuprim.core.train.angle import AngularSize
 from neuprim.core.train.coarse import reduced, reduction
 from neuprim.core.train.exposure import Exposures
-from neuprim.core.train.losses import seen_size
 from neuprim.core.train.trainer import Trainer
 from tests.core import tiny
 
@@ -171,26 +170,3 @@ def test_a_training_keeps_the_limit(plain: Dataset) -> None:
     distance = torch.cdist(trainer.model.params["means"].detach(), eyes).min(1).values
     size = trainer.model.params["log_scales"].detach().max(1).values.exp()
     assert float((size / distance).max()) <= 0.02 * math.exp(0.7), "a few steps may have passed since the last look"
-
-
-def test_the_size_that_is_seen_is_an_angle_at_most_one() -> None:
-    eye = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    means = torch.tensor([[1.0, 2.0, 7.0], [1.0, 2.0, 3.0]], requires_grad=True)
-    log_scales = torch.tensor([[0.1, 0.2, 0.4], [0.5, 0.25, 1.0]]).log().requires_grad_()
-    seen = seen_size(means, log_scales, eye)
-    assert seen.item() == pytest.approx(((0.1 + 0.2 + 0.4) / 4 + 0.5 + 0.25 + 1.0) / 6, rel=1e-6), "4 away; and around the camera"
-    seen.backward()
-    assert means.grad is None, "a primitive is to shrink, not to flee"
-    assert log_scales.grad is not None and torch.allclose(log_scales.grad[0], torch.tensor([0.1, 0.2, 0.4]) / 4 / 6)
-    larger = seen_size(3 * means, log_scales + math.log(3.0), 3 * eye)
-    assert larger.item() == pytest.approx(seen.item(), rel=1e-6), "whatever the unit of length"
-
-
-def test_a_weight_on_the_size_that_is_seen_makes_primitives_smaller(plain: Dataset) -> None:
-    sizes = []
-    for weight in (0.0, 0.3):
-        trainer = tiny.trainer(plain, 40, size_weight=weight)
-        for _ in trainer.run():
-            pass
-        sizes.append(trainer.model.params["log_scales"].detach().mean().item())
-    assert sizes[1] < sizes[0] - 0.1

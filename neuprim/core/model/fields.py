@@ -108,6 +108,14 @@ class Field(ABC):
         """
         return dict(params)
 
+    def folded(self, params: Params) -> dict[str, Tensor]:
+        """The same field in numbers that lie as close together as they can, for files where each has few bits.
+
+        Where several sets of numbers mean the same field, as with the sign of a cosine's argument, one of them. Images may change by
+        rounding alone; folding what is folded changes no bit.
+        """
+        return dict(params)
+
 
 class DensityField(Field):
     """How much light a point absorbs.

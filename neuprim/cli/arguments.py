@@ -1,4 +1,4 @@
-"""Values of command-line flags, from their text; and the flags of ``bench``, which are many."""
+"""Values of command-line flags, from their text; and the flags of commands that have many."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import re
 from pathlib import Path
 
-__all__ = ["count", "for_bench", "numbers", "rate", "row", "size"]
+__all__ = ["count", "for_bench", "for_compress", "numbers", "rate", "row", "size"]
 
 
 def for_bench(parser: argparse.ArgumentParser) -> None:
@@ -22,6 +22,16 @@ def for_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", type=count, default=1, metavar="N", help="runs of each, with seeds from 0 (default: 1)")
     parser.add_argument("--out", type=Path, default=Path("outputs/paper"), metavar="DIR", help="gets a run directory each")
     parser.add_argument("--estimate", action="store_true", help="only say what would run, and for how long")
+
+
+def for_compress(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of ``neuprim compress``."""
+    parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    parser.add_argument("--level", type=count, default=3, metavar="1-5", help="1 keeps nearly everything, 5 very little (default: 3)")
+    words = "bits of a parameter, or of all others, over the level's: means=16 sh_rest=6,5 others=8"
+    parser.add_argument("--bits", nargs="+", default=[], metavar="NAME=BITS", help=words)
+    parser.add_argument("--out", "--output", type=Path, metavar="FILE", help="where to write (default: RUN_DIR/model.neuprim)")
+    parser.add_argument("--force", action="store_true", help="replace a file that exists")
 
 
 def size(text: str) -> tuple[int, int]:

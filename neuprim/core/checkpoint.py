@@ -102,8 +102,8 @@ def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any
 
 def save_compressed(
     path: Path, model: Primitives, task: str, extra: Mapping[str, Any], table: compressed.BitTable, config: str | None = None
-) -> dict[str, int]:
-    """As :func:`save_model`, in few bits; returns the bytes in the file of every parameter.
+) -> dict[str, compressed.Stored]:
+    """As :func:`save_model`, in few bits; returns what the file has of every parameter.
 
     Args:
         table: how many.
@@ -113,11 +113,13 @@ def save_compressed(
         CheckpointError: numbers that cannot be stored, or the file could not be written; names it and the reason.
     """
     model = compressed.folded(model)
-    sections = compressed.encode(model, compressed.schemes(model, table))
+    schemes = compressed.schemes(model, table)
+    sections = compressed.encode(model, schemes)
     if config is not None:
-        sections.insert(0, compressed.Section(compressed.CONFIG, compressed.TEXT, (), config.encode()))
+        sections.insert(0, compressed.Section(compressed.CONFIG, compressed.TEXT, (), planes=(config.encode(),)))
     header = {"format": FORMAT, "kind": "model", **_model_header(model, task, extra)}
-    return compressed.write_compressed(path, header, model.count, sections)
+    sizes = compressed.write_compressed(path, header, model.count, sections)
+    return {name: compressed.Stored(compressed.bits_in_words(scheme), sizes[name]) for name, scheme in schemes.items()}
 
 
 def stored_config(path: Path) -> str | None:

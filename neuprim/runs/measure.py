@@ -34,7 +34,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, choose, render
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import clips_of, diagnosed, judged, mask_of
-from neuprim.runs.open import LOGS, load_dataset, load_run, placed
+from neuprim.runs.open import LOGS, load_dataset, load_run, model_file, placed
 from neuprim.version import __version__
 
 __all__ = ["ViewMetrics", "draw", "draw_sum", "evaluate_run", "measure", "summary"]
@@ -168,7 +168,7 @@ def evaluate_run(run_dir: Path, lpips: str | Path | None = None) -> dict[str, An
         dataset = load_dataset(config, task, run_dir=run_dir)
         suspects.know(dataset)
         check_dataset(dataset, task.conditions)
-        path = run_dir / "model.safetensors"
+        path = model_file(run_dir)
         training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
         channels = channels_of(task, dataset)
         model = placed(model, config.renderer, dataset.test.view(0))

@@ -81,7 +81,9 @@ def _numbers(word: str, text: str, name: str) -> tuple[int, ...]:
     low, high = (LEAST_BITS, 16) if name == "quats" else (1, MOST_BITS if name == "means" else 16)
     several = name not in ("means", "quats", OTHERS)
     parts = text.split(",")
-    if any(not p.isascii() or not p.isdigit() or len(p) > 2 or not low <= int(p) <= high for p in parts) or (len(parts) > 1 and not several):
+    if any(not p.isascii() or not p.isdigit() or len(p) > 2 or not low <= int(p) <= high for p in parts) or (
+        len(parts) > 1 and not several
+    ):
         more = "; several, as 7,6,5, for the bands of spherical harmonics" if several else ""
         raise ConfigError(f"--bits {word}: expected {low} to {high}{more}")
     return tuple(map(int, parts))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,10 +19,19 @@ from neuprim.core.errors import CheckpointError, FormError
 from neuprim.core.model.checks import method
 from neuprim.core.model.primitives import Primitives
 
-__all__ = ["Schemes", "encode", "folded", "rounded", "schemes"]
+__all__ = ["Schemes", "Stored", "bits_in_words", "encode", "folded", "rounded", "schemes"]
 
 Schemes = dict[str, Columns | Rotations]
 """Parameter -> how its numbers are coded."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a file has of a parameter: bits of a number, as text, and bytes."""
+
+    bits: str
+    size: int
+
 
 _SPIKY = 12.0
 """Columns whose error is more times the usual one than this get twice the bits: a few of their numbers lie far from all others."""
@@ -96,7 +106,7 @@ def encode(model: Primitives, made: Schemes) -> list[Section]:
         scheme = made[spec.name]
         coding = ROTATIONS if isinstance(scheme, Rotations) else POSITIONS if spec.name == "means" else COLUMNS
         rows = model.params[spec.name].reshape(model.count, spec.size)[torch.from_numpy(order)]
-        sections.append(Section(spec.name, coding, spec.shape, pack(coding, scheme, scheme.codes(rows).numpy())))
+        sections.append(pack(spec.name, spec.shape, scheme, scheme.codes(rows).numpy(), coding))
     return sections
 
 
@@ -106,3 +116,9 @@ def rounded(params: Mapping[str, Tensor], made: Schemes) -> dict[str, Tensor]:
     For training that knows what will be stored: the schemes are fixed meanwhile, and numbers beyond a column's ends come back as the end.
     """
     return {name: made[name].rounded(x.reshape(len(x), math.prod(x.shape[1:]))).reshape(x.shape) for name, x in params.items()}
+
+
+def bits_in_words(scheme: Columns | Rotations) -> str:
+    """``"7"``, ``"6 to 8"`` of several columns."""
+    bits = sorted({scheme.bits} if isinstance(scheme, Rotations) else set(scheme.bits.tolist()))
+    return " to ".join(map(str, bits if len(bits) < 2 else (bits[0], bits[-1])))

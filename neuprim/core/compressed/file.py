@@ -11,14 +11,15 @@ import json
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import zstandard
 from torch import Tensor
 
-from neuprim.core.compressed.sections import CODINGS, MOST_TEXT, POSITIONS, ROTATIONS, TEXT, Damaged, Section, least_and_most, unpack
+from neuprim.core.compressed.packing import packed_planes
+from neuprim.core.compressed.sections import CODINGS, MOST_TEXT, POSITIONS, ROTATIONS, TEXT, Damaged, Section, plane_count, unpack
 from neuprim.core.errors import CheckpointError
 from neuprim.core.io.files import atomic_path
 
@@ -32,8 +33,8 @@ CONFIG = "config.yaml"
 MOST_TIMES = 64
 """Bytes in float32 for each byte of the file, beyond the first MiB of them."""
 
-_LEVEL = 19
 _PLAIN, _ZSTD = 0, 1
+_MOST_PLANES = 3  # of a column's codes
 _START = struct.Struct("<IIQIII")  # version, sections, primitives, bytes of header and table, their check sum
 _SIZES = struct.Struct("<QQI")
 _MOST_HEADER, _MOST_TABLE, _MOST_SECTIONS, _MOST_DIMENSIONS, _MOST_COLUMNS, _MOST_PRIMITIVES = (
@@ -44,7 +45,7 @@ _MOST_HEADER, _MOST_TABLE, _MOST_SECTIONS, _MOST_DIMENSIONS, _MOST_COLUMNS, _MOS
 
 @dataclass(frozen=True)
 class _Entry:
-    """A row of the table: a section, the size of its content, how it is stored, in how many bytes, and their check sum."""
+    """A row of the table: a section without its bytes; those of its planes, how they are stored, the bytes of it all, and their check sum."""
 
     section: Section
     content: int
@@ -78,17 +79,19 @@ def write_compressed(path: Path, header: Mapping[str, Any], count: int, sections
     text = json.dumps(header, allow_nan=False).encode()
     if len(text) > _MOST_HEADER:
         raise CheckpointError(f"{path}: the header has {len(text)} bytes; at most {_MOST_HEADER} can be stored")
-    if any(s.coding == TEXT and len(s.content) > MOST_TEXT for s in sections):
+    if any(s.coding == TEXT and sum(map(len, s.planes)) > MOST_TEXT for s in sections):
         raise CheckpointError(f"{path}: {CONFIG} has more than {MOST_TEXT} bytes, which is the most that can be stored")
-    packer = zstandard.ZstdCompressor(level=_LEVEL, write_content_size=True)
-    stored = [packer.compress(s.content) for s in sections]
-    stored = [made if len(made) < len(s.content) else s.content for made, s in zip(stored, sections, strict=True)]
+    plain = [b"".join(s.planes) for s in sections]
+    packed = [packed_planes(s.planes) for s in sections]
     numbers = count * sum(s.columns for s in sections if s.coding != TEXT)
-    for i in sorted(range(len(sections)), key=lambda i: len(stored[i]) - len(sections[i].content)):
-        if _allowed(numbers, sum(map(len, stored))):
+    for i in sorted(range(len(sections)), key=lambda i: len(packed[i]) - len(plain[i])):
+        if _allowed(numbers, sum(map(len, packed))):
             break
-        stored[i] = sections[i].content  # a model of next to nothing, such as all zeros, would look like a bomb
-    table = b"".join(_entry(s, data) for s, data in zip(sections, stored, strict=True))
+        packed[i] = plain[i]  # a model of next to nothing, such as all zeros, would look like a bomb
+    packings = [_PLAIN if len(a) == len(b) else _ZSTD for a, b in zip(packed, plain, strict=True)]
+    stored = [s.head + data for s, data in zip(sections, packed, strict=True)]
+    rows = zip(sections, packings, plain, stored, strict=True)
+    table = b"".join(_entry(section, packing, len(content), data) for section, packing, content, data in rows)
     start = _START.pack(VERSION, len(sections), count, len(text), len(table), 0)[:-4]
     try:
         with atomic_path(path) as temporary, open(temporary, "wb") as file:
@@ -99,11 +102,10 @@ def write_compressed(path: Path, header: Mapping[str, Any], count: int, sections
     return {s.name: len(data) for s, data in zip(sections, stored, strict=True)}
 
 
-def _entry(section: Section, data: bytes) -> bytes:
+def _entry(section: Section, packing: int, content: int, data: bytes) -> bytes:
     name = section.name.encode()
-    packing = _PLAIN if data is section.content else _ZSTD
     dimensions = struct.pack(f"<BBB{len(section.shape)}I", section.coding, packing, len(section.shape), *section.shape)
-    return bytes([len(name)]) + name + dimensions + _SIZES.pack(len(section.content), len(data), zlib.crc32(data))
+    return bytes([len(name)]) + name + dimensions + _SIZES.pack(content, len(data), zlib.crc32(data))
 
 
 def _allowed(numbers: int, size: int) -> bool:
@@ -145,12 +147,17 @@ def read_compressed(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], str 
         for entry in head.entries:
             section = entry.section
             try:
-                content = _content(file.read(entry.stored), entry)
-                whole = Section(section.name, section.coding, section.shape, content)
+                data = file.read(entry.stored)
+                if zlib.crc32(data) != entry.checksum:
+                    raise Damaged(f"its check sum is {zlib.crc32(data):08x}; expected {entry.checksum:08x}")
+                section = replace(section, head=data[: section.head_size])
+                if section.coding != TEXT and entry.content != (wanted := head.count * plane_count(section)):
+                    raise Damaged(f"its planes have {entry.content} bytes; expected {wanted}")
+                content = _content(data[section.head_size :], entry)
                 if section.coding == TEXT:
                     config = content.decode("utf-8")
                 else:
-                    tensors[section.name] = unpack(whole, head.count)
+                    tensors[section.name] = unpack(section, content, head.count)
             except (Damaged, UnicodeDecodeError) as error:
                 raise CheckpointError(f"{path}: section {section.name!r} is damaged: {error}") from error
     return head.header, tensors, config
@@ -166,8 +173,6 @@ def _opened(path: Path) -> BinaryIO:
 
 
 def _content(data: bytes, entry: _Entry) -> bytes:
-    if zlib.crc32(data) != entry.checksum:
-        raise Damaged(f"its check sum is {zlib.crc32(data):08x}; expected {entry.checksum:08x}")
     if entry.packing == _PLAIN:
         return data
     try:
@@ -244,7 +249,7 @@ def _named(name: str, coding: int, shape: tuple[int, ...], others: Sequence[str]
         raise Damaged(f"section {name!r} is there twice")
     if coding not in CODINGS:
         raise Damaged(f"section {name!r} has coding {coding}; expected {', '.join(f'{k} ({v})' for k, v in CODINGS.items())}")
-    section, wanted = Section(name, coding, shape, b""), {TEXT: (), POSITIONS: (3,), ROTATIONS: (4,)}.get(coding, shape)
+    section, wanted = Section(name, coding, shape), {TEXT: (), POSITIONS: (3,), ROTATIONS: (4,)}.get(coding, shape)
     if shape != wanted:
         raise Damaged(f"section {name!r} of {CODINGS[coding]} has shape {shape}; expected {wanted}")
     if (coding == TEXT) != (name == CONFIG):
@@ -255,14 +260,18 @@ def _named(name: str, coding: int, shape: tuple[int, ...], others: Sequence[str]
 
 
 def _check(entry: _Entry, count: int) -> None:
-    section = entry.section
-    least, most = least_and_most(section.coding, section.columns, count)
-    if not least <= entry.content <= most:
-        raise Damaged(f"section {section.name!r} has a content of {entry.content} bytes; expected {least} to {most} of {count} primitives")
+    """That sizes are possible; that they fit is seen when the section's head is read."""
+    section, head = entry.section, entry.section.head_size
+    most = MOST_TEXT if section.coding == TEXT else _MOST_PLANES * count * section.columns
+    if entry.content > most:
+        raise Damaged(f"section {section.name!r} has planes of {entry.content} bytes; expected at most {most} of {count} primitives")
     if entry.packing not in (_PLAIN, _ZSTD):
         raise Damaged(f"section {section.name!r} has packing {entry.packing}; expected {_PLAIN} (plain) or {_ZSTD} (zstd)")
-    if entry.packing == _PLAIN and entry.stored != entry.content:
-        raise Damaged(f"section {section.name!r} is stored plainly in {entry.stored} bytes; expected {entry.content}")
+    least = head + (entry.content if entry.packing == _PLAIN else 0)
+    if entry.stored < least or (entry.packing == _PLAIN and entry.stored != least):
+        raise Damaged(
+            f"section {section.name!r} is stored in {entry.stored} bytes; expected {least}" + " or more" * (entry.packing == _ZSTD)
+        )
 
 
 def _fit(entries: Sequence[_Entry], count: int, size: int, left: int) -> None:

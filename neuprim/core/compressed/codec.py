@@ -19,7 +19,7 @@ from neuprim.core.errors import CheckpointError, FormError
 from neuprim.core.model.checks import method
 from neuprim.core.model.primitives import Primitives
 
-__all__ = ["Schemes", "Stored", "bits_in_words", "encode", "folded", "rounded", "schemes"]
+__all__ = ["Schemes", "Stored", "bits_in_words", "encode", "file_order", "folded", "rounded", "schemes"]
 
 Schemes = dict[str, Columns | Rotations]
 """Parameter -> how its numbers are coded."""
@@ -58,7 +58,7 @@ def folded(model: Primitives) -> Primitives:
     for name, value in params.items():
         if value.dtype != torch.float32:
             raise CheckpointError(f"parameter {name} is {value.dtype}; only torch.float32 can be compressed")
-        bad = ~torch.isfinite(value).reshape(len(value), -1).all(1)
+        bad = ~torch.isfinite(value).reshape(len(value), math.prod(value.shape[1:])).all(1)
         if name == "quats":
             bad |= (value == 0).all(1)
         if bool(bad.any()):
@@ -96,16 +96,21 @@ def _positions(model: Primitives, x: Tensor, bits: int, exact: bool) -> Columns:
     return fit_columns(x, [bits] * 3, clips=(0.0,))
 
 
-def encode(model: Primitives, made: Schemes) -> list[Section]:
-    """The sections of a folded model, its primitives in the order of the file: along a Z curve through the positions' codes."""
+def file_order(model: Primitives, made: Schemes) -> Tensor:
+    """(N,) int64 rows of a folded model as they follow each other in a file: along a Z curve through the positions' codes."""
     places = made["means"]
     assert isinstance(places, Columns)
-    order = np.argsort(morton(places.codes(model.params["means"]).numpy(), int(places.bits[0])), kind="stable")
+    return torch.from_numpy(np.argsort(morton(places.codes(model.params["means"]).numpy(), int(places.bits[0])), kind="stable"))
+
+
+def encode(model: Primitives, made: Schemes) -> list[Section]:
+    """The sections of a folded model, in the order of the file."""
+    order = file_order(model, made)
     sections = []
     for spec in model.specs:
         scheme = made[spec.name]
         coding = ROTATIONS if isinstance(scheme, Rotations) else POSITIONS if spec.name == "means" else COLUMNS
-        rows = model.params[spec.name].reshape(model.count, spec.size)[torch.from_numpy(order)]
+        rows = model.params[spec.name].reshape(model.count, spec.size)[order]
         sections.append(pack(spec.name, spec.shape, scheme, scheme.codes(rows).numpy(), coding))
     return sections
 

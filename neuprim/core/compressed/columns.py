@@ -52,7 +52,7 @@ class Columns:
 
     def rounded(self, x: Tensor) -> Tensor:
         """x as it comes back, with the gradient of x itself (straight through): for training that knows what will be stored."""
-        return x + (self.values(self.codes(x)).to(x) - x).detach()
+        return self.values(self.codes(x)).to(x) + (x - x.detach())
 
     def to(self, device: torch.device) -> Columns:
         """The same for tensors elsewhere."""

@@ -84,7 +84,7 @@ def write_compressed(path: Path, header: Mapping[str, Any], count: int, sections
     plain = [b"".join(s.planes) for s in sections]
     packed = [packed_planes(s.planes) for s in sections]
     numbers = count * sum(s.columns for s in sections if s.coding != TEXT)
-    for i in sorted(range(len(sections)), key=lambda i: len(packed[i]) - len(plain[i])):
+    for i in sorted(range(len(sections)), key=lambda i: len(plain[i]) - len(packed[i])):
         if _allowed(numbers, sum(map(len, packed))):
             break
         packed[i] = plain[i]  # a model of next to nothing, such as all zeros, would look like a bomb

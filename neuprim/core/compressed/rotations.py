@@ -63,7 +63,7 @@ class Rotations:
         q = quats.detach()
         back = self.values(self.codes(q)).to(q)
         back = back * q.norm(dim=1, keepdim=True) * torch.where((back * q).sum(1, keepdim=True) < 0, -1.0, 1.0).to(q)
-        return quats + (back - quats).detach()
+        return back + (quats - q)
 
     def to(self, device: torch.device) -> Rotations:
         """The same for tensors elsewhere: itself."""

@@ -87,7 +87,11 @@ def test_more_bits_are_a_better_image(tmp_path: Path) -> None:
         for level in LEVELS:
             checkpoint.save_compressed(tmp_path / "m", model, task.name, {}, LEVELS[level])
             sizes.append((tmp_path / "m").stat().st_size)
-            errors.append(float((render(checkpoint.load_model(tmp_path / "m", task)[0], scenes.camera(), {}, RenderSettings()).rgb - true).abs().mean()))
+            errors.append(
+                float(
+                    (render(checkpoint.load_model(tmp_path / "m", task)[0], scenes.camera(), {}, RenderSettings()).rgb - true).abs().mean()
+                )
+            )
     assert sizes == sorted(sizes, reverse=True) and errors == sorted(errors) and errors[0] < 0.1 * errors[-1]
 
 
@@ -137,7 +141,9 @@ def test_words_over_a_level() -> None:
     specs = example("static")[1].specs
     table = bit_table(3, ["sh_rest=6,5", "means=20", "others=9"], specs)
     assert table.named["sh_rest"] == (6, 5) and table.named["means"] == (20,) and table.of("W1", (3, 3)) == [9] * 9
-    assert table.of("quats", (4,)) == LEVELS[3].of("quats", (4,)) and {"W1", "sh_rest", "means"} <= table.exact and "quats" not in table.exact
+    assert (
+        table.of("quats", (4,)) == LEVELS[3].of("quats", (4,)) and {"W1", "sh_rest", "means"} <= table.exact and "quats" not in table.exact
+    )
     assert bit_table(2, [], specs) == LEVELS[2]
 
 

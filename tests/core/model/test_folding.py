@@ -45,7 +45,11 @@ def test_folding_twice_changes_no_bit(name: str) -> None:
 
 
 def test_numbers_lie_where_they_are_said_to() -> None:
-    for name, rate, phase, weights in (("static", 30.0, "b1", "w2"), ("dynamic", 30.0, "b1", "w2"), ("additive", 3.0, "net_phase", "net_out")):
+    for name, rate, phase, weights in (
+        ("static", 30.0, "b1", "w2"),
+        ("dynamic", 30.0, "b1", "w2"),
+        ("additive", 3.0, "net_phase", "net_out"),
+    ):
         model = example(name, 500)[1]
         made = folded(model).params
         first = made[weights] if made[weights].dim() == 2 else made[weights][:, 0]
@@ -63,6 +67,6 @@ def test_a_phase_at_the_end_of_half_a_turn_stays() -> None:
 
 
 def test_fields_without_cosines_stay_as_they_are() -> None:
-    task, model = example("harmonics")
+    model = example("harmonics")[1]
     assert isinstance(model.colour.lower(model.of(model.colour), model.geometry, scenes.camera(), CONDITIONS["relight"]), Constant)
     assert all(torch.equal(value, model.params[key]) for key, value in model.colour.folded(model.of(model.colour)).items())

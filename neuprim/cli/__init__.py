@@ -10,13 +10,14 @@ import argparse
 import os
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from neuprim.cli import arguments
 from neuprim.cli.environment_flags import add_environment_flags, environment_of
 from neuprim.cli.export_help import export_help
+from neuprim.cli.metrics_report import print_metrics
 from neuprim.cli.operating_words import DRAWN, OPERATING, operating_words
 from neuprim.cli.tradeoff import for_tradeoff, tradeoff
 from neuprim.core.errors import DISK, ConfigError, NeuprimError, nearest
@@ -148,7 +149,9 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
     export.add_argument("--force", action="store_true", help="replace files that exist")
     export.add_argument("--json", action="store_true", help="print JSON")
 
-    back = command("import", _import, "make a run directory of an exported .ply or .npz")
+    arguments.for_compress(command("compress", _compress, "write a run's model in few bits, as one file that every command reads"))
+
+    back = command("import", _import, "make a run directory of an exported .ply or .npz, or of a .neuprim")
     back.add_argument("file", type=Path, metavar="FILE")
     back.add_argument("--out", type=Path, required=True, metavar="RUN_DIR", help="new directory")
 
@@ -224,7 +227,7 @@ def _eval(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
     from neuprim.runs.measure import evaluate_run
 
-    _print_metrics(evaluate_run(run_dir, args.lpips, args.words))
+    print_metrics(evaluate_run(run_dir, args.lpips, args.words))
     return 0
 
 
@@ -266,6 +269,18 @@ def _export(args: argparse.Namespace) -> int:
     from neuprim.runs.export import export_run
 
     print_report(export_run(run_dir, args.format, args.out, args.options, args.force, LineProgress(plain_console(stderr=True))), args.json)
+    return 0
+
+
+def _compress(args: argparse.Namespace) -> int:
+    run_dir = _run_directory(args.run_dir)
+    from neuprim.cli.compress_report import print_compression
+    from neuprim.cli.console import plain_console
+    from neuprim.cli.progress import LineProgress
+    from neuprim.runs.compress import compress_run
+
+    progress = LineProgress(plain_console(stderr=True))
+    print_compression(compress_run(run_dir, args.level, args.bits, args.out, args.force, progress))
     return 0
 
 
@@ -368,7 +383,8 @@ def _no_such(word: str, command: str, known: argparse.ArgumentParser, task: Task
 
 def _run_directory(path: Path) -> Path:
     if not path.is_dir():
-        raise ConfigError(f"{path}: no such run directory")
+        hint = f"; `neuprim import {path} --out RUN_DIR` makes one of this file" if path.is_file() else ""
+        raise ConfigError(f"{path}: no such run directory{hint if path.suffix in ('.neuprim', '.npz', '.ply') else ''}")
     return path
 
 
@@ -377,26 +393,3 @@ def _task_names() -> str:
 
     lines = [f"  {TASKS.word(info)}  ({info.origin})" for info in list_tasks()]
     return "\n".join(["tasks:", *(lines or ["  none is installed"])])
-
-
-# ---------------------------------------------------------------- output
-
-
-def _print_metrics(metrics: Mapping[str, Any]) -> None:
-    rows = list(_rows(metrics))
-    width = max((len(name) for name, _ in rows), default=0)
-    for name, value in rows:
-        print(f"{name:{width}}  {value}")
-
-
-def _rows(metrics: Mapping[str, Any], where: str = "") -> list[tuple[str, str]]:
-    rows: list[tuple[str, str]] = []
-    for key, value in metrics.items():
-        name = f"{where}{key}"
-        if isinstance(value, Mapping):
-            rows += _rows(value, name + ".")
-        elif isinstance(value, list) and value and all(isinstance(entry, Mapping) for entry in value):
-            rows.append((name, f"{len(value)} entries, in the run's metrics.json"))
-        else:
-            rows.append((name, f"{value:.4f}" if isinstance(value, float) else str(value)))
-    return rows

@@ -7,7 +7,7 @@ import math
 import re
 from pathlib import Path
 
-__all__ = ["count", "for_bench", "for_inspect", "for_render", "numbers", "rate", "row", "size"]
+__all__ = ["count", "for_bench", "for_compress", "for_inspect", "for_render", "numbers", "rate", "row", "size"]
 
 
 def for_bench(parser: argparse.ArgumentParser) -> None:
@@ -54,6 +54,16 @@ def for_inspect(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels of the picture or window")
     parser.add_argument("--out", type=Path, metavar="FILE", help=".png, .webp, .gif, .mp4, .html or .vdb (default: a window)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
+
+
+def for_compress(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of ``neuprim compress``."""
+    parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    parser.add_argument("--level", type=count, default=3, metavar="1-5", help="1 keeps nearly everything, 5 very little (default: 3)")
+    words = "bits of a parameter, or of all others, over the level's: means=16 sh_rest=6,5 others=8"
+    parser.add_argument("--bits", nargs="+", default=[], metavar="NAME=BITS", help=words)
+    parser.add_argument("--out", "--output", type=Path, metavar="FILE", help="where to write (default: RUN_DIR/model.neuprim)")
+    parser.add_argument("--force", action="store_true", help="replace a file that exists")
 
 
 def size(text: str) -> tuple[int, int]:

@@ -1,6 +1,7 @@
 """Models and checkpoints on disk: safetensors with one JSON header. Nothing in a file is ever executed.
 
-A *model* holds what rendering needs and nothing else; a *checkpoint* holds the exact training state.
+A *model* holds what rendering needs and nothing else; a *checkpoint* holds the exact training state. A model may also be a compressed file
+(:mod:`neuprim.core.compressed`), which its first bytes tell; whatever reads models here reads both.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from neuprim.core import compressed
 from neuprim.core.errors import CheckpointError, nearest
 from neuprim.core.io.files import atomic_path
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 
-__all__ = ["FORMAT", "load_model", "read", "read_header", "save_model", "write"]
+__all__ = ["FORMAT", "load_model", "read", "read_header", "save_compressed", "save_model", "stored_config", "write"]
 
 FORMAT = 1
 _KEY = "neuprim"
@@ -48,6 +50,8 @@ def read_header(path: Path, kind: str) -> dict[str, Any]:
     Raises:
         CheckpointError: missing, truncated, foreign or of another format version.
     """
+    if compressed.is_compressed(path):
+        return _checked(path, compressed.read_head(path), kind)
     try:
         with safe_open(str(path), framework="pt") as file:
             metadata = file.metadata() or {}
@@ -61,6 +65,10 @@ def read_header(path: Path, kind: str) -> dict[str, Any]:
         header = json.loads(metadata[_KEY])
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{path}: the {_KEY!r} header is not valid JSON ({error})") from error
+    return _checked(path, header, kind)
+
+
+def _checked(path: Path, header: Any, kind: str) -> dict[str, Any]:
     if not isinstance(header, dict) or header.get("kind") != kind:
         found = header.get("kind") if isinstance(header, dict) else type(header).__name__
         raise CheckpointError(f"{path}: kind is {found!r}; expected {kind!r}")
@@ -75,6 +83,9 @@ def read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     Raises:
         CheckpointError: see :func:`read_header`.
     """
+    if compressed.is_compressed(path):
+        header, tensors, _ = compressed.read_compressed(path)
+        return _checked(path, header, kind), tensors
     header = read_header(path, kind)
     try:
         with safe_open(str(path), framework="pt") as file:
@@ -86,11 +97,46 @@ def read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any]) -> None:
     """Write what rendering needs. ``extra`` (JSON-able) joins the header: background, colour space, data source."""
+    write(path, "model", model.params, _model_header(model, task, extra))
+
+
+def save_compressed(
+    path: Path, model: Primitives, task: str, extra: Mapping[str, Any], table: compressed.BitTable, config: str | None = None
+) -> dict[str, compressed.Stored]:
+    """As :func:`save_model`, in few bits; returns what the file has of every parameter.
+
+    Args:
+        table: how many.
+        config: text of the run's ``config.yaml``, so that a run directory can be made of the file.
+
+    Raises:
+        CheckpointError: numbers that cannot be stored, or the file could not be written; names it and the reason.
+    """
+    model = compressed.folded(model)
+    schemes = compressed.schemes(model, table)
+    sections = compressed.encode(model, schemes)
+    if config is not None:
+        sections.insert(0, compressed.Section(compressed.CONFIG, compressed.TEXT, (), planes=(config.encode(),)))
+    header = {"format": FORMAT, "kind": "model", **_model_header(model, task, extra)}
+    sizes = compressed.write_compressed(path, header, model.count, sections)
+    return {name: compressed.Stored(compressed.bits_in_words(scheme), sizes[name]) for name, scheme in schemes.items()}
+
+
+def stored_config(path: Path) -> str | None:
+    """Text of the ``config.yaml`` in a compressed model; None where it has none.
+
+    Raises:
+        CheckpointError: see :func:`read_header`.
+    """
+    return compressed.read_compressed(path)[2]
+
+
+def _model_header(model: Primitives, task: str, extra: Mapping[str, Any]) -> dict[str, Any]:
     fields = {
         kind: {"class": type(field).__name__, "settings": field.settings()}
         for kind, field in (("density", model.density), ("colour", model.colour))
     }
-    write(path, "model", model.params, {"task": task, "primitives": model.count, **fields, **extra})
+    return {"task": task, "primitives": model.count, **fields, **extra}
 
 
 def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:

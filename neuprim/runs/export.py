@@ -13,6 +13,7 @@ import torch
 
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint
+from neuprim.core.compressed import is_compressed
 from neuprim.core.conditions import flag, named, read_conditions, split_words
 from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
@@ -21,7 +22,7 @@ from neuprim.core.model.fields import ConditionSpec
 from neuprim.plugins.blame import origin_of, reported
 from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin, load_exporter
 from neuprim.runs.export_record import record_export
-from neuprim.runs.open import load_run, open_run
+from neuprim.runs.open import COMPRESSED, load_run, open_run
 
 __all__ = ["export_run", "import_model", "import_run"]
 
@@ -136,9 +137,9 @@ def _scalar(text: str) -> Any:
 
 
 def import_run(path: Path, out: Path, name: str | None = None) -> Path:
-    """Make a run directory of a file that a lossless exporter wrote; returns ``out``.
+    """Make a run directory of a file that a lossless exporter or ``neuprim compress`` wrote; returns ``out``.
 
-    It has ``config.yaml`` and ``model.safetensors``, so that it renders, is measured and exports like the run that it came from.
+    It has ``config.yaml`` and ``model.safetensors``, or the compressed file as ``model.neuprim``, so that it renders, is measured and exports like the run that it came from.
 
     Raises:
         ConfigError: ``out`` exists and is not empty, or no format reads such files.
@@ -148,6 +149,8 @@ def import_run(path: Path, out: Path, name: str | None = None) -> Path:
         raise DataError(f"{path}: no such file")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"--out {out}: exists and is not an empty folder")
+    if name is None and is_compressed(path):
+        return _import_compressed(path, out)
     reader = _reader(path, name)
     assert reader.read is not None
     with reported(EXPORTERS, name or reader.name, [out.absolute().parent]):
@@ -160,7 +163,7 @@ def _reader(path: Path, name: str | None) -> Exporter:
     try:
         exporter = load_exporter(name)
     except UnknownPlugin:
-        raise ConfigError(f"{path}: no format reads .{name} files; lossless formats are exported by --format ply or npz") from None
+        raise ConfigError(f"{path}: no format reads .{name} files; expected one of `neuprim compress`, or of --format ply or npz") from None
     if exporter.read is None:
         raise ConfigError(f"{path}: --format {name} is lossy and cannot be imported; ply and npz can")
     return exporter
@@ -168,15 +171,27 @@ def _reader(path: Path, name: str | None) -> Exporter:
 
 def import_model(stored: StoredModel, path: Path, out: Path) -> Path:
     """Write a stored model as a run directory and load it once, so that nothing unsound gets the name ``out``."""
+    header: Mapping[str, Any] = {key: value for key, value in stored.header.items() if key not in ("format", "kind")}
+    tensors = {name: torch.from_numpy(value) for name, value in stored.tensors.items()}
+    return _run_of(path, out, stored.config, lambda draft: checkpoint.write(draft / "model.safetensors", "model", tensors, header))
+
+
+def _import_compressed(path: Path, out: Path) -> Path:
+    config = checkpoint.stored_config(path)
+    if config is None:
+        raise DataError(f"{path}: holds no config.yaml; expected a file written by `neuprim compress`")
+    return _run_of(path, out, config, lambda draft: shutil.copyfile(path, draft / COMPRESSED))
+
+
+def _run_of(path: Path, out: Path, config: str, write: Callable[[Path], object]) -> Path:
+    """A run directory with this text of ``config.yaml`` and the model that ``write`` puts there."""
     out.parent.mkdir(parents=True, exist_ok=True)
     draft = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
     try:
         draft.chmod(0o755)
-        (draft / "config.yaml").write_text(stored.config, encoding="utf-8", newline="")
-        header: Mapping[str, Any] = {key: value for key, value in stored.header.items() if key not in ("format", "kind")}
-        tensors = {name: torch.from_numpy(value) for name, value in stored.tensors.items()}
+        (draft / "config.yaml").write_text(config, encoding="utf-8", newline="")
         try:
-            checkpoint.write(draft / "model.safetensors", "model", tensors, header)
+            write(draft)
             RunConfig.from_yaml(draft / "config.yaml")
             load_run(draft, named=False)
         except (NeuprimError, ValueError, TypeError) as error:  # of a file that is not yet there under this name

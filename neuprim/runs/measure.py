@@ -34,9 +34,9 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, choose, render
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import clips_of, diagnosed, judged, mask_of
-from neuprim.runs.open import LOGS, load_dataset, load_run, placed
+from neuprim.runs.open import LOGS, load_dataset, load_run, model_file, placed
 from neuprim.runs.operating import read_point
-from neuprim.runs.storage import stored_bytes
+from neuprim.runs.storage import file_bytes
 from neuprim.version import __version__
 
 __all__ = ["ViewMetrics", "draw", "draw_sum", "evaluate_run", "measure", "summary"]
@@ -176,13 +176,12 @@ def evaluate_run(run_dir: Path, lpips: str | Path | None = None, words: Sequence
         dataset = load_dataset(config, task, run_dir=run_dir)
         suspects.know(dataset)
         check_dataset(dataset, task.conditions)
-        path = run_dir / "model.safetensors"
+        path = model_file(run_dir)
         training = {"iterations": header.get("iterations"), "train_seconds": header.get("train_seconds")}
         channels = channels_of(task, dataset)
-        size = path.stat().st_size - stored_bytes(model, {})
-        model = point.applied(model)
-        size += point.bytes(model)
-        model = placed(model, config.renderer, dataset.test.view(0))
+        part = point.applied(model)
+        size = file_bytes(path, model, part, point.stored)
+        model = placed(part, config.renderer, dataset.test.view(0))
         views = measure(model, task, dataset, config.renderer, channels, lpips=distance, paint=point.draw)
         return summary(config, model, task, dataset, channels, views, size, training, distance)
 

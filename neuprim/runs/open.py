@@ -25,12 +25,21 @@ from neuprim.plugins.blame import blamed
 from neuprim.plugins.mechanism import PluginError
 from neuprim.plugins.provenance import warn_of_neuprim
 
-__all__ = ["LOGS", "load_dataset", "load_run", "open_run", "placed", "read_metrics"]
+__all__ = ["COMPRESSED", "LOGS", "load_dataset", "load_run", "model_file", "open_run", "placed", "read_metrics"]
 
 LOGS = "logs"
 """Folder of a run directory for tracebacks of plugins."""
 
+COMPRESSED = "model.neuprim"
+"""A run's model in few bits, as ``neuprim compress`` writes it."""
+
 Progress = Callable[[str, float], None]
+
+
+def model_file(run_dir: Path) -> Path:
+    """The model of a run directory: ``model.safetensors``, or the compressed one where that is the only one."""
+    whole, compressed = run_dir / "model.safetensors", run_dir / COMPRESSED
+    return compressed if compressed.exists() and not whole.exists() else whole
 
 
 def load_dataset(
@@ -75,7 +84,7 @@ def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Pr
     task = task_of(config, place)
     if config.made_by is not None:
         warn_of_neuprim(config.made_by, place)
-    model, header = load_model(run_dir / "model.safetensors", task)
+    model, header = load_model(model_file(run_dir), task)
     return replace(config, renderer=at_hand(config.renderer)), task, model, header
 
 

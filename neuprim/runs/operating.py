@@ -28,7 +28,7 @@ from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, backends, render
-from neuprim.runs.storage import ALL, FORMATS, FULL, GROUPS, rounded, stored_bytes
+from neuprim.runs.storage import ALL, FORMATS, FULL, GROUPS, rounded
 
 __all__ = ["HEADS", "OperatingPoint", "read_point"]
 
@@ -82,10 +82,6 @@ class OperatingPoint:
         density, colour = fields["density"], fields["colour"]
         assert isinstance(density, DensityField) and isinstance(colour, ColourField), "a field is reduced to one of its kind"
         return rounded(Primitives(density, colour, params) if self.reduced else model, self.stored)
-
-    def bytes(self, model: Primitives) -> int:
-        """Of the tensors of a model that is :meth:`applied` already."""
-        return stored_bytes(model, self.stored)
 
     def seen(self, view: View) -> View:
         """The view at the resolution that it is drawn at."""

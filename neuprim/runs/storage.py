@@ -1,22 +1,24 @@
 """How a model's numbers may be stored, and what comes back of them: the one table of formats. A new one is a row here.
 
-A model file of neuprim holds float32. What it would be otherwise is tried in memory: values are rounded to what the format brings back, and
-its bytes are counted.
+A model file of neuprim holds float32, unless it was compressed (:mod:`neuprim.core.compressed`). What it would be otherwise is tried in memory:
+values are rounded to what the format brings back, and its bytes are counted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from neuprim.core.compressed import is_compressed
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.model.primitives import Primitives
 
-__all__ = ["ALL", "FORMATS", "FULL", "GROUPS", "Format", "parameters_of", "rounded", "stored_bytes"]
+__all__ = ["ALL", "FORMATS", "FULL", "GROUPS", "Format", "file_bytes", "parameters_of", "rounded", "stored_bytes"]
 
 
 @dataclass(frozen=True)
@@ -79,3 +81,14 @@ def rounded(model: Primitives, stored: Mapping[str, str]) -> Primitives:
 def stored_bytes(model: Primitives, stored: Mapping[str, str]) -> int:
     """Bytes of the model's tensors, each group in its format."""
     return sum(FORMATS[stored.get(group, FULL)].bytes(model.params[name]) for group in GROUPS for name in parameters_of(model, group))
+
+
+def file_bytes(path: Path, whole: Primitives, part: Primitives, stored: Mapping[str, str]) -> int:
+    """Bytes of a run's model file if it held ``part`` of the ``whole`` model that is in it, in formats.
+
+    A compressed file has its own size as it is; less of it, or other formats, are counted as the tensors of a file that is not compressed.
+    """
+    size, after = path.stat().st_size, stored_bytes(part, stored)
+    if not is_compressed(path):
+        return size - stored_bytes(whole, {}) + after
+    return size if after == stored_bytes(whole, {}) else after

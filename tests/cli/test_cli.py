@@ -10,7 +10,8 @@ import pytest
 
 import neuprim
 from neuprim import runs
-from neuprim.cli import _print_metrics, main
+from neuprim.cli import main
+from neuprim.cli.metrics_report import print_metrics
 from neuprim.config import RunConfig
 from neuprim.core.environment import EnvironmentFile
 from neuprim.core.errors import DataError, NonFiniteError
@@ -213,7 +214,7 @@ def test_a_disk_that_refuses_is_no_bug(calls: list[Any], capsys: pytest.CaptureF
 
 
 def test_eval_counts_what_is_too_long_for_a_line(capsys: pytest.CaptureFixture[str]) -> None:
-    _print_metrics({"psnr": 30.0, "per_view": [{"psnr": 1.0}, {"psnr": 2.0}], "background": [0.0, 0.0]})
+    print_metrics({"psnr": 30.0, "per_view": [{"psnr": 1.0}, {"psnr": 2.0}], "background": [0.0, 0.0]})
     assert [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()] == [
         "psnr 30.0000",
         "per_view 2 entries, in the run's metrics.json",

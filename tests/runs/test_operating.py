@@ -22,6 +22,7 @@ from neuprim.runs.draw import render_run
 from neuprim.runs.measure import draw, evaluate_run
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.operating import HEADS, OperatingPoint, read_point
+from neuprim.runs.storage import stored_bytes
 from tests.runs.tradeoff_runs import tiny_run
 
 
@@ -122,7 +123,7 @@ def test_a_format_changes_its_group_alone(model: Primitives) -> None:
         expected = value.half().float() if name in ("sh_dc", "sh_rest") else value
         assert torch.equal(stored.params[name], expected)
     saved = 2 * sum(model.params[name].numel() for name in ("sh_dc", "sh_rest"))
-    assert point.bytes(stored) == OperatingPoint().bytes(model) - saved
+    assert stored_bytes(stored, point.stored) == stored_bytes(model, {}) - saved
 
 
 def test_bytes_are_those_of_a_file_that_holds_it_so(model: Primitives, run_dir: Path, tmp_path: Path) -> None:
@@ -132,11 +133,11 @@ def test_bytes_are_those_of_a_file_that_holds_it_so(model: Primitives, run_dir: 
     save_model(tmp_path / "m.safetensors", reduced, "static", {})
     save_model(tmp_path / "whole.safetensors", model, "static", {})
     difference = (tmp_path / "whole.safetensors").stat().st_size - (tmp_path / "m.safetensors").stat().st_size
-    assert abs(difference - (OperatingPoint().bytes(model) - smaller.bytes(reduced))) <= 16
+    assert abs(difference - (stored_bytes(model, {}) - stored_bytes(reduced, smaller.stored))) <= 16
     path = run_dir / "model.safetensors"
     assert evaluate_run(run_dir)["model_bytes"] == path.stat().st_size
     less = evaluate_run(run_dir, words=["colour.degree=1", "density.neurons=2"])
-    assert less["model_bytes"] == path.stat().st_size - OperatingPoint().bytes(model) + smaller.bytes(reduced)
+    assert less["model_bytes"] == path.stat().st_size - stored_bytes(model, {}) + stored_bytes(reduced, smaller.stored)
     assert less["parameters"] == reduced.count * reduced.parameters_per_primitive
 
 
@@ -146,7 +147,7 @@ def test_another_row_is_another_format(model: Primitives, monkeypatch: pytest.Mo
     monkeypatch.setattr("neuprim.runs.operating.FORMATS", storage.FORMATS)
     point = read_point(["store.means=whole"], RenderSettings(), model)
     assert torch.equal(point.applied(model).params["means"], model.params["means"].round())
-    assert point.bytes(model) == OperatingPoint().bytes(model) - 3 * model.params["means"].numel()
+    assert stored_bytes(model, point.stored) == stored_bytes(model, {}) - 3 * model.params["means"].numel()
 
 
 def test_what_a_format_does_not_hold_is_refused(model: Primitives) -> None:

@@ -121,6 +121,14 @@ class Field(ABC):
         """
         raise NotImplementedError(f"{type(self).__name__} names {name} in reductions() and does not know how to reduce it")
 
+    def folded(self, params: Params) -> dict[str, Tensor]:
+        """The same field in numbers that lie as close together as they can, for files where each has few bits.
+
+        Where several sets of numbers mean the same field, as with the sign of a cosine's argument, one of them. Images may change by
+        rounding alone; folding what is folded changes no bit.
+        """
+        return dict(params)
+
 
 class DensityField(Field):
     """How much light a point absorbs.

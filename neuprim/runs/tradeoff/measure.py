@@ -14,6 +14,7 @@ import torch
 from neuprim.core.metrics import psnr, ssim, ssim_3dgs
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.operating import OperatingPoint
+from neuprim.runs.storage import file_bytes
 from neuprim.runs.tradeoff.memory import peak_bytes
 from neuprim.runs.tradeoff.record import Measured
 from neuprim.runs.tradeoff.subject import Exact, Subject, masked
@@ -77,7 +78,7 @@ def look(subject: Subject, models: Models, knob: str, point: OperatingPoint, exa
     error = quality.pop("mse_exact")
     against = -10.0 * math.log10(error) if error > 0 else math.inf
     quality["psnr_exact"] = against if exact.error is None else min(against, exact.error)
-    size = subject.file_bytes + point.bytes(model)
+    size = file_bytes(subject.file, subject.model, model, point.stored)
     return Measured(knob, subject.words(point), quality, size, max(peaks, default=None)), seconds
 
 

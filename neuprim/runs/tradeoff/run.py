@@ -229,7 +229,7 @@ def tradeoff_run(
 def _same(subject: Subject) -> dict[str, Any]:
     """What makes an earlier point worth keeping; JSON-able."""
     camera = subject.truths[0].view.camera
-    model = hashlib.sha256((subject.run_dir / "model.safetensors").read_bytes()).hexdigest()
+    model = hashlib.sha256(subject.file.read_bytes()).hexdigest()
     return {
         "model": model,
         "settings": asdict(subject.config.renderer),

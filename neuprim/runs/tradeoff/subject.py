@@ -22,7 +22,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.blame import Suspects
-from neuprim.runs.open import load_dataset, load_run, placed
+from neuprim.runs.open import load_dataset, load_run, model_file, placed
 from neuprim.runs.operating import OperatingPoint, read_point
 from neuprim.runs.tradeoff.knobs import Candidate
 
@@ -50,7 +50,7 @@ class Subject:
 
     Attributes:
         reference: the point that others are compared with: how the run draws, and what was asked for over that.
-        file_bytes: of the model's file, less those of its tensors.
+        file: the model's.
     """
 
     run_dir: Path
@@ -62,7 +62,7 @@ class Subject:
     suspects: Suspects
     reference: OperatingPoint
     truths: list[Truth]
-    file_bytes: int
+    file: Path
     lpips: Lpips | None = None
 
     @property
@@ -123,9 +123,8 @@ def load_subject(run_dir: Path, words: Sequence[str], views: int, lpips: str | P
         view, pixels = dataset.test.view(i), dataset.test.pixels(i)
         check_pixels("test", view, pixels, dataset.channels)
         truths.append(Truth(view, pixels.over(dataset.background), pixels.mask))
-    tensors = sum(4 * value.numel() for value in model.params.values())
-    size = (run_dir / "model.safetensors").stat().st_size - tensors
-    return Subject(run_dir, config, task, model, dataset, channels_of(task, dataset), suspects, reference, truths, size, distance)
+    channels, file = channels_of(task, dataset), model_file(run_dir)
+    return Subject(run_dir, config, task, model, dataset, channels, suspects, reference, truths, file, distance)
 
 
 # ---------------------------------------------------------------- exact images

@@ -22,6 +22,7 @@ from neuprim.core.compute import device
 from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity, amplified, cosine_density, split_cosine, split_scale
 from neuprim.core.model.densities.fewer import fewer_neurons
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
+from neuprim.core.model.folding import fold_cosines
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.train.population import SPLIT_LONG, SPLIT_SHIFT
@@ -140,6 +141,9 @@ class TimeDensity(DensityField):
             for name in ("offset_cos", "offset_sin"):
                 children[name] = params[name] * scale.to(params["b2"])[:, None]
         return children
+
+    def folded(self, params: Params) -> dict[str, Tensor]:
+        return fold_cosines(params, ("W1", "W_t") if "phase" in self.parts else ("W1",), "b1", "w2", self.static.omega0)
 
     def divide(self, params: Params, geometry: Geometry) -> tuple[Tensor, dict[str, Tensor], Geometry] | None:
         """Windows longer than ``divide_above`` are halved; the halves overlap, as windows fade at their ends.

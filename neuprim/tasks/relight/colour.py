@@ -21,6 +21,7 @@ from torch import Tensor
 from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.compute import device
 from neuprim.core.model.fields import ColourField, Conditions, LoweredDensity, RayNet, Shading
+from neuprim.core.model.folding import fold_cosines
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.settings import RenderSettings
@@ -119,6 +120,9 @@ class LightNetwork(ColourField):
         net_x = params["net_x"].double()
         phase = params["net_phase"].double() + (net_x * shift[:, None]).sum(-1)
         return {**params, "net_x": (net_x * r[:, None, None]).to(params["net_x"]), "net_phase": phase.to(params["net_phase"])}
+
+    def folded(self, params: Params) -> dict[str, Tensor]:
+        return fold_cosines(params, ("net_x", "net_view", "net_light"), "net_phase", "net_out", self.boost)
 
 
 _DARKEST = 1e-3

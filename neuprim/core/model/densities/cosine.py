@@ -17,6 +17,7 @@ from neuprim.core.checked import Range
 from neuprim.core.model.densities.fewer import fewer_neurons, smaller_counts
 from neuprim.core.model.edge import EDGES, NORMS, fade
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
+from neuprim.core.model.folding import fold_cosines
 from neuprim.core.model.footprint import gaussian_support
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
@@ -97,6 +98,9 @@ class CosineDensity(DensityField):
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
         return split_cosine(params, old, new, self.omega0, self.edge)
+
+    def folded(self, params: Params) -> dict[str, Tensor]:
+        return fold_cosines(params, ("W1",), "b1", "w2", self.omega0)
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
         support, depth = gaussian_support(self.edge, alphas)

@@ -1,0 +1,28 @@
+"""What ``neuprim compress`` prints when it is done."""
+
+from __future__ import annotations
+
+from neuprim.runs.compress import Compression
+
+__all__ = ["print_compression"]
+
+
+def print_compression(made: Compression) -> None:
+    """File, bytes of every parameter, and what was lost, on standard output."""
+    print(made.file)
+    cells = [("", "bits", "bytes before", "after", "times")]
+    cells += [(p.name, p.bits, f"{p.before:,}", f"{p.after:,}", _times(p.before, p.after)) for p in made.parameters]
+    cells += [("all, and the header", "", f"{made.before:,}", f"{made.after:,}", _times(made.before, made.after))]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
+    for name, *numbers in cells:
+        print("  ".join([f"{name:{widths[0]}}", *(f"{n:>{w}}" for n, w in zip(numbers, widths[1:], strict=True))]).rstrip())
+    for name, (before, after) in made.measured.items():
+        unit, digits = (" dB", 3) if name == "psnr" else ("", 4)
+        print(f"{name:5} {before:.{digits}f} -> {after:.{digits}f}{unit} ({after - before:+.{digits}f}), mean of the held-out views")
+    for note in made.notes:
+        print(f"note: {note}")
+    print(f"compressed in {made.seconds:.2f} s")
+
+
+def _times(before: int, after: int) -> str:
+    return f"{before / after:.2f}" if before and after else "-"

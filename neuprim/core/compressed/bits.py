@@ -1,0 +1,89 @@
+"""How many bits each parameter gets: named levels, a user's own numbers over them, and where the data ask for more."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+from neuprim.core.compressed.columns import MOST_BITS
+from neuprim.core.compressed.rotations import LEAST_BITS
+from neuprim.core.errors import ConfigError, nearest
+from neuprim.core.model.schema import ParameterSpec
+
+__all__ = ["LEVELS", "USUAL_LEVEL", "BitTable", "bit_table"]
+
+OTHERS = "others"
+
+
+@dataclass(frozen=True)
+class BitTable:
+    """Bits of a number, by parameter.
+
+    Attributes:
+        named: parameter -> bits; several numbers are for the bands of spherical harmonics, degrees 1, 2, ... in the order of 3D Gaussian
+            splatting, the last for all that follow.
+        others: of every other parameter.
+        exact: parameters that get just that; of the others, columns that need more get more (:mod:`neuprim.core.compressed.codec`).
+    """
+
+    named: Mapping[str, tuple[int, ...]]
+    others: int
+    exact: frozenset[str] = frozenset()
+
+    def of(self, name: str, shape: tuple[int, ...]) -> list[int]:
+        """Bits of each column of a parameter with this shape per primitive."""
+        bits = self.named.get(name, (self.others,))
+        if len(bits) == 1 or len(shape) < 2:
+            return [bits[0]] * math.prod(shape)
+        degrees = [math.isqrt(row + 1) for row in range(shape[0])]
+        return [bits[min(degree, len(bits)) - 1] for degree in degrees for _ in range(math.prod(shape[1:]))]
+
+
+LEVELS: dict[int, BitTable] = {
+    1: BitTable({"means": (16,), "quats": (11,)}, 10),
+    2: BitTable({"means": (15,), "quats": (9,), "sh_rest": (8, 7)}, 8),
+    3: BitTable({"means": (14,), "quats": (8,), "sh_rest": (7, 6)}, 7),
+    4: BitTable({"means": (13,), "quats": (7,), "sh_rest": (5,)}, 6),
+    5: BitTable({"means": (12,), "quats": (6,), "sh_rest": (4,)}, 5),
+}
+"""From nearly everything to very little."""
+
+USUAL_LEVEL = 3
+
+
+def bit_table(level: int, words: Iterable[str], specs: Iterable[ParameterSpec]) -> BitTable:
+    """A level's table under a user's words NAME=BITS, where NAME is a parameter of the model or ``others``, and BITS a number or several.
+
+    Raises:
+        ConfigError: no such level or parameter, or no such number of bits.
+    """
+    if level not in LEVELS:
+        raise ConfigError(f"--level {level}: expected one of {', '.join(map(str, LEVELS))}")
+    table, names = LEVELS[level], [spec.name for spec in specs]
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not equals:
+            raise ConfigError(f"--bits {word}: expected NAME=BITS, for example means=16")
+        if name not in names and name != OTHERS:
+            raise ConfigError(f"--bits {word}: the model has no parameter {name!r}{nearest(name, [*names, OTHERS])}")
+        if name in table.exact:
+            raise ConfigError(f"--bits {word}: {name} is given twice")
+        bits = _numbers(word, text, name)
+        if name == OTHERS:
+            table = replace(table, others=bits[0], exact=table.exact | {n for n in (*names, OTHERS) if n not in table.named})
+        else:
+            table = replace(table, named={**table.named, name: bits}, exact=table.exact | {name})
+    return table
+
+
+def _numbers(word: str, text: str, name: str) -> tuple[int, ...]:
+    low, high = (LEAST_BITS, 16) if name == "quats" else (1, MOST_BITS if name == "means" else 16)
+    several = name not in ("means", "quats", OTHERS)
+    parts = text.split(",")
+    if any(not p.isascii() or not p.isdigit() or len(p) > 2 or not low <= int(p) <= high for p in parts) or (
+        len(parts) > 1 and not several
+    ):
+        more = "; several, as 7,6,5, for the bands of spherical harmonics" if several else ""
+        raise ConfigError(f"--bits {word}: expected {low} to {high}{more}")
+    return tuple(map(int, parts))

@@ -1,0 +1,129 @@
+"""A model as sections of codes, and what training may use of the same: ``Primitives`` -> schemes -> codes -> bytes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuprim.core.compressed.bits import BitTable
+from neuprim.core.compressed.columns import MOST_BITS, Columns, fit_columns, spread_error
+from neuprim.core.compressed.order import morton
+from neuprim.core.compressed.rotations import Rotations
+from neuprim.core.compressed.sections import COLUMNS, POSITIONS, ROTATIONS, Section, pack
+from neuprim.core.errors import CheckpointError, FormError
+from neuprim.core.model.checks import method
+from neuprim.core.model.primitives import Primitives
+
+__all__ = ["Schemes", "Stored", "bits_in_words", "encode", "file_order", "folded", "rounded", "schemes"]
+
+Schemes = dict[str, Columns | Rotations]
+"""Parameter -> how its numbers are coded."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a file has of a parameter: bits of a number, as text, and bytes."""
+
+    bits: str
+    size: int
+
+
+_SPIKY = 12.0
+"""Columns whose error is more times the usual one than this get twice the bits: a few of their numbers lie far from all others."""
+
+_FINE = 50.0
+"""Steps of a position in the median of the primitives' longest semi-axes, at least."""
+
+
+def folded(model: Primitives) -> Primitives:
+    """The same model in the numbers that are stored (:meth:`~neuprim.core.model.fields.Field.folded`), detached and on the processor.
+
+    Raises:
+        CheckpointError: numbers that cannot be stored: not float32, not finite, or a quaternion of zeros.
+        FormError: a field's own code returned something of another shape.
+    """
+    params = {name: value.detach().cpu() for name, value in model.params.items()}
+    for field in (model.density, model.colour):
+        own = {spec.name: params[spec.name] for spec in field.parameters()}
+        found = field.folded(own)
+        wanted = {name: tuple(value.shape) for name, value in own.items()}
+        if {name: tuple(value.shape) for name, value in found.items()} != wanted:
+            raise FormError(f"{method(field, 'folded')} returned tensors of other names or shapes; expected {wanted}")
+        params |= found
+    for name, value in params.items():
+        if value.dtype != torch.float32:
+            raise CheckpointError(f"parameter {name} is {value.dtype}; only torch.float32 can be compressed")
+        bad = ~torch.isfinite(value).reshape(len(value), math.prod(value.shape[1:])).all(1)
+        if name == "quats":
+            bad |= (value == 0).all(1)
+        if bool(bad.any()):
+            row = int(bad.nonzero()[0])
+            raise CheckpointError(f"parameter {name} of primitive {row} is {value[row].flatten()[:8].tolist()}, which cannot be compressed")
+    return Primitives(model.density, model.colour, params)
+
+
+def schemes(model: Primitives, table: BitTable) -> Schemes:
+    """How a folded model's numbers are coded: ends from its own numbers, bits from the table and, where it leaves it open, from them."""
+    found: Schemes = {}
+    for spec in model.specs:
+        x, bits = model.params[spec.name].reshape(model.count, spec.size), table.of(spec.name, spec.shape)
+        if spec.name == "quats":
+            found[spec.name] = Rotations(bits[0])
+        elif spec.name == "means":
+            found[spec.name] = _positions(model, x, bits[0], spec.name in table.exact)
+        else:
+            columns = fit_columns(x, bits)
+            if spec.name not in table.exact and model.count:
+                spiky = spread_error(x, columns) > _SPIKY
+                if bool(spiky.any()):
+                    columns = fit_columns(x, [min(2 * b, 16) if more else b for b, more in zip(bits, spiky.tolist(), strict=True)])
+            found[spec.name] = columns
+    return found
+
+
+def _positions(model: Primitives, x: Tensor, bits: int, exact: bool) -> Columns:
+    """No position is clipped: what is far away stays there, and if need be costs everybody a bit more."""
+    if model.count and not exact:
+        width = (x.amax(0) - x.amin(0)).double().max()
+        size = model.params["log_scales"].double().amax(1).exp().median()
+        while bits < MOST_BITS and width / (2**bits - 1) * _FINE > size:
+            bits += 1
+    return fit_columns(x, [bits] * 3, clips=(0.0,))
+
+
+def file_order(model: Primitives, made: Schemes) -> Tensor:
+    """(N,) int64 rows of a folded model as they follow each other in a file: along a Z curve through the positions' codes."""
+    places = made["means"]
+    assert isinstance(places, Columns)
+    return torch.from_numpy(np.argsort(morton(places.codes(model.params["means"]).numpy(), int(places.bits[0])), kind="stable"))
+
+
+def encode(model: Primitives, made: Schemes) -> list[Section]:
+    """The sections of a folded model, in the order of the file."""
+    order = file_order(model, made)
+    sections = []
+    for spec in model.specs:
+        scheme = made[spec.name]
+        coding = ROTATIONS if isinstance(scheme, Rotations) else POSITIONS if spec.name == "means" else COLUMNS
+        rows = model.params[spec.name].reshape(model.count, spec.size)[order]
+        sections.append(pack(spec.name, spec.shape, scheme, scheme.codes(rows).numpy(), coding))
+    return sections
+
+
+def rounded(params: Mapping[str, Tensor], made: Schemes) -> dict[str, Tensor]:
+    """Tensors as they would come back, row by row, with the gradients of the tensors themselves (straight through).
+
+    For training that knows what will be stored: the schemes are fixed meanwhile, and numbers beyond a column's ends come back as the end.
+    """
+    return {name: made[name].rounded(x.reshape(len(x), math.prod(x.shape[1:]))).reshape(x.shape) for name, x in params.items()}
+
+
+def bits_in_words(scheme: Columns | Rotations) -> str:
+    """``"7"``, ``"6 to 8"`` of several columns."""
+    bits = sorted({scheme.bits} if isinstance(scheme, Rotations) else set(scheme.bits.tolist()))
+    return " to ".join(map(str, bits if len(bits) < 2 else (bits[0], bits[-1])))

@@ -1,0 +1,127 @@
+"""``neuprim compress``: a run's model in few bits, in one file."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from neuprim.config import RunConfig, suspects_of
+from neuprim.core.channels import channels_of
+from neuprim.core.checkpoint import load_model, save_compressed
+from neuprim.core.compressed import USUAL_LEVEL, bit_table
+from neuprim.core.data import Dataset
+from neuprim.core.data.check import check_dataset
+from neuprim.core.errors import ConfigError, NeuprimError
+from neuprim.core.io.drafts import refuse_taken
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.task import TaskSpec
+from neuprim.runs.measure import measure
+from neuprim.runs.open import COMPRESSED, LOGS, load_dataset, load_run, placed
+
+__all__ = ["Compression", "StoredParameter", "compress_run"]
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class StoredParameter:
+    """A parameter's bits for a number, as text, its bytes in float32 and those in the file."""
+
+    name: str
+    bits: str
+    before: int
+    after: int
+
+
+@dataclass(frozen=True)
+class Compression:
+    """What became of a model.
+
+    Attributes:
+        file: where it is; before: bytes of its numbers in float32; after: of the file.
+        measured: "psnr" and "ssim" -> means over the held-out views before and after; empty where the run's data are not there.
+        seconds: of taking apart and writing.
+    """
+
+    file: Path
+    parameters: tuple[StoredParameter, ...]
+    before: int
+    after: int
+    measured: dict[str, tuple[float, float]]
+    seconds: float
+    notes: tuple[str, ...] = ()
+
+
+def compress_run(
+    run_dir: Path,
+    level: int = USUAL_LEVEL,
+    bits: Iterable[str] = (),
+    out: Path | None = None,
+    overwrite: bool = False,
+    progress: Progress = lambda text, fraction: None,
+) -> Compression:
+    """Write a run's model as a compressed file, whole or not at all, and measure what that costs where the run's data are there.
+
+    Args:
+        level: 1 (nearly everything) to 5 (very little), see :data:`neuprim.core.compressed.LEVELS`.
+        bits: words NAME=BITS over the level's own.
+        out: the file; None: ``model.neuprim`` in the run directory.
+        overwrite: whether a file that exists may be replaced.
+        progress: called with (text, fraction 0..1).
+
+    Raises:
+        NeuprimError: no such run, level or parameter, numbers that cannot be stored, or a file in the way.
+    """
+    final = run_dir / COMPRESSED if out is None else out
+    if final.is_dir():
+        raise ConfigError(f"--out {final}: is a folder; expected the name of a file")
+    refuse_taken(final, overwrite)
+    config, task, model, header = load_run(run_dir)
+    table = bit_table(level, bits, model.specs)
+    extra = {k: v for k, v in header.items() if k not in ("format", "kind", "task", "primitives", "density", "colour")}
+    start = time.perf_counter()
+    stored = save_compressed(final, model, task.name, extra, table, (run_dir / "config.yaml").read_text(encoding="utf-8"))
+    seconds = time.perf_counter() - start
+    parameters = tuple(
+        StoredParameter(s.name, stored[s.name].bits, 4 * model.count * s.size, stored[s.name].size) for s in model.specs if s.size
+    )
+    again, _ = load_model(final, task)
+    notes = ["its primitives are in another order than the run's"]
+    measured: dict[str, tuple[float, float]] = {}
+    try:
+        progress("reading the run's data", 0.0)
+        dataset = _dataset(run_dir, config, task)
+    except NeuprimError as error:
+        notes.append(f"what this costs was not measured, as the run's data cannot be read: {error}")
+    else:
+        measured = _costs(run_dir, config, task, dataset, model, again, progress)
+    before = sum(p.before for p in parameters)
+    return Compression(final, parameters, before, final.stat().st_size, measured, seconds, tuple(notes))
+
+
+def _dataset(run_dir: Path, config: RunConfig, task: TaskSpec) -> Dataset:
+    dataset = load_dataset(config, task, run_dir=run_dir)
+    with suspects_of(config).watch(run_dir / LOGS):
+        check_dataset(dataset, task.conditions)
+    return dataset
+
+
+def _costs(
+    run_dir: Path, config: RunConfig, task: TaskSpec, dataset: Dataset, model: Primitives, again: Primitives, progress: Progress
+) -> dict[str, tuple[float, float]]:
+    """PSNR and SSIM before and after, as in ``metrics.json``."""
+    suspects = suspects_of(config)
+    found = []
+    with suspects.watch(run_dir / LOGS):
+        suspects.know(dataset)
+        for i, (text, tried) in enumerate((("before", model), ("after", again))):
+            progress(f"measuring {text}", i / 2)
+            views = measure(
+                placed(tried, config.renderer, dataset.test.view(0)), task, dataset, config.renderer, channels_of(task, dataset)
+            )
+            found.append({"psnr": float(np.mean([v.psnr for v in views])), "ssim": float(np.mean([v.ssim for v in views]))})
+    return {name: (found[0][name], found[1][name]) for name in found[0]}

@@ -1,0 +1,251 @@
+"""A model in few bits and back: every built-in field, errors as the steps allow, the same bytes and the same floats every time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neuprim.core import checkpoint
+from neuprim.core.compressed import LEVELS, BitTable, bit_table, folded, read_compressed, rounded, schemes
+from neuprim.core.compressed.columns import Columns
+from neuprim.core.errors import CheckpointError, ConfigError, FormError
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.densities.gaussian import GaussianDensity
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import Params
+from neuprim.core.render import RenderSettings, render
+from neuprim.plugins.registry import load_task
+from tests import scenes
+from tests.compressing import FIELDS, example, gaussians, stored
+
+
+def angles(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    cosine = (a.double() * b.double()).sum(1).abs() / a.double().norm(dim=1) / b.double().norm(dim=1)
+    return 2 * cosine.clamp_max(1).acos()
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_model_comes_back_within_its_steps(tmp_path: Path, name: str, level: int) -> None:
+    task, model = example(name)
+    path = tmp_path / "m.neuprim"
+    checkpoint.save_compressed(path, model, task.name, {"background": [0.5], "note": "naïve"}, LEVELS[level])
+    again, header = checkpoint.load_model(path, task)
+    assert header["note"] == "naïve" and header["primitives"] == model.count and header["background"] == [0.5]
+    assert type(again.density) is type(model.density) and again.colour.settings() == model.colour.settings()
+    wanted, made = stored(model, LEVELS[level])
+    for key, value in wanted.params.items():
+        back, scheme = again.params[key].reshape(model.count, value[0].numel()), made[key]
+        if not isinstance(scheme, Columns):
+            assert float(angles(value, back).max()) < 4.0 / scheme.half
+            continue
+        x = value.reshape(back.shape)
+        inside = x.clamp(scheme.low, scheme.high)
+        half = (scheme.high - scheme.low).double() / scheme.last / 2
+        assert bool(((back - inside).double().abs() <= half * 1.001 + 1e-6).all()), key
+        assert float((x != inside).double().mean() if x.numel() else 0.0) <= 0.06, key  # at most 1% at either end, of 40 rows
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_compressing_again_changes_nothing(tmp_path: Path, name: str) -> None:
+    task, model = example(name, 300)
+    files = []
+    for i in range(3):
+        path = tmp_path / f"{i}.neuprim"
+        checkpoint.save_compressed(path, model, task.name, {}, LEVELS[3])
+        model, _ = checkpoint.load_model(path, task)
+        files.append((path.read_bytes(), model.params))
+    assert files[0][0] == files[1][0] == files[2][0]
+    assert all(torch.equal(value, files[2][1][key]) for key, value in files[0][1].items())
+
+
+def test_neither_the_order_of_rows_nor_their_place_matters(tmp_path: Path) -> None:
+    """The same primitives in another order make the same file, and the file's order draws the same image."""
+    task, model = example("static", 200)
+    rows = torch.randperm(200, generator=torch.Generator().manual_seed(1))
+    other = Primitives(model.density, model.colour, model.rows(rows))
+    for i, m in enumerate((model, other)):
+        checkpoint.save_compressed(tmp_path / f"{i}", m, task.name, {}, LEVELS[2])
+    assert (tmp_path / "0").read_bytes() == (tmp_path / "1").read_bytes()
+    wanted, _ = stored(model, LEVELS[2])
+    for backend in ("reference", "cpu"):
+        settings = RenderSettings(backend=backend)
+        with torch.no_grad():
+            a, b = (render(m, scenes.camera(), {}, settings).rgb for m in (folded(model), wanted))
+        assert torch.allclose(a, b, atol=1e-5)
+
+
+def test_more_bits_are_a_better_image(tmp_path: Path) -> None:
+    task, model = example("static", 100)
+    errors, sizes = [], []
+    with torch.no_grad():
+        true = render(model, scenes.camera(), {}, RenderSettings()).rgb
+        for level in LEVELS:
+            checkpoint.save_compressed(tmp_path / "m", model, task.name, {}, LEVELS[level])
+            sizes.append((tmp_path / "m").stat().st_size)
+            errors.append(
+                float(
+                    (render(checkpoint.load_model(tmp_path / "m", task)[0], scenes.camera(), {}, RenderSettings()).rgb - true).abs().mean()
+                )
+            )
+    assert sizes == sorted(sizes, reverse=True) and errors == sorted(errors) and errors[0] < 0.1 * errors[-1]
+
+
+def test_fields_of_others_come_back(tmp_path: Path) -> None:
+    model = gaussians()
+    task = load_task("static")
+    task = replace(task, fields={**(task.fields or {}), "GaussianDensity": GaussianDensity})
+    checkpoint.save_compressed(tmp_path / "m", model, task.name, {}, LEVELS[3])
+    again, _ = checkpoint.load_model(tmp_path / "m", task)
+    wanted, made = stored(model, LEVELS[3])
+    step = (made["log_amplitude"].high - made["log_amplitude"].low) / made["log_amplitude"].last
+    assert float((again.params["log_amplitude"] - wanted.params["log_amplitude"]).abs().max()) <= float(step) / 2 * 1.001
+
+
+# ---------------------------------------------------------------- bits
+
+
+def test_a_column_with_a_few_far_numbers_gets_twice_the_bits() -> None:
+    model = gaussians(4000)
+    model.params["log_amplitude"] = torch.randn(4000, 1, generator=torch.Generator().manual_seed(0))
+    assert schemes(model, LEVELS[3])["log_amplitude"].bits.tolist() == [7]
+    model.params["log_amplitude"][::1000] = 200.0
+    assert schemes(model, LEVELS[3])["log_amplitude"].bits.tolist() == [14]
+    exact = bit_table(3, ["log_amplitude=7"], model.specs)
+    assert schemes(model, exact)["log_amplitude"].bits.tolist() == [7]
+
+
+def test_positions_get_the_bits_that_the_primitives_sizes_ask_for() -> None:
+    model = gaussians(400)
+    model.params["log_scales"] = torch.full((400, 3), -3.0)
+    assert schemes(model, LEVELS[5])["means"].bits.tolist() == [12] * 3
+    model.params["means"][0] = 500.0
+    made = schemes(model, LEVELS[5])["means"]
+    steps = float((made.high - made.low)[0] / made.last[0])
+    assert np.exp(-3.0) / 100 < steps <= np.exp(-3.0) / 50
+    assert schemes(model, bit_table(5, ["means=9"], model.specs))["means"].bits.tolist() == [9] * 3
+
+
+def test_bands_of_harmonics_have_bits_of_their_own() -> None:
+    table = BitTable({"sh_rest": (8, 7, 5)}, 6)
+    assert table.of("sh_rest", (15, 3)) == [8] * 9 + [7] * 15 + [5] * 21
+    assert table.of("sh_rest", (24, 1)) == [8] * 3 + [7] * 5 + [5] * 16
+    assert table.of("sh_rest", (3, 1)) == [8] * 3 and table.of("W1", (4, 3)) == [6] * 12 and table.of("b2", (1,)) == [6]
+
+
+def test_words_over_a_level() -> None:
+    specs = example("static")[1].specs
+    table = bit_table(3, ["sh_rest=6,5", "means=20", "others=9"], specs)
+    assert table.named["sh_rest"] == (6, 5) and table.named["means"] == (20,) and table.of("W1", (3, 3)) == [9] * 9
+    assert (
+        table.of("quats", (4,)) == LEVELS[3].of("quats", (4,)) and {"W1", "sh_rest", "means"} <= table.exact and "quats" not in table.exact
+    )
+    assert bit_table(2, [], specs) == LEVELS[2]
+
+
+@pytest.mark.parametrize(
+    ("level", "word", "message"),
+    [
+        (6, "", "--level 6: expected one of 1, 2, 3, 4, 5"),
+        (3, "means", "--bits means: expected NAME=BITS"),
+        (3, "mean=16", "no parameter 'mean'; did you mean 'means'"),
+        (3, "means=21", "--bits means=21: expected 1 to 20"),
+        (3, "means=8,9", "--bits means=8,9: expected 1 to 20"),
+        (3, "quats=2", "expected 3 to 16"),
+        (3, "W1=17", "expected 1 to 16; several"),
+        (3, "W1=0", "expected 1 to 16"),
+        (3, "W1=-1", "expected 1 to 16"),
+        (3, "W1=8.5", "expected 1 to 16"),
+        (3, "W1=", "expected 1 to 16"),
+        (3, "W1=²", "expected 1 to 16"),
+        (3, "others=8,7", "expected 1 to 16"),
+    ],
+)
+def test_words_that_mean_nothing(level: int, word: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        bit_table(level, [word] if word else [], example("static")[1].specs)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_parameter_is_named_once() -> None:
+    with pytest.raises(ConfigError, match="W1 is given twice"):
+        bit_table(3, ["W1=8", "W1=7"], example("static")[1].specs)
+
+
+# ---------------------------------------------------------------- what training may use
+
+
+@pytest.mark.parametrize("name", ["static", "dynamic", "additive"])
+def test_rounded_tensors_are_what_comes_back_with_their_own_gradients(tmp_path: Path, name: str) -> None:
+    task, model = example(name)
+    checkpoint.save_compressed(tmp_path / "m", model, task.name, {}, LEVELS[4])
+    again, _ = checkpoint.load_model(tmp_path / "m", task)
+    wanted, made = stored(model, LEVELS[4])
+    leaves = {key: value.clone().requires_grad_() for key, value in wanted.params.items()}
+    found = rounded(leaves, made)
+    for key, value in found.items():
+        if key == "quats":
+            assert torch.allclose(angles(value.detach(), again.params[key]), torch.zeros(model.count, dtype=torch.float64), atol=1e-3)
+        else:
+            assert torch.equal(value.detach(), again.params[key]), key
+    total = torch.stack([(value * (i + 1)).sum() for i, value in enumerate(found.values())]).sum()
+    grads = torch.autograd.grad(total, list(leaves.values()), allow_unused=True)
+    for i, (grad, leaf) in enumerate(zip(grads, leaves.values(), strict=True)):
+        assert grad is not None and torch.equal(grad, torch.full_like(leaf, i + 1.0))
+
+
+# ---------------------------------------------------------------- what cannot be stored
+
+
+def altered(**params: torch.Tensor) -> Primitives:
+    model = example("static")[1]
+    return Primitives(model.density, model.colour, {**model.params, **params})
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        ({"b1": torch.full((40, 3), float("nan"))}, "parameter b1 of primitive 0 is [nan, nan, nan], which cannot be compressed"),
+        ({"b2": torch.cat([torch.zeros(39, 1), torch.full((1, 1), float("inf"))])}, "parameter b2 of primitive 39 is [inf]"),
+        ({"quats": torch.zeros(40, 4)}, "parameter quats of primitive 0 is [0.0, 0.0, 0.0, 0.0]"),
+        ({"b2": torch.zeros(40, 1, dtype=torch.int64)}, "parameter b2 is torch.int64; only torch.float32"),
+        ({"b2": torch.zeros(40, 1, dtype=torch.float64)}, "parameter b2 is torch.float64; only torch.float32"),
+    ],
+)
+def test_numbers_that_cannot_be_stored(tmp_path: Path, params: dict[str, torch.Tensor], message: str) -> None:
+    with pytest.raises(CheckpointError) as caught:
+        checkpoint.save_compressed(tmp_path / "m", altered(**params), "static", {}, LEVELS[3])
+    assert message in str(caught.value) and not (tmp_path / "m").exists()
+
+
+def test_a_field_that_folds_into_something_else_is_named() -> None:
+    class Loses(CosineDensity):
+        def folded(self, params: Params) -> dict[str, torch.Tensor]:
+            return {name: value[:-1] for name, value in params.items()}
+
+    model = example("static")[1]
+    with pytest.raises(FormError, match="density field Loses: folded returned tensors of other names or shapes"):
+        folded(Primitives(Loses(3), model.colour, model.params))
+
+
+def test_no_primitives_at_all(tmp_path: Path) -> None:
+    task, model = example("static")
+    none = Primitives(model.density, model.colour, {name: value[:0] for name, value in model.params.items()})
+    checkpoint.save_compressed(tmp_path / "m", none, task.name, {}, LEVELS[3])
+    assert checkpoint.load_model(tmp_path / "m", task)[0].count == 0
+
+
+def test_a_model_of_nothing_but_zeros_is_no_bomb(tmp_path: Path) -> None:
+    """What compresses without end is stored as it is, so that what strangers send need not be believed."""
+    task, model = example("static", 40_000)
+    params = {name: torch.zeros_like(value) for name, value in model.params.items()}
+    params["quats"][:, 0] = 1.0
+    path = tmp_path / "m"
+    checkpoint.save_compressed(path, Primitives(model.density, model.colour, params), task.name, {}, LEVELS[3], "task: static\n")
+    numbers = 4 * 40_000 * model.parameters_per_primitive
+    assert numbers > 2**20 and path.stat().st_size * 64 + 2**20 >= numbers > 10 * path.stat().st_size
+    assert all(torch.equal(value, params[name]) for name, value in read_compressed(path)[1].items())

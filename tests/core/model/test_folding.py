@@ -1,0 +1,72 @@
+"""Cosines have many sets of numbers; folding takes one of them, and nobody sees which."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from neuprim.core.model.fields import Constant
+from neuprim.core.model.folding import fold_cosines
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import RenderSettings, render
+from tests import scenes
+from tests.compressing import FIELDS, example
+
+CONDITIONS = {
+    "static": {},
+    "dynamic": {"time": torch.tensor(0.37)},
+    "relight": {"light": torch.tensor([1.0, 2.0, 3.0]), "light_intensity": torch.tensor([1.0])},
+}
+
+
+def folded(model: Primitives) -> Primitives:
+    params = dict(model.params)
+    for field in (model.density, model.colour):
+        params |= field.folded(model.of(field))
+    return Primitives(model.density, model.colour, params)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_images_do_not_change(name: str) -> None:
+    task, model = example(name)
+    settings, camera = RenderSettings(backend="reference"), scenes.camera(24, 20)
+    with torch.no_grad():
+        a, b = (render(m, camera, CONDITIONS[task.name], settings) for m in (model, folded(model)))
+    assert float(a.alpha.max()) > 0.1
+    assert torch.allclose(a.rgb, b.rgb, atol=2e-5) and torch.allclose(a.alpha, b.alpha, atol=2e-5)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_folding_twice_changes_no_bit(name: str) -> None:
+    once = folded(example(name, 300)[1])
+    assert all(torch.equal(value, folded(once).params[key]) for key, value in once.params.items())
+
+
+def test_numbers_lie_where_they_are_said_to() -> None:
+    for name, rate, phase, weights in (
+        ("static", 30.0, "b1", "w2"),
+        ("dynamic", 30.0, "b1", "w2"),
+        ("additive", 3.0, "net_phase", "net_out"),
+    ):
+        model = example(name, 500)[1]
+        made = folded(model).params
+        first = made[weights] if made[weights].dim() == 2 else made[weights][:, 0]
+        assert float(first.min()) >= 0 and float(model.params[weights].min()) < 0
+        assert float(made[phase].min()) >= 0 and float(made[phase].max()) <= math.pi / rate * (1 + 1e-5)
+        assert float(model.params[phase].abs().max()) > math.pi / rate
+
+
+def test_a_phase_at_the_end_of_half_a_turn_stays() -> None:
+    """float32 rounds pi/30 up: taken for more than half a turn, it would be folded to just below, then again."""
+    end = torch.tensor([[math.pi / 30, 0.0]])
+    params = {"W": torch.ones(1, 2, 3), "b": end, "w": torch.ones(1, 2)}
+    made = fold_cosines(params, ("W",), "b", "w", 30.0)
+    assert all(torch.equal(made[key], value) for key, value in params.items())
+
+
+def test_fields_without_cosines_stay_as_they_are() -> None:
+    model = example("harmonics")[1]
+    assert isinstance(model.colour.lower(model.of(model.colour), model.geometry, scenes.camera(), CONDITIONS["relight"]), Constant)
+    assert all(torch.equal(value, model.params[key]) for key, value in model.colour.folded(model.of(model.colour)).items())

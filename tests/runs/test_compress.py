@@ -62,14 +62,14 @@ def error_line(capsys: pytest.CaptureFixture[str]) -> str:
 
 def test_the_command_says_what_became_of_every_parameter(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "m.neuprim"
-    assert main(["compress", str(whole), "--level", "2", "--bits", "W1=12", "means=20", "--out", str(out)]) == 0
+    assert main(["compress", str(whole), "--level", "2", "--bits", "W1=12", "means=20", "sh_rest=9,7", "--out", str(out)]) == 0
     lines = capsys.readouterr().out.splitlines()
     _, _, model, _ = load_run(whole)
     assert lines[0] == str(out) and lines[1].split() == ["bits", "bytes", "before", "after", "times"]
     rows = {line.split()[0]: line.split()[1:] for line in lines[2 : 2 + len(model.specs)]}
     assert rows.keys() == model.params.keys()
     assert all(int(rows[s.name][-3].replace(",", "")) == 4 * model.count * s.size for s in model.specs)
-    assert rows["W1"][0] == "12" and rows["means"][0] == "20" and rows["sh_rest"][:3] == ["7", "to", "8"]
+    assert rows["W1"][0] == "12" and rows["means"][0] == "20" and rows["sh_rest"][:3] == ["7", "to", "9"]
     total = lines[2 + len(model.specs)]
     assert total.startswith("all, and the header") and f"{out.stat().st_size:,}" in total
     (psnr,) = [line for line in lines if line.startswith("psnr")]

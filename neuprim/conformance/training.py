@@ -13,9 +13,11 @@ from torch import Tensor
 from neuprim.conformance.subject import ConformanceError, Subject
 from neuprim.core import checkpoint
 from neuprim.core.channels import channels_of
+from neuprim.core.compressed import LEVELS, folded
 from neuprim.core.data import Dataset
 from neuprim.core.data import check as data_check
 from neuprim.core.errors import CheckpointError
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
 from neuprim.core.task import Supervision
 from neuprim.core.train.trainer import Trainer
@@ -26,6 +28,7 @@ __all__ = [
     "check_dataset",
     "check_determinism",
     "check_display",
+    "check_folded",
     "check_judging",
     "check_learning",
     "check_loss",
@@ -34,6 +37,8 @@ __all__ = [
 ]
 
 _STEPS = 4  # before the kill, and again after it; the population changes twice in each half
+
+_FOLDED = 1e-4  # of a colour: what rounding may change
 
 
 def check_dataset(t: Subject) -> None:
@@ -214,3 +219,23 @@ def _refuses_foreign(t: Subject, path: Path) -> None:
             continue
         where = f"{header[kind]['class']}(no_such_setting=1), as a model file has it"
         t.require(False, where, "it was loaded", "CheckpointError, because the class refuses settings that it does not have")
+
+
+def check_folded(t: Subject) -> None:
+    """What ``folded`` makes of tensors is the same field, and stays as it is, so that what is compressed again is not lost bit by bit."""
+    model = t.model(torch.float32)
+    once = folded(model)
+    for name, value in folded(once).params.items():
+        t.require(torch.equal(value, once.params[name]), f"{name} after folding twice", "other values than after once", "equal bits")
+    with torch.no_grad():
+        for view in t.views()[:3]:
+            change = float((_frame(t, once, view.camera, view.conditions) - _frame(t, model, view.camera, view.conditions)).abs().max())
+            t.require(change < _FOLDED, f"view {view.name} after folding", f"a change of {change:.3g}", f"less than {_FOLDED:g}")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.neuprim"
+        stored = [once.params]
+        for _ in range(2):
+            checkpoint.save_compressed(path, Primitives(model.density, model.colour, stored[-1]), t.task.name, {}, LEVELS[1])
+            stored.append(checkpoint.load_model(path, t.task)[0].params)
+    for name, value in stored[2].items():
+        t.require(torch.equal(value, stored[1][name]), f"{name} compressed twice", "other values than after once", "equal bits")

@@ -84,7 +84,8 @@ def compress_run(
     table = bit_table(level, bits, model.specs)
     extra = {k: v for k, v in header.items() if k not in ("format", "kind", "task", "primitives", "density", "colour")}
     start = time.perf_counter()
-    stored = save_compressed(final, model, task.name, extra, table, (run_dir / "config.yaml").read_text(encoding="utf-8"))
+    with suspects_of(config).watch(run_dir / LOGS):
+        stored = save_compressed(final, model, task.name, extra, table, (run_dir / "config.yaml").read_text(encoding="utf-8"))
     seconds = time.perf_counter() - start
     parameters = tuple(
         StoredParameter(s.name, stored[s.name].bits, 4 * model.count * s.size, stored[s.name].size) for s in model.specs if s.size

@@ -120,6 +120,18 @@ class Squares(CosineDensity):
         return super().scale_density(params, factor.square())
 
 
+class FoldsAway(CosineDensity):
+    """Half a turn without the weight's other sign."""
+
+    def folded(self, params: Params) -> dict[str, Tensor]:
+        return {**params, "w2": params["w2"].abs()}
+
+
+class FoldsOnAndOn(CosineDensity):
+    def folded(self, params: Params) -> dict[str, Tensor]:
+        return {**params, "b1": params["b1"] + 2 * math.pi / self.omega0}
+
+
 class InPlace(CosineDensity):
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         params["w2"].mul_(factor[:, None])
@@ -386,6 +398,8 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("learning", "mean loss over the training views", using(loss=uphill)),
     ("save_load", "after loading: found a change", using(colour=Progresses)),
     ("save_load", "SwallowsSettings(no_such_setting=1), as a model file has it", using(SwallowsSettings)),
+    ("folded", "after folding: found a change of", using(FoldsAway)),
+    ("folded", "b1 after folding twice: found other values", using(FoldsOnAndOn)),
     ("resume", "8 steps against 4 + resume + 4", using(Remembers)),
     ("conditions", "parse('no such value'): found it was taken", timed(parse=lenient)),
     ("conditions", "parse('0.25'): found shape (1,)", timed(parse=lambda text: [number(text)[0].reshape(1)])),

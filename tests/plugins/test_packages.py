@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -57,6 +58,9 @@ def test_the_example_installs_trains_and_passes_its_own_tests(tmp_path: Path) ->
     header = (tmp_path / "r" / "model.safetensors").read_bytes()[:4000]
     assert b"BellDensity" in header
     assert json.loads((tmp_path / "r" / "metrics.json").read_text())["psnr"] > 5
+    assert "psnr" in neuprim_command(["eval", "r"], tmp_path, site)
+    assert re.search(r"log_kappa +7 +160 ", neuprim_command(["compress", "r"], tmp_path, site))
+    (tmp_path / "r" / "model.safetensors").unlink()
     assert "psnr" in neuprim_command(["eval", "r"], tmp_path, site)
     assert passed(shell([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"], copy, site)) > 50
 

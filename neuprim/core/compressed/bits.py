@@ -40,14 +40,20 @@ class BitTable:
         return [bits[min(degree, len(bits)) - 1] for degree in degrees for _ in range(math.prod(shape[1:]))]
 
 
+def _level(means: int, shapes: int, quats: int, gain: int, W1: int, rest: int, sh_dc: int, sh_rest: int, others: int) -> BitTable:
+    """``shapes`` of log_scales, ``rest`` of the density's other numbers."""
+    named = {"means": means, "log_scales": shapes, "quats": quats, "log_gain": gain, "W1": W1, "sh_dc": sh_dc, "sh_rest": sh_rest}
+    return BitTable({name: (bits,) for name, bits in (named | {"b1": rest, "w2": rest, "b2": rest}).items()}, others)
+
+
 LEVELS: dict[int, BitTable] = {
-    1: BitTable({"means": (16,), "quats": (11,)}, 10),
-    2: BitTable({"means": (15,), "quats": (9,), "sh_rest": (8, 7)}, 8),
-    3: BitTable({"means": (14,), "quats": (8,), "sh_rest": (7, 6)}, 7),
-    4: BitTable({"means": (13,), "quats": (7,), "sh_rest": (5,)}, 6),
-    5: BitTable({"means": (12,), "quats": (6,), "sh_rest": (4,)}, 5),
+    1: _level(means=16, shapes=11, quats=11, gain=11, W1=10, rest=9, sh_dc=10, sh_rest=9, others=10),
+    2: _level(means=14, shapes=9, quats=9, gain=9, W1=8, rest=7, sh_dc=8, sh_rest=7, others=8),
+    3: _level(means=13, shapes=8, quats=8, gain=8, W1=7, rest=6, sh_dc=7, sh_rest=6, others=7),
+    4: _level(means=12, shapes=7, quats=7, gain=7, W1=6, rest=5, sh_dc=6, sh_rest=5, others=5),
+    5: _level(means=11, shapes=6, quats=6, gain=6, W1=5, rest=4, sh_dc=5, sh_rest=4, others=4),
 }
-"""From nearly everything to very little."""
+"""From nearly everything to very little. What a primitive has few of and images depend on has more bits: its place, shape and strength."""
 
 USUAL_LEVEL = 3
 

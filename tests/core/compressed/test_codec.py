@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+import neuprim
 from neuprim.core import checkpoint
 from neuprim.core.compressed import LEVELS, BitTable, bit_table, folded, read_compressed, rounded, schemes
 from neuprim.core.compressed.columns import Columns
@@ -122,7 +124,7 @@ def test_a_column_with_a_few_far_numbers_gets_twice_the_bits() -> None:
 def test_positions_get_the_bits_that_the_primitives_sizes_ask_for() -> None:
     model = gaussians(400)
     model.params["log_scales"] = torch.full((400, 3), -3.0)
-    assert schemes(model, LEVELS[5])["means"].bits.tolist() == [12] * 3
+    assert schemes(model, LEVELS[5])["means"].bits.tolist() == [11] * 3
     model.params["means"][0] = 500.0
     made = schemes(model, LEVELS[5])["means"]
     steps = float((made.high - made.low)[0] / made.last[0])
@@ -138,12 +140,11 @@ def test_bands_of_harmonics_have_bits_of_their_own() -> None:
 
 
 def test_words_over_a_level() -> None:
-    specs = example("static")[1].specs
+    specs = example("dynamic")[1].specs
     table = bit_table(3, ["sh_rest=6,5", "means=20", "others=9"], specs)
-    assert table.named["sh_rest"] == (6, 5) and table.named["means"] == (20,) and table.of("W1", (3, 3)) == [9] * 9
-    assert (
-        table.of("quats", (4,)) == LEVELS[3].of("quats", (4,)) and {"W1", "sh_rest", "means"} <= table.exact and "quats" not in table.exact
-    )
+    assert table.named["sh_rest"] == (6, 5) and table.named["means"] == (20,) and table.of("W_t", (3,)) == [9] * 3
+    assert all(table.of(name, (4,)) == LEVELS[3].of(name, (4,)) for name in ("quats", "W1", "log_scales"))
+    assert {"W_t", "velocity", "sh_rest", "means"} <= table.exact and not {"quats", "W1"} & table.exact
     assert bit_table(2, [], specs) == LEVELS[2]
 
 
@@ -249,3 +250,14 @@ def test_a_model_of_nothing_but_zeros_is_no_bomb(tmp_path: Path) -> None:
     numbers = 4 * 40_000 * model.parameters_per_primitive
     assert numbers > 2**20 and path.stat().st_size * 64 + 2**20 >= numbers > 10 * path.stat().st_size
     assert all(torch.equal(value, params[name]) for name, value in read_compressed(path)[1].items())
+
+
+def test_the_levels_are_those_of_the_documentation() -> None:
+    text = (Path(neuprim.__file__).parents[1] / "docs" / "export.md").read_text(encoding="utf-8")
+    head, _, *rows = [line.strip("| \n").split(" | ") for line in text.split("| level |", 1)[1].split("\n\n", 1)[0].splitlines()]
+    names = [re.findall(r"\w+", cell) for cell in head]
+    found = {int(row[0]): [int(cell) for cell in row[1:]] for row in rows}
+    assert found.keys() == LEVELS.keys() and "others" in names[-1]
+    for level, table in LEVELS.items():
+        said = {name: (bits,) for group, bits in zip(names[:-1], found[level][:-1], strict=True) for name in group}
+        assert said == dict(table.named) and found[level][-1] == table.others and not table.exact

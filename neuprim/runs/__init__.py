@@ -6,6 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from neuprim.runs.compress import compress_run as compress_run
     from neuprim.runs.draw import render_run as render_run
     from neuprim.runs.export import export_run as export_run
     from neuprim.runs.fit import Fitted as Fitted
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "Fitted": "fit",
+    "compress_run": "compress",
     "evaluate_run": "measure",
     "export_run": "export",
     "load_dataset": "open",

@@ -59,7 +59,6 @@ class _Head:
     header: dict[str, Any]
     count: int
     entries: list[_Entry]
-    size: int
 
 
 # ---------------------------------------------------------------- writing
@@ -81,6 +80,10 @@ def write_compressed(path: Path, header: Mapping[str, Any], count: int, sections
         raise CheckpointError(f"{path}: the header has {len(text)} bytes; at most {_MOST_HEADER} can be stored")
     if any(s.coding == TEXT and sum(map(len, s.planes)) > MOST_TEXT for s in sections):
         raise CheckpointError(f"{path}: {CONFIG} has more than {MOST_TEXT} bytes, which is the most that can be stored")
+    for s in sections:
+        if len(s.name.encode()) > 255 or len(s.shape) > _MOST_DIMENSIONS or max(*s.shape, s.columns, 0) > _MOST_COLUMNS:
+            limits = f"a name of 255 bytes, {_MOST_DIMENSIONS} dimensions and {_MOST_COLUMNS} numbers"
+            raise CheckpointError(f"{path}: parameter {s.name!r} of shape {s.shape} cannot be stored; at most {limits} can be")
     plain = [b"".join(s.planes) for s in sections]
     packed = [packed_planes(s.planes) for s in sections]
     numbers = count * sum(s.columns for s in sections if s.coding != TEXT)
@@ -222,12 +225,13 @@ def _head(path: Path, file: BinaryIO) -> _Head:
         raise CheckpointError(f"{path}: {error}") from error
     if header.get("primitives") != count:
         raise CheckpointError(f"{path}: the header says {header.get('primitives')!r} primitives; expected {count}")
-    return _Head(header, count, entries, size)
+    return _Head(header, count, entries)
 
 
 def _entries(table: bytes, sections: int, count: int) -> list[_Entry]:
     file = io.BytesIO(table)
     made: list[_Entry] = []
+    names: set[str] = set()
     for number in range(sections):
         try:
             name = file.read(file.read(1)[0]).decode("utf-8")
@@ -238,16 +242,17 @@ def _entries(table: bytes, sections: int, count: int) -> list[_Entry]:
             content, stored, checksum = _SIZES.unpack(file.read(_SIZES.size))
         except (struct.error, IndexError, UnicodeDecodeError) as error:
             raise Damaged(f"row {number} of the table of {sections} sections is cut short or damaged ({error})") from error
-        made.append(_Entry(_named(name, coding, shape, [e.section.name for e in made]), content, packing, stored, checksum))
+        if name in names:
+            raise Damaged(f"section {name!r} is there twice")
+        names.add(name)
+        made.append(_Entry(_named(name, coding, shape), content, packing, stored, checksum))
         _check(made[-1], count)
     if file.read(1):
         raise Damaged(f"the table goes on after {sections} sections; expected its end")
     return made
 
 
-def _named(name: str, coding: int, shape: tuple[int, ...], others: Sequence[str]) -> Section:
-    if name in others:
-        raise Damaged(f"section {name!r} is there twice")
+def _named(name: str, coding: int, shape: tuple[int, ...]) -> Section:
     if coding not in CODINGS:
         raise Damaged(f"section {name!r} has coding {coding}; expected {', '.join(f'{k} ({v})' for k, v in CODINGS.items())}")
     section, wanted = Section(name, coding, shape), {TEXT: (), POSITIONS: (3,), ROTATIONS: (4,)}.get(coding, shape)

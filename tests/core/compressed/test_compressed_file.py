@@ -24,7 +24,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from neuprim.core import checkpoint
-from neuprim.core.compressed import CONFIG, LEVELS, is_compressed
+from neuprim.core.compressed import CONFIG, LEVELS, Section, is_compressed, write_compressed
+from neuprim.core.compressed.packing import packed_planes
 from neuprim.core.errors import CheckpointError
 from neuprim.core.model.primitives import Primitives
 from neuprim.tasks.static import TASK
@@ -411,3 +412,23 @@ def test_headers_and_texts_that_no_reader_would_take(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"config\.yaml has more than 1048576 bytes"):
         checkpoint.save_compressed(tmp_path / "m", model, "static", {}, LEVELS[3], "x" * 2_000_000)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1, 1, 1), (2**20 + 1,), (2**10, 2**11)])
+def test_parameters_that_no_reader_would_take(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    with pytest.raises(CheckpointError, match=r"parameter 'p' of shape .* cannot be stored; at most"):
+        write_compressed(tmp_path / "m", {}, 0, [Section("p", 1, shape)])
+    with pytest.raises(CheckpointError, match="cannot be stored; at most a name of 255 bytes"):
+        write_compressed(tmp_path / "m", {}, 0, [Section("ü" * 128, 1, (1,))])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_blocks_are_cut_where_that_helps() -> None:
+    """Wide and narrow columns in turns: less than one frame without cuts, and not more than a frame for each."""
+    numbers = np.random.default_rng(0)
+    planes = [np.clip(numbers.normal(128, width, 3000), 0, 255).astype(np.uint8).tobytes() for width in (3, 12) * 12]
+    found, whole = packed_planes(planes), b"".join(planes)
+    assert len(found) < 0.97 * len(zstd(whole, level=19)) and len(found) <= sum(len(packed_planes([plane])) for plane in planes)
+    assert zstandard.ZstdDecompressor().decompress(found) == whole
+    noise = numbers.bytes(1000)
+    assert packed_planes([noise]) == noise and packed_planes([]) == b""

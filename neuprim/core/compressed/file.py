@@ -37,10 +37,8 @@ _PLAIN, _ZSTD = 0, 1
 _MOST_PLANES = 3  # of a column's codes
 _START = struct.Struct("<IIQIII")  # version, sections, primitives, bytes of header and table, their check sum
 _SIZES = struct.Struct("<QQI")
-_MOST_HEADER, _MOST_TABLE, _MOST_SECTIONS, _MOST_DIMENSIONS, _MOST_COLUMNS, _MOST_PRIMITIVES = (
-    *(2**22, 2**20, 4096),
-    *(4, 2**20, 2**31),
-)
+_MOST_HEADER, _MOST_TABLE = 2**22, 2**20  # bytes
+_MOST_SECTIONS, _MOST_DIMENSIONS, _MOST_COLUMNS, _MOST_PRIMITIVES = 4096, 4, 2**20, 2**31
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from neuprim.core.compute import device
 from neuprim.core.compute.machine import cpu_name
 from neuprim.core.compute.threads import core_count
 from neuprim.core.errors import ConfigError, NeuprimError
-from neuprim.core.model.forms import Cosine
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
 from neuprim.core.render.marched import compare_sampling
@@ -273,7 +273,7 @@ def _describe(record: Record, subject: Subject) -> None:
         "shown": subject.channels.shown,
         "not_measured": {} if subject.lpips is not None else {"lpips": "no weights were given (--lpips FILE)"},
     }
-    if not Path("/proc/self/clear_refs").exists() and record.facts["backend"] != "cuda":
+    if not Path("/proc/self/clear_refs").exists() and subject.prepared(subject.reference).device.type == device.PROCESSOR:
         record.facts["not_measured"]["peak_bytes"] = UNKNOWN
 
 
@@ -284,8 +284,6 @@ def _marching(subject: Subject) -> dict[str, Any]:
     scale = min(1.0, _CHORDS / max(view.camera.width, view.camera.height))
     camera = view.camera.resized(*(max(1, round(scale * side)) for side in (view.camera.width, view.camera.height)))
     lowered = double.lower(camera, view.conditions, subject.reference.settings)
-    if not isinstance(lowered.density, Cosine):
-        return {"not_measured": f"density {type(lowered.density).__name__} has no closed form to compare with"}
     settings = OperatingPoint(subject.reference.settings).settings
     try:
         found = compare_sampling(lowered, camera, settings)

@@ -110,10 +110,11 @@ KERNELS = {
     "core/render/backends.py",
     "core/render/cpu/backend.py",
     "core/render/cuda/backend.py",
+    "core/render/marched.py",
     "core/volumes/grid.py",
     "core/volumes/points.py",
 }
-"""Where code asks which form it has, as compiled kernels know only some."""
+"""Where code asks which form it has, as compiled kernels, and the samples that stand beside a closed form, know only some."""
 
 OWN = {"core/model/forms.py", "tasks/dynamic/invisible.py"}
 """A sum of two of a kind; a density that is the task's own."""

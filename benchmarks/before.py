@@ -18,8 +18,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from shared.machine import cpu_name
 from shared.tables import ROOT, Table
+
+from neuprim.core.compute.machine import cpu_name
 
 RESULTS = Path(__file__).parent / "results" / "before.json"
 CHAIR = ("task=static", "scene=blender", "train.background=white")

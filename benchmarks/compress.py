@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from shared.machine import cpu_name
 from shared.tables import Table, spread
 
 from neuprim.config import RunConfig
 from neuprim.core.channels import channels_of
 from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compressed import LEVELS, bit_table
+from neuprim.core.compute.machine import cpu_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.measure import measure
 from neuprim.runs.open import load_dataset, load_run

@@ -30,9 +30,10 @@ from typing import Any
 
 import torch
 from shared.forms import PAPER, SCENES, Form
-from shared.machine import cpu_name
 from shared.tables import README, between_markers, spread
 from shared.trials import Trial, begin, paces_of, run_all
+
+from neuprim.core.compute.machine import cpu_name
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "expressivity.json"

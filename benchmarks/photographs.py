@@ -17,9 +17,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from shared.machine import cpu_name
 from shared.tables import ROOT, Table, between_markers, spread
 from shared.trials import Trial, recorded, run_all
+
+from neuprim.core.compute.machine import cpu_name
 
 RESULTS = Path(__file__).parent / "results" / "photographs.json"
 SCENES = {

@@ -25,11 +25,11 @@ from typing import Any
 
 import torch
 from shared.forms import SCENES
-from shared.machine import cpu_name
 from shared.tables import ROOT, Table, between_markers, spread
 from shared.trials import Trial, begin, paces_of, recorded
 from torch import Tensor
 
+from neuprim.core.compute.machine import cpu_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.train import population
 from neuprim.core.train.population import Change

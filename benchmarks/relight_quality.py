@@ -25,11 +25,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from shared.machine import cpu_name
 from shared.tables import README, ROOT, between_markers, spread
 from shared.trials import paces_of
 
 from neuprim.config import compose
+from neuprim.core.compute.machine import cpu_name
 from neuprim.core.compute.threads import core_count
 from neuprim.core.data import Dataset
 from neuprim.runs.fit import Fitted, compile_kernels, complete, start

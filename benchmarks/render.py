@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 import torch
 from numba import njit
-from shared.machine import cpu_name
 from shared.scenes import lower, random_scene, view
 from shared.tables import PERFORMANCE, Table, between_markers
 from shared.timing import fastest
 
 from neuprim.core.cameras import Camera
+from neuprim.core.compute.machine import cpu_name
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.model.schema import ParameterSpec

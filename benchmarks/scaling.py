@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from shared.machine import cpu_name
 from shared.scenes import lower, random_scene, view
 from shared.tables import PERFORMANCE, Table, between_markers
 
+from neuprim.core.compute.machine import cpu_name
 from neuprim.core.compute.threads import core_count
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import RenderSettings, render_lowered

@@ -17,9 +17,10 @@ from typing import Any
 
 from PIL import Image
 from shared.forms import PAPER, Form
-from shared.machine import cpu_name
 from shared.tables import README, ROOT, between_markers, spread
 from shared.trials import Trial, run_all
+
+from neuprim.core.compute.machine import cpu_name
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "static_quality.json"

@@ -25,10 +25,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from shared.machine import cpu_name
 from shared.tables import ROOT, Table, between_markers, spread
 
 from neuprim.config import compose
+from neuprim.core.compressed import order as curve
+from neuprim.core.compute.machine import cpu_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.fit import Fitted, compile_kernels, complete, start
 
@@ -92,8 +93,7 @@ def morton(points: np.ndarray) -> np.ndarray:
     """Places along a Z curve of 2^30 cells."""
     low, high = points.min(0), points.max(0)
     cells = ((points - low) / np.maximum(high - low, 1e-9) * 1023).astype(np.int64)
-    bits = [((cells[:, axis] >> bit) & 1) << (3 * bit + axis) for bit in range(10) for axis in range(3)]
-    return np.asarray(np.sum(bits, 0))
+    return curve.morton(cells, 10)
 
 
 def measured(fitted: Fitted, model: Primitives) -> dict[str, Any]:

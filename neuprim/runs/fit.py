@@ -115,7 +115,7 @@ def start(config: RunConfig, events: Events = silent, dataset: Dataset | None = 
     events(Preparing("starting points"))
     trainer = make_trainer(config, task, dataset, loss)
     asked, found = config.model.primitives, trainer.model.count
-    if found < max(round(config.train.population.grow_from * asked), 1):
+    if found < _first(config):
         grows = config.train.population.strategy == "relocate"
         rest = "the rest is born where the error is largest" if grows else "there will be no more of them"
         events(Note(f"{dataset.name} offers {found:,} starting points for model.primitives={asked:,}: {rest}"))
@@ -177,8 +177,7 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss
     with blamed(origin, f"build of task {task.name!r}", config.output_dir / LOGS):
         density, colour = task.build(build_settings(task, config.model, config.options), dataset)
     check_fields(density, colour, dataset, f"build of task {task.name!r} of {origin.origin}")
-    first = replace(config.model, primitives=max(round(config.train.population.grow_from * config.model.primitives), 1))
-    model = initial_model(density, colour, dataset, first, config.seed)
+    model = initial_model(density, colour, dataset, replace(config.model, primitives=_first(config)), config.seed)
     # A preset has rates for every density and colour of its task; the trainer refuses names that the model does not have.
     others = task.parameter_names() - model.params.keys()
     rates = {k: v for k, v in config.train.rates.items() if k not in others}
@@ -188,6 +187,11 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss
         population = replace(population, grow_to=config.model.primitives)
     settings = replace(config.train, rates=rates, rate_units=units, population=population)
     return Trainer(model, dataset, loss or make_loss(config, task), settings, config.renderer, config.seed)
+
+
+def _first(config: RunConfig) -> int:
+    """Primitives that a model is to start with."""
+    return max(round(config.train.population.grow_from * config.model.primitives), 1)
 
 
 def compile_kernels(trainer: Trainer) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,21 +22,13 @@ from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_run, model_file
 from tests.core import tiny
 from tests.plugins import marked, runs
-from tests.short_runs import fit, words
-
-
-@pytest.fixture(scope="module", autouse=True)
-def short_orbits() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 4)
-        yield
+from tests.runs.tradeoff_runs import tiny_run
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run whose data are there."""
-    scene = tiny.write_blender(tmp_path_factory.mktemp("data") / "two")
-    return fit(words(scene, tmp_path_factory.mktemp("runs") / "whole", 60))
+    return tiny_run(tmp_path_factory.mktemp("whole"))
 
 
 @pytest.fixture(scope="module")

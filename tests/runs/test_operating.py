@@ -26,13 +26,6 @@ from neuprim.runs.storage import stored_bytes
 from tests.runs.tradeoff_runs import tiny_run
 
 
-@pytest.fixture(scope="module", autouse=True)
-def short_orbits() -> object:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 2)
-        yield
-
-
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny_run(tmp_path_factory.mktemp("operating"))

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,13 +33,6 @@ from tests.core import tiny
 from tests.lpips_weights import weights, written
 from tests.short_runs import STEPS, fit, words
 from tests.systems import posix
-
-
-@pytest.fixture(scope="module", autouse=True)
-def short_orbits() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 4)
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,6 @@ from neuprim.core.compute import device
 from neuprim.core.compute.machine import cpu_name
 from neuprim.core.compute.threads import core_count
 from neuprim.core.errors import ConfigError, NeuprimError
-from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
 from neuprim.core.render.marched import compare_sampling
 from neuprim.report.tradeoff import write_tradeoff
@@ -279,14 +278,11 @@ def _describe(record: Record, subject: Subject) -> None:
 
 def _marching(subject: Subject) -> dict[str, Any]:
     """Closed form against sampled chords on one small view of the model in float64."""
-    double = Primitives(subject.model.density, subject.model.colour, {n: v.detach().double() for n, v in subject.model.params.items()})
-    view = subject.truths[0].view
-    scale = min(1.0, _CHORDS / max(view.camera.width, view.camera.height))
-    camera = view.camera.resized(*(max(1, round(scale * side)) for side in (view.camera.width, view.camera.height)))
-    lowered = double.lower(camera, view.conditions, subject.reference.settings)
-    settings = OperatingPoint(subject.reference.settings).settings
+    view = subject.small(_CHORDS)
+    camera = view.camera
+    lowered = subject.double.lower(camera, view.conditions, subject.reference.settings)
     try:
-        found = compare_sampling(lowered, camera, settings)
+        found = compare_sampling(lowered, camera, subject.reference.settings)
     except NeuprimError as error:
         return {"not_measured": str(error)}
     rows = [

@@ -69,6 +69,18 @@ class Subject:
     def background(self) -> Tensor:
         return self.dataset.background
 
+    @property
+    def double(self) -> Primitives:
+        """The model in float64."""
+        return Primitives(self.model.density, self.model.colour, {n: v.detach().double() for n, v in self.model.params.items()})
+
+    def small(self, longer: int) -> View:
+        """The first view with at most so many pixels on its longer side."""
+        view = self.truths[0].view
+        width, height = view.camera.width, view.camera.height
+        scale = min(1.0, longer / max(width, height))
+        return replace(view, camera=view.camera.resized(max(1, round(scale * width)), max(1, round(scale * height))))
+
     def words(self, point: OperatingPoint) -> tuple[str, ...]:
         """What reproduces a point with ``neuprim render`` or ``neuprim eval``."""
         return point.words(self.config.renderer)
@@ -167,12 +179,9 @@ def exact_images(subject: Subject, allowed: float, float64: bool | None = None) 
     settings = replace(subject.reference.settings, alpha_min=0.0, transmittance_min=0.0)
     uncut = OperatingPoint(settings)
     oracle = OperatingPoint(replace(settings, backend=backends.ORACLE, device="auto"))
-    double = Primitives(subject.model.density, subject.model.colour, {n: v.detach().double() for n, v in subject.model.params.items()})
+    double, small = subject.double, subject.small(_SMALL)
     background = subject.background.double()
-    first = subject.truths[0].view
-    scale = min(1.0, _SMALL / max(first.camera.width, first.camera.height))
-    size = (max(1, round(first.camera.width * scale)), max(1, round(first.camera.height * scale)))
-    small = replace(first, camera=first.camera.resized(*size))
+    size = (small.camera.width, small.camera.height)
     start = time.perf_counter()
     check = oracle.draw(double, small, background)
     pixels = sum(t.view.camera.width * t.view.camera.height for t in subject.truths) / len(subject.truths)

@@ -8,7 +8,6 @@ import io
 import json
 import re
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,13 +36,6 @@ from tests.runs.tradeoff_runs import copied, tiny_run
 
 QUICK = ("alpha_min", "resolution", "store", "colour.degree", "density.neurons")
 """Knobs that compile nothing more."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def short_orbits() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neuprim.runs.finish._ORBIT_FRAMES", 2)
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def small(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same run, whose one model is a compressed one."""
-    copy = tmp_path_factory.mktemp("compressed") / "run"
+    copy = tmp_path_factory.mktemp("compressed") / "small"
     shutil.copytree(whole, copy)
     compress_run(copy)
     (copy / "model.safetensors").unlink()

@@ -7,21 +7,18 @@ import multiprocessing
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from neuprim.config import compose, task_of
+from neuprim.config import compose
 from neuprim.core.checkpoint import save_model
-from neuprim.core.data import Dataset
-from neuprim.core.data.views import SomeViews
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import Fitted, compile_kernels, complete, start
-from neuprim.runs.open import load_dataset
 
-__all__ = ["Trial", "begin", "held_out", "paces_of", "recorded", "run_all"]
+__all__ = ["Trial", "begin", "paces_of", "recorded", "run_all"]
 
 _TURN, _DRAWS = 16, 500
 
@@ -51,13 +48,6 @@ class Trial:
     interventions: int | None = 20
 
 
-def held_out(dataset: Dataset, every: int) -> Dataset:
-    """The same without its test views: every n-th training view takes their place."""
-    count = range(len(dataset.train))
-    test = [i for i in count if i % every == 0]
-    return replace(dataset, train=SomeViews(dataset.train, [i for i in count if i % every]), test=SomeViews(dataset.train, test))
-
-
 def begin(trial: Trial) -> Fitted:
     """Data and a fresh model."""
     words = [
@@ -72,11 +62,7 @@ def begin(trial: Trial) -> Fitted:
         words.append(f"train.population.every={max(trial.iterations // trial.interventions, 1)}")
     if trial.keep is not None:
         words.append(f"output_dir='{trial.keep.resolve()}'")
-    config = compose(words, check_output=False)
-    dataset = None
-    if trial.hold_out:
-        dataset = held_out(load_dataset(config, task_of(config)), trial.hold_out)
-    return start(config, dataset=dataset)
+    return start(compose(words, check_output=False), hold_out=trial.hold_out)
 
 
 Wanted = Sequence[str] | Callable[[dict[str, Any]], dict[str, Any]]

@@ -8,10 +8,11 @@ from typing import Any
 
 from neuprim.core.io.files import write_text
 from neuprim.core.metrics import psnr
+from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.measure import draw
 
-__all__ = ["curve_psnr", "next_evaluation", "open_curve"]
+__all__ = ["curve_psnr", "next_evaluation", "open_curve", "read_curve"]
 
 _VIEWS = 5  # held-out views behind the curve's eval_psnr
 _PSNR_MAX = 200.0  # dB; equal images have an infinite one
@@ -29,6 +30,21 @@ def open_curve(path: Path, step: int) -> Any:
                 continue  # a line that a kill cut short
     write_text(path, "".join(f"{text}\n" for text in kept))
     return open(path, "a", encoding="utf-8")
+
+
+def read_curve(path: Path, settings: TrainSettings) -> tuple[tuple[float, float], ...]:
+    """(used fraction of the budget, PSNR of the held-out views behind the curve, dB) of every evaluation in metrics.jsonl; none of a file that is not there."""
+    found = []
+    for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+        try:
+            line = json.loads(text)
+            value, step, seconds = line.get("eval_psnr"), line["step"], line["seconds"]
+        except (ValueError, KeyError, TypeError, AttributeError):
+            continue  # a line that a kill cut short
+        if value is not None:
+            used = [part / whole for part, whole in ((step, settings.iterations), (seconds, settings.max_seconds)) if whole]
+            found.append((min(max(used, default=1.0), 1.0), float(value)))
+    return tuple(found)
 
 
 def next_evaluation(trainer: Trainer) -> float:

@@ -13,6 +13,7 @@ from neuprim.config import RunConfig, made_now, suspects_of, task_of
 from neuprim.core.channels import Channels, channels_of
 from neuprim.core.data import Dataset
 from neuprim.core.data.check import check_dataset
+from neuprim.core.data.held_out import held_out
 from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
@@ -91,11 +92,15 @@ def complete(fitted: Fitted, events: Events = silent) -> Fitted:
     return fitted
 
 
-def start(config: RunConfig, events: Events = silent, dataset: Dataset | None = None, suspects: Suspects | None = None) -> Fitted:
+def start(
+    config: RunConfig, events: Events = silent, dataset: Dataset | None = None, suspects: Suspects | None = None, hold_out: int = 0
+) -> Fitted:
     """Everything up to the first step. Raises as :func:`fit`.
 
     Args:
         suspects: who is watched for crashes around this call; told whose code the data set is.
+        hold_out: n > 1: every n-th training view takes the place of the test views; 0: the data are taken as they are. What a task knows of
+            its test views, and checks here, is of those that the data set came with.
     """
     backends.check_device(config.renderer)
     task = task_of(config)
@@ -112,6 +117,8 @@ def start(config: RunConfig, events: Events = silent, dataset: Dataset | None = 
     channels = channels_of(task, dataset)
     if channels.partial:
         events(Note(f"shown: {channels.shown}; task {task.name!r} has no display that shows them all"))
+    if hold_out:
+        dataset = held_out(dataset, hold_out)
     events(Preparing("starting points"))
     trainer = make_trainer(config, task, dataset, loss)
     asked, found = config.model.primitives, trainer.model.count

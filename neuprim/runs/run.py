@@ -2,34 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import signal
-import threading
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 from neuprim.config import RunConfig, suspects_of
-from neuprim.core import checkpoint
-from neuprim.core.errors import CheckpointError
-from neuprim.core.io.files import write_text
-from neuprim.core.model.edge import EDGES
-from neuprim.core.render.backends import choose, compiled_ahead
-from neuprim.plugins.judging import facts_of
-from neuprim.plugins.provenance import check_resumed
-from neuprim.runs.compile import compiled, compiling, mark_compiled, variant
-from neuprim.runs.curve import open_curve
-from neuprim.runs.events import Events, Finishing, Note, Preparing, silent
+from neuprim.runs.events import Events, Finishing, silent
 from neuprim.runs.finish import finish
-from neuprim.runs.fit import Fitted, compile_kernels, one_torch_thread, start, steps
 from neuprim.runs.open import LOGS
+from neuprim.runs.training import train
 
 __all__ = ["run"]
-
-_COMPILING = "compiling kernels, once per installation (about a minute)"
 
 
 def run(config: RunConfig, events: Events = silent) -> Path:
@@ -45,106 +26,10 @@ def run(config: RunConfig, events: Events = silent) -> Path:
     """
     directory = config.output_dir
     suspects = suspects_of(config)
-    ahead = compiled_ahead(config.renderer)
-    edge = config.model.density.get("edge", 0)  # of a density of ours; of another's, whatever the word means there
-    with compiling(None if ahead is None else ahead.name, edge if edge in EDGES else 0) as kernels, suspects.watch(directory / LOGS):
-        fitted = start(config, events, suspects=suspects)
-        _resume(fitted, events)
-        directory.mkdir(parents=True, exist_ok=True)
-        write_text(directory / "config.yaml", fitted.config.to_yaml())
-        if kernels.running:
-            events(Preparing(_COMPILING))
-            kernels.wait()
-        interrupted = _train(fitted, events)
+    with suspects.watch(directory / LOGS):
+        fitted, interrupted = train(config, suspects, events)
         events(Finishing("measuring held-out views"))
         finish(fitted, directory)
     if interrupted:
         raise KeyboardInterrupt
     return directory
-
-
-def _resume(fitted: Fitted, events: Events) -> None:
-    config, saved = fitted.config, fitted.config.output_dir / "checkpoint.safetensors"
-    if not (config.resume and saved.exists()):
-        return
-    header, tensors = checkpoint.read(saved, "checkpoint")
-    if header.get("task") != config.task:
-        raise CheckpointError(f"{saved}: written for task {header.get('task')!r}; this run's task is {config.task!r}")
-    check_resumed(header.get("made_by"), config.made_by, saved)
-    fitted.trainer.load_state(tensors, header, str(saved))
-    events(Note(f"resumed at step {fitted.trainer.step}"))
-
-
-def _train(fitted: Fitted, events: Events) -> bool:
-    """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
-    trainer, config = fitted.trainer, fitted.config
-    view = fitted.dataset.train.view(0)
-    lowered = trainer.model.lower(view.camera, view.conditions, trainer.renderer)
-    form = variant(type(lowered.colour).__name__, lowered.density.edge)
-    backend = choose(lowered, trainer.renderer, view.camera)
-    if backend.compiles and not compiled(backend.name, form):
-        events(Preparing(_COMPILING))
-    compile_kernels(trainer)
-    if backend.compiles:
-        mark_compiled(backend.name, form)
-    curve = open_curve(config.output_dir / "metrics.jsonl", trainer.step)
-    last_saved = time.monotonic()
-    interrupted = False
-    with _interruptible() as stop, curve, one_torch_thread():
-        for report, held_out in steps(trainer, events):
-            line: dict[str, Any] = {}
-            if held_out is not None:
-                line["eval_psnr"] = held_out
-            if report.change:
-                line["change"] = report.change
-            if line or report.step % config.train.log_every == 0 or trainer.finished:
-                line = {"step": report.step, "seconds": round(report.seconds, 4), "loss": report.loss, **report.parts, "psnr": report.psnr, "primitives": report.primitives, **line}  # fmt: skip
-                curve.write(json.dumps(line) + "\n")
-                curve.flush()
-            if time.monotonic() - last_saved > config.train.checkpoint_every_seconds:
-                _save(fitted)
-                last_saved = time.monotonic()
-            if stop.is_set():
-                interrupted = True
-                break
-    _save(fitted)
-    return interrupted
-
-
-def _save(fitted: Fitted) -> None:
-    trainer, config, dataset = fitted.trainer, fitted.config, fitted.dataset
-    tensors, header = trainer.state()
-    made_by = {} if config.made_by is None else {"made_by": config.made_by.to_dict()}
-    checkpoint.write(config.output_dir / "checkpoint.safetensors", "checkpoint", tensors, {"task": config.task, **made_by, **header})
-    extra: dict[str, Any] = {
-        "background": [float(x) for x in dataset.background],
-        "color_space": dataset.color_space,
-        "channels": list(fitted.channels.names),
-        "data_source": dataset.data_source,
-        "data": facts_of(fitted.task, dataset),
-        **fitted.training,
-    }
-    if dataset.placement is not None:
-        extra["world"] = dataset.placement.to_json()
-    checkpoint.save_model(config.output_dir / "model.safetensors", trainer.model, config.task, extra)
-
-
-@contextmanager
-def _interruptible() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; the second interrupts at once. Outside the main thread Ctrl-C is not ours."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    previous = signal.getsignal(signal.SIGINT)
-
-    def handler(number: int, frame: FrameType | None) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-
-    signal.signal(signal.SIGINT, handler)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, previous)

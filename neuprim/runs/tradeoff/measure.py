@@ -17,7 +17,8 @@ from neuprim.runs.operating import OperatingPoint
 from neuprim.runs.storage import file_bytes
 from neuprim.runs.tradeoff.memory import peak_bytes
 from neuprim.runs.tradeoff.record import Measured
-from neuprim.runs.tradeoff.subject import Exact, Subject, masked
+from neuprim.runs.tradeoff.subject import Exact, Subject
+from neuprim.runs.truths import masked
 
 __all__ = ["Models", "look", "take_turns"]
 

@@ -6,7 +6,8 @@ from neuprim.report.tradeoff import Picture
 from neuprim.runs.operating import read_point
 from neuprim.runs.tradeoff.measure import Models
 from neuprim.runs.tradeoff.record import Record
-from neuprim.runs.tradeoff.subject import Subject, masked
+from neuprim.runs.tradeoff.subject import Subject
+from neuprim.runs.truths import masked
 
 __all__ = ["pictures"]
 

@@ -8,13 +8,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from neuprim.config import RunConfig, suspects_of
 from neuprim.core.channels import Channels, channels_of
 from neuprim.core.data import Dataset, View
-from neuprim.core.data.check import check_pixels
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
 from neuprim.core.metrics import psnr
 from neuprim.core.metrics.lpips import Lpips
@@ -25,23 +23,15 @@ from neuprim.plugins.blame import Suspects
 from neuprim.runs.open import load_dataset, load_run, model_file, placed
 from neuprim.runs.operating import OperatingPoint, read_point
 from neuprim.runs.tradeoff.knobs import Candidate
+from neuprim.runs.truths import Truth, truths_of
 
-__all__ = ["Exact", "Subject", "Truth", "exact_images", "load_subject", "masked"]
+__all__ = ["Exact", "Subject", "exact_images", "load_subject"]
 
 _EQUAL = 400.0
 """dB that stand for equal images, as JSON has no infinity."""
 
 _SMALL = 48
 """Pixels on the longer side of the image that tells how exact, and how slow, an exact image is."""
-
-
-@dataclass(frozen=True)
-class Truth:
-    """A held-out view: its name, camera and conditions, its true image over the background, (H, W, C), and which pixels count."""
-
-    view: View
-    image: Tensor
-    mask: Tensor | None
 
 
 @dataclass
@@ -127,14 +117,9 @@ def load_subject(run_dir: Path, words: Sequence[str], views: int, lpips: str | P
     suspects = suspects_of(config)
     dataset = load_dataset(config, task, run_dir=run_dir)
     suspects.know(dataset)
-    count = len(dataset.test)
-    if not count:
+    truths = truths_of(dataset, views)
+    if not truths:
         raise DataError(f"{run_dir}: {dataset.name} has no held-out views; expected some to measure on")
-    truths = []
-    for i in sorted({k * count // views for k in range(min(views, count))}):
-        view, pixels = dataset.test.view(i), dataset.test.pixels(i)
-        check_pixels("test", view, pixels, dataset.channels)
-        truths.append(Truth(view, pixels.over(dataset.background), pixels.mask))
     channels, file = channels_of(task, dataset), model_file(run_dir)
     return Subject(run_dir, config, task, model, dataset, channels, suspects, reference, truths, file, distance)
 
@@ -196,8 +181,3 @@ def exact_images(subject: Subject, allowed: float, float64: bool | None = None) 
     seconds = (time.perf_counter() - start) / len(images)
     error = min(psnr(uncut.draw(model, small, subject.background).double(), check), _EQUAL)
     return Exact(images, False, error, size, seconds, slow)
-
-
-def masked(image: Tensor, truth: Truth) -> Tensor:
-    """The image with the truth where pixels do not count, as metrics take it."""
-    return image if truth.mask is None else torch.where(truth.mask[..., None], image, truth.image.to(image))

@@ -19,6 +19,7 @@ from neuprim.cli.environment_flags import add_environment_flags, environment_of
 from neuprim.cli.export_help import export_help
 from neuprim.cli.metrics_report import print_metrics
 from neuprim.cli.operating_words import DRAWN, OPERATING, operating_words
+from neuprim.cli.prune import for_prune, prune
 from neuprim.cli.tradeoff import for_tradeoff, tradeoff
 from neuprim.core.errors import DISK, ConfigError, NeuprimError, nearest
 from neuprim.core.notices import warnings_as_lines
@@ -151,6 +152,8 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
 
     arguments.for_compress(command("compress", _compress, "write a run's model in few bits, as one file that every command reads"))
 
+    for_prune(command("prune", _prune, "remove what a run's scene does not require, and write the rest as a run"))
+
     back = command("import", _import, "make a run directory of an exported .ply or .npz, or of a .neuprim")
     back.add_argument("file", type=Path, metavar="FILE")
     back.add_argument("--out", type=Path, required=True, metavar="RUN_DIR", help="new directory")
@@ -282,6 +285,11 @@ def _compress(args: argparse.Namespace) -> int:
     progress = LineProgress(plain_console(stderr=True))
     print_compression(compress_run(run_dir, args.level, args.bits, args.out, args.force, progress))
     return 0
+
+
+def _prune(args: argparse.Namespace) -> int:
+    _run_directory(args.run_dir)
+    return prune(args)
 
 
 def _import(args: argparse.Namespace) -> int:

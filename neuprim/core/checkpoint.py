@@ -19,9 +19,10 @@ from torch import Tensor
 from neuprim.core import compressed
 from neuprim.core.errors import CheckpointError, nearest
 from neuprim.core.io.files import atomic_path
-from neuprim.core.model.fields import ColourField, DensityField
+from neuprim.core.model.fields import ColourField, DensityField, pieces_by_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
+from neuprim.core.zeros import split_off, whole
 
 __all__ = ["FORMAT", "load_model", "read", "read_header", "save_compressed", "save_model", "stored_config", "write"]
 
@@ -96,8 +97,10 @@ def read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 
 def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any]) -> None:
-    """Write what rendering needs. ``extra`` (JSON-able) joins the header: background, colour space, data source."""
-    write(path, "model", model.params, _model_header(model, task, extra))
+    """Write what rendering needs, without what is zero (:mod:`neuprim.core.zeros`). ``extra`` (JSON-able) joins the header: background,
+    colour space, data source."""
+    tensors, apart = split_off(model.params, model.specs, pieces_by_name(model.density, model.colour))
+    write(path, "model", tensors, {**_model_header(model, task, extra), **({"apart": apart} if apart else {})})
 
 
 def save_compressed(
@@ -154,6 +157,9 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
         raise CheckpointError(
             f"{path}: density and colour fields are {type(density).__name__} and {type(colour).__name__}; expected one of each"
         )
+    if "apart" in header:
+        known = pieces_by_name(density, colour)
+        tensors = whole(tensors, header["apart"], (*density.parameters(), *colour.parameters()), known, str(path))
     try:
         model = Primitives(density, colour, tensors)
     except (ValueError, KeyError, TypeError, IndexError) as error:

@@ -75,6 +75,8 @@ def for_compress(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--level", type=count, default=3, metavar="1-5", help="1 keeps nearly everything, 5 very little (default: 3)")
     words = "bits of a parameter, or of all others, over the level's: means=16 sh_rest=6,5 others=8"
     parser.add_argument("--bits", nargs="+", default=[], metavar="NAME=BITS", help=words)
+    parser.add_argument("--seconds", type=duration, default=30.0, metavar="S", help="of training for few bits; 0 for none (default: 30)")
+    parser.add_argument("--steps", type=whole, metavar="N", help="of training instead, for the same file on every machine")
     parser.add_argument("--out", "--output", type=Path, metavar="FILE", help="where to write (default: RUN_DIR/model.neuprim)")
     parser.add_argument("--force", action="store_true", help="replace a file that exists")
 

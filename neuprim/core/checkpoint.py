@@ -104,25 +104,33 @@ def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any
 
 
 def save_compressed(
-    path: Path, model: Primitives, task: str, extra: Mapping[str, Any], table: compressed.BitTable, config: str | None = None
+    path: Path,
+    model: Primitives,
+    task: str,
+    extra: Mapping[str, Any],
+    table: compressed.BitTable,
+    config: str | None = None,
+    made: compressed.Schemes | None = None,
 ) -> dict[str, compressed.Stored]:
     """As :func:`save_model`, in few bits; returns what the file has of every parameter.
 
     Args:
         table: how many.
         config: text of the run's ``config.yaml``, so that a run directory can be made of the file.
+        made: of a model that is folded and was trained for them; then the table is not asked.
 
     Raises:
         CheckpointError: numbers that cannot be stored, or the file could not be written; names it and the reason.
     """
-    model = compressed.folded(model)
-    schemes = compressed.schemes(model, table)
-    sections = compressed.encode(model, schemes)
+    if made is None:
+        model = compressed.folded(model)
+        made = compressed.schemes(model, table)
+    sections = compressed.encode(model, made)
     if config is not None:
         sections.insert(0, compressed.Section(compressed.CONFIG, compressed.TEXT, (), planes=(config.encode(),)))
     header = {"format": FORMAT, "kind": "model", **_model_header(model, task, extra)}
     sizes = compressed.write_compressed(path, header, model.count, sections)
-    return {name: compressed.Stored(compressed.bits_in_words(scheme), sizes[name]) for name, scheme in schemes.items()}
+    return {name: compressed.Stored(compressed.bits_in_words(scheme), sizes[name]) for name, scheme in made.items()}
 
 
 def stored_config(path: Path) -> str | None:

@@ -6,6 +6,7 @@ zero (:mod:`neuprim.core.zeros`), and compressed files have next to nothing to s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -39,7 +40,7 @@ class Piece:
 
 def numbers_of(piece: Piece, params: Params) -> int:
     """How many numbers of one primitive the piece is."""
-    return sum(value[0].numel() if len(value) else 0 for value in piece.of(params).values())
+    return sum(math.prod(value.shape[1:]) for value in piece.of(params).values())
 
 
 def worth(piece: Piece, params: Params, gradients: Params) -> Tensor:
@@ -47,7 +48,7 @@ def worth(piece: Piece, params: Params, gradients: Params) -> Tensor:
     total: Tensor | None = None
     slopes = piece.of(gradients)
     for name, value in piece.of(params).items():
-        part = (value.detach() * slopes[name]).reshape(len(value), -1).sum(1)
+        part = _flat(value.detach() * slopes[name]).sum(1)
         total = part if total is None else total + part
     assert total is not None, "a piece has numbers"
     return total
@@ -70,5 +71,9 @@ def without(pieces: Mapping[str, tuple[Piece, Tensor]], params: Params) -> dict[
 
 def alive(piece: Piece, params: Params) -> Tensor:
     """(N,) bool of the primitives of whose piece some number is not zero."""
-    parts = [(value.detach() != 0).reshape(len(value), -1).any(1) for value in piece.of(params).values()]
-    return torch.stack(parts).any(0)
+    return torch.stack([_flat(value.detach() != 0).any(1) for value in piece.of(params).values()]).any(0)
+
+
+def _flat(value: Tensor) -> Tensor:
+    """(N, numbers of a primitive), also of no primitives."""
+    return value.reshape(len(value), math.prod(value.shape[1:]))

@@ -22,7 +22,7 @@ from neuprim.core.model.pieces import alive
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer
-from neuprim.runs.finetune import fine_tuner
+from neuprim.runs.finetune import steps_in
 from neuprim.runs.finish import finish
 from neuprim.runs.fit import Fitted, make_loss, one_torch_thread, settings_for
 from neuprim.runs.measure import draw, measure
@@ -38,9 +38,6 @@ FILE = "pruned.json"
 
 _TURNS = 12
 """Frames that tell how fast a model is drawn."""
-
-_WARM, _PACED = 5, 20
-"""Steps before the pace is taken, and those that it is taken of."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +108,7 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
         suspects.know(dataset)
         check_dataset(dataset, task.conditions)
         begun = time.monotonic()
-        steps = _steps(request, config, task, dataset, model)
+        steps = request.steps if request.steps is not None else steps_in(request.seconds, config, task, dataset, model)
         search = Search(config, task, dataset, request.tolerance, steps, progress)
         small, words = search(model)
         seconds = time.monotonic() - begun
@@ -132,21 +129,6 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
 
 
 # ---------------------------------------------------------------- parts
-
-
-def _steps(request: Request, config: RunConfig, task: TaskSpec, dataset: Dataset, model: Primitives) -> int:
-    """As many as were asked for, or as fit into the seconds at the pace of the whole model."""
-    if request.steps is not None:
-        return request.steps
-    if request.seconds <= 0:
-        return 0
-    trainer = fine_tuner(config, task, dataset, model, _WARM + _PACED)
-    for _ in range(_WARM):
-        trainer.train_step()
-    before = trainer.elapsed
-    for _ in range(_PACED):
-        trainer.train_step()
-    return max(int(request.seconds * _PACED / max(trainer.elapsed - before, 1e-9)), 1)
 
 
 def _quality(config: RunConfig, task: TaskSpec, dataset: Dataset, model: Primitives) -> tuple[float, float]:

@@ -50,6 +50,8 @@ _ROWS = (
 
 
 def _report(made: Pruning, tolerance: float) -> None:
+    from neuprim.runs.kept import kept_words
+
     for number, stage in enumerate(made.stages, 1):
         less = f", {', '.join(stage.words)}" if stage.words else ""
         what = f"cut {number}: {stage.primitives:,} primitives, {stage.numbers:,} numbers{less}"
@@ -66,7 +68,6 @@ def _report(made: Pruning, tolerance: float) -> None:
         print(f"{name:{widths[0]}}  {before:>{widths[1]}}  {after:>{widths[2]}}".rstrip())
     for word in made.words:
         print(f"all primitives: {word}")
-    for name, share in made.kept.items():
-        if share < 1:
-            print(f"{name}: kept by {share:.0%} of the primitives")
+    for line in kept_words(made.kept):
+        print(line)
     print(f"fine-tuned for {made.steps:,} steps, {made.seconds:.0f} s in all")

@@ -167,7 +167,7 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
         )
     if "apart" in header:
         known = pieces_by_name(density, colour)
-        tensors = whole(tensors, header["apart"], (*density.parameters(), *colour.parameters()), known, str(path))
+        tensors = whole(tensors, header.pop("apart"), (*density.parameters(), *colour.parameters()), known, str(path))
     try:
         model = Primitives(density, colour, tensors)
     except (ValueError, KeyError, TypeError, IndexError) as error:

@@ -91,7 +91,7 @@ def compress_run(
     config, task, model, header = load_run(run_dir)
     config = replace(config, output_dir=run_dir)
     table = bit_table(level, bits, model.specs)
-    extra = {k: v for k, v in header.items() if k not in ("format", "kind", "task", "primitives", "density", "colour", "apart")}
+    extra = {k: v for k, v in header.items() if k not in ("format", "kind", "task", "primitives", "density", "colour")}
     notes = ["its primitives are in another order than the run's"]
     dataset: Dataset | None = None
     try:

@@ -17,14 +17,13 @@ from neuprim.core.data.check import check_dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.drafts import refuse_taken
 from neuprim.core.io.files import write_json, write_text
-from neuprim.core.model.fields import pieces_by_name
-from neuprim.core.model.pieces import alive
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.finetune import steps_in
 from neuprim.runs.finish import finish
 from neuprim.runs.fit import Fitted, make_loss, one_torch_thread, settings_for
+from neuprim.runs.kept import kept_pieces
 from neuprim.runs.measure import draw, measure
 from neuprim.runs.open import LOGS, load_dataset, load_run, model_file, placed, read_metrics
 from neuprim.runs.prune.cut import numbers, zeros_of
@@ -115,7 +114,7 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
         judged = (search.base, search.judge(small))
         if numbers(small) >= numbers(model):
             there = _facts(model, model_file(request.run_dir), _quality(config, task, dataset, model), _paces(config, dataset, (model,))[0])
-            return Pruning(None, there, there, (), _kept(model), judged, tuple(search.stages), steps, seconds)
+            return Pruning(None, there, there, (), kept_pieces(model), judged, tuple(search.stages), steps, seconds)
         progress("measuring held-out views", 1.0)
         paces = _paces(config, dataset, (model, small))
         before = _facts(model, model_file(request.run_dir), _quality(config, task, dataset, model), paces[0])
@@ -123,7 +122,7 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
         _written(final, config, task, dataset, small, words, header, steps, seconds)
         metrics = read_metrics(final)
         after = _facts(small, final / "model.safetensors", (metrics["psnr"], metrics["ssim"]), paces[1])
-    made = Pruning(final, before, after, words, _kept(small), judged, tuple(search.stages), steps, seconds)
+    made = Pruning(final, before, after, words, kept_pieces(small), judged, tuple(search.stages), steps, seconds)
     write_json(final / FILE, _record(request, made))
     return made
 
@@ -154,12 +153,6 @@ def _paces(config: RunConfig, dataset: Dataset, models: Sequence[Primitives]) ->
 def _facts(model: Primitives, file: Path, quality: tuple[float, float], pace: float) -> dict[str, float]:
     facts = {"primitives": model.count, "numbers": numbers(model), "bytes": file.stat().st_size}
     return {**facts, "psnr": quality[0], "ssim": quality[1], "frames_per_second": pace}
-
-
-def _kept(model: Primitives) -> dict[str, float]:
-    """Piece -> share of the primitives that have it."""
-    pieces = pieces_by_name(model.density, model.colour)
-    return {name: float(alive(piece, model.params).float().mean()) if model.count else 0.0 for name, piece in pieces.items()}
 
 
 def _written(

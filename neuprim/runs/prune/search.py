@@ -103,7 +103,7 @@ class Search:
         self.base = self.judge(model)
         best, tried = _State(model), None
         rounds = min(max(self.steps // _LEAST, 1), ROUNDS)
-        bite = self.tolerance * (_BITE if self.steps else 1.0)
+        bite = self.tolerance * (1.0 + (_BITE - 1.0) * min(self.steps / rounds / _LEAST, 1.0))
         for number in range(rounds):
             left = self.tolerance - max(best.lost, 0.0)
             if left < _ENOUGH * self.tolerance or not best.model.count:
@@ -122,7 +122,8 @@ class Search:
             elif tried.rounds > 1 or tried.lost > _PATIENCE * self.tolerance:
                 bite *= min(max(0.7 * left / max(spent, 1e-9), 0.2), 0.7)
                 tried = None
-        return best.model, best.words
+        last = {word.partition("=")[0]: word for word in best.words}  # degree 0 after degree 2 is degree 0
+        return best.model, tuple(last.values())
 
     # ------------------------------------------------------------ one stage
 

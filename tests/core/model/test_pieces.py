@@ -1,0 +1,168 @@
+"""Pieces of primitives: what fields name, what their absence changes, and files that leave them out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from neuprim.core import checkpoint
+from neuprim.core.errors import CheckpointError
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.fields import Field, pieces_by_name
+from neuprim.core.model.pieces import alive, numbers_of, without, worth
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.task import TaskSpec
+from neuprim.core.zeros import split_off, whole
+from neuprim.plugins.registry import load_task
+from neuprim.tasks.dynamic.colour import TimeHarmonics
+from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.relight.colour import LightNetwork
+from neuprim.tasks.relight.harmonics import LightHarmonics
+from neuprim.tasks.static.fields import SphericalHarmonics
+from tests.core.model.test_reductions import CONDITIONS, COUNT, camera, made
+
+PAIRS = [
+    (CosineDensity(3, edge=2, gain=True), SphericalHarmonics(3)),
+    (TimeDensity(2, "phase+offset+window+motion"), TimeHarmonics(2)),
+    (CosineDensity(1), LightHarmonics(4)),
+    (CosineDensity(0), LightNetwork(4, visibility="none")),
+    (CosineDensity(0), LightNetwork(3, form="multiplicative", visibility="none")),
+]
+
+
+def pruned(model: Primitives, seed: int = 5) -> Primitives:
+    """The model, in which every piece is gone from half of the primitives."""
+    generator = torch.Generator().manual_seed(seed)
+    pieces = pieces_by_name(model.density, model.colour)
+    gone = {name: (piece, torch.rand(model.count, generator=generator) < 0.5) for name, piece in pieces.items()}
+    return Primitives(model.density, model.colour, without(gone, model.params))
+
+
+@pytest.mark.parametrize(("density", "colour"), PAIRS, ids=lambda field: type(field).__name__)
+def test_no_number_is_in_two_pieces_and_each_has_some(density: Field, colour: Field) -> None:
+    model = made(density, colour)
+    pieces = pieces_by_name(model.density, model.colour)
+    assert pieces
+    times = {name: torch.zeros_like(value) for name, value in model.params.items()}
+    for piece in pieces.values():
+        assert numbers_of(piece, model.params) > 0
+        for name, place in piece.places.items():
+            times[name][(slice(None), *place)] += 1
+    assert all(float(count.max()) <= 1 for count in times.values() if count.numel())
+
+
+@pytest.mark.parametrize(("density", "colour"), PAIRS, ids=lambda field: type(field).__name__)
+def test_of_a_piece_that_is_gone_nothing_is_left(density: Field, colour: Field) -> None:
+    """A primitive whose piece is zero looks like one whose other numbers of the piece never were: moving zeros elsewhere changes nothing."""
+    model = made(density, colour)
+    for name, piece in pieces_by_name(model.density, model.colour).items():
+        everywhere = torch.ones(COUNT, dtype=torch.bool)
+        empty = Primitives(model.density, model.colour, without({name: (piece, everywhere)}, model.params))
+        assert not bool(alive(piece, empty.params).any()) and bool(alive(piece, model.params).all())
+        empty.lower(camera(), CONDITIONS).check()
+        untouched = [key for key in model.params if key not in piece.places]
+        assert all(empty.params[key] is model.params[key] for key in untouched)
+
+
+def test_a_neuron_that_is_gone_is_a_field_without_it() -> None:
+    model = made(*PAIRS[0])
+    piece = pieces_by_name(model.density, model.colour)["density.neuron 1"]
+    empty = without({"": (piece, torch.ones(COUNT, dtype=torch.bool))}, model.params)
+    fewer = {name: value[:, [0, 2]] if name in ("W1", "b1", "w2") else value for name, value in model.of(model.density).items()}
+    prim, x = torch.arange(COUNT), model.params["means"] + 0.02
+    own = {name: empty[name] for name in model.of(model.density)}
+    found = model.density.density(own, model.geometry, prim, x, {})
+    expected = CosineDensity(2, edge=2, gain=True).density(fewer, model.geometry, prim, x, {})
+    assert torch.allclose(found, expected, atol=1e-6)
+
+
+def test_worth_is_the_first_order_of_doing_without() -> None:
+    model = made(*PAIRS[0])
+    piece = pieces_by_name(model.density, model.colour)["colour.band 2"]
+    params = {name: value.clone().requires_grad_() for name, value in model.params.items()}
+    weights = torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(1))
+    colours = 5.0 + sum((params["sh_rest"][:, i] for i in range(15)), torch.zeros(COUNT, 3))  # linear, as harmonics are
+    (colours * weights).sum().backward()
+    gradients = {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()}
+    expected = (model.params["sh_rest"][:, 3:8].sum(1) * weights).sum(1)
+    assert torch.allclose(worth(piece, params, gradients), expected, atol=1e-5)
+
+
+# ---------------------------------------------------------------- files
+
+
+@pytest.mark.parametrize(("density", "colour"), PAIRS, ids=lambda field: type(field).__name__)
+def test_files_leave_zeros_out_and_give_them_back(density: Field, colour: Field) -> None:
+    model = pruned(made(density, colour))
+    pieces = pieces_by_name(model.density, model.colour)
+    stored, apart = split_off(model.params, model.specs, pieces)
+    own = (*model.density.parameters(), *model.colour.parameters())
+    again = whole(stored, apart, own, pieces, "file")
+    assert apart and again.keys() == model.params.keys()
+    assert all(torch.equal(again[name], value) for name, value in model.params.items())
+    assert sum(t.numel() * t.element_size() for t in stored.values()) < 4 * model.count * model.parameters_per_primitive
+
+
+def test_a_model_without_zeros_is_stored_as_ever() -> None:
+    model = made(*PAIRS[0])
+    stored, apart = split_off(model.params, model.specs, pieces_by_name(model.density, model.colour))
+    assert apart == [] and stored == model.params
+
+
+@pytest.fixture
+def task() -> TaskSpec:
+    return load_task("static")
+
+
+@pytest.fixture
+def file(tmp_path: Path, task: TaskSpec) -> Path:
+    path = tmp_path / "model.safetensors"
+    checkpoint.save_model(path, pruned(made(CosineDensity(2, edge=2, gain=True), SphericalHarmonics(3))), task.name, {})
+    return path
+
+
+def test_a_pruned_model_loads_as_it_was(file: Path, task: TaskSpec) -> None:
+    model, header = checkpoint.load_model(file, task)
+    assert checkpoint.read_header(file, "model")["apart"] and "apart" not in header  # the model in memory is whole
+    expected = pruned(made(CosineDensity(2, edge=2, gain=True), SphericalHarmonics(3)))
+    assert all(torch.equal(model.params[name], value) for name, value in expected.params.items())
+    plain = file.with_name("plain.safetensors")
+    checkpoint.save_model(plain, made(CosineDensity(2, edge=2, gain=True), SphericalHarmonics(3)), task.name, {})
+    assert file.stat().st_size < 0.75 * plain.stat().st_size
+
+
+LIES = {
+    "no mask": (lambda t: t.pop("rows|colour.band 2"), "rows|colour.band 2 is missing"),
+    "a short mask": (lambda t: t.update({"rows|colour.band 2": torch.zeros(1, dtype=torch.uint8)}), "expected torch.uint8 (5,)"),
+    "a mask of floats": (lambda t: t.update({"rows|colour.band 2": torch.zeros(5)}), "expected torch.uint8 (5,)"),
+    "rows too few": (lambda t: t.update({"sh_rest|colour.band 2": t["sh_rest|colour.band 2"][:-1]}), "sh_rest|colour.band 2 is"),
+    "rows too many": (lambda t: t.update({"rows|colour.band 2": torch.zeros(5, dtype=torch.uint8)}), "expected torch.float32 (0, 5, 3)"),
+    "another type": (lambda t: t.update({"sh_rest|colour.band 2": t["sh_rest|colour.band 2"].double()}), "is torch.float64"),
+    "a part missing": (lambda t: t.pop("W1|density.neuron 0"), "W1|density.neuron 0 is missing"),
+    "a part of nothing": (lambda t: t.update({"sh_rest|colour.band 9": torch.zeros(1)}), "belongs to no piece"),
+    "no means": (lambda t: t.pop("means"), "means"),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_files_that_lie_are_refused(lie: str, file: Path, task: TaskSpec) -> None:
+    change, expected = LIES[lie]
+    with safe_open(str(file), framework="pt") as source:
+        metadata, tensors = source.metadata(), {name: source.get_tensor(name) for name in source.keys()}  # noqa: SIM118
+    change(tensors)
+    save_file({name: t.contiguous() for name, t in tensors.items()}, str(file), metadata=metadata)
+    with pytest.raises(CheckpointError) as caught:
+        checkpoint.load_model(file, task)
+    assert expected in str(caught.value) and str(file) in str(caught.value)
+
+
+@pytest.mark.parametrize("names", ["colour.band 1", ["colour.band 7"], [3], {"colour.band 1": 1}])
+def test_a_header_of_pieces_that_do_not_exist_is_refused(names: object, file: Path, task: TaskSpec) -> None:
+    header, tensors = checkpoint.read(file, "model")
+    checkpoint.write(file, "model", tensors, {**{k: v for k, v in header.items() if k not in ("format", "kind")}, "apart": names})
+    with pytest.raises(CheckpointError, match="apart"):
+        checkpoint.load_model(file, task)

@@ -1,0 +1,72 @@
+"""What images would lose: random signs against the change itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from neuprim.core.data import Dataset
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.fields import pieces_by_name
+from neuprim.core.model.pieces import without
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import RenderSettings, render
+from neuprim.core.train.sensitivity import sensitivity
+from neuprim.tasks.static.fields import SphericalHarmonics
+from tests.core import tiny
+from tests.core.model.test_reductions import made
+
+SETTINGS = RenderSettings(threads=1, alpha_min=0.0, transmittance_min=0.0)
+
+
+def model() -> Primitives:
+    """Twelve primitives whose colours are far from where they are cut at zero, so that bands are linear in them."""
+    whole = made(CosineDensity(1, edge=2, gain=True), SphericalHarmonics(1), noise=0.1)
+    small = Primitives(whole.density, whole.colour, whole.rows(torch.arange(12)))
+    small.params["sh_dc"] = small.params["sh_dc"] * 0 + 4.0
+    small.params["log_scales"] = small.params["log_scales"] * 0 - 1.2
+    return small
+
+
+def images(one: Primitives, dataset: Dataset, views: list[int]) -> torch.Tensor:
+    with torch.no_grad():
+        drawn = [dataset.train.view(i) for i in views]
+        return torch.stack([render(one, v.camera, v.conditions, SETTINGS, dataset.background).rgb for v in drawn])
+
+
+def test_signs_find_the_mean_squared_change_of_every_piece() -> None:
+    one, dataset = model(), tiny.two_primitives()
+    views = list(range(len(dataset.train)))[:4]
+    whole = images(one, dataset, views)
+    trials = [sensitivity(one, dataset, views, SETTINGS, seed) for seed in range(60)]
+    pieces = pieces_by_name(one.density, one.colour)
+    found = torch.stack([t.pieces["colour.band 1"] for t in trials]).mean(0)
+    for row in range(one.count):
+        only = torch.arange(one.count) == row
+        less = Primitives(one.density, one.colour, without({"": (pieces["colour.band 1"], only)}, one.params))
+        true = float((images(less, dataset, views) - whole).square().mean())
+        assert abs(float(found[row]) - true) < 0.5 * true + 1e-9
+    assert torch.isfinite(torch.stack([t.pieces["density.neuron 0"] for t in trials])).all()
+
+
+def test_whole_primitives_count_by_the_squares_of_their_weights() -> None:
+    """Its image, white among black ones on black, is its weights."""
+    one, dataset = model(), tiny.two_primitives()
+    views = list(range(len(dataset.train)))[:4]
+    mean = torch.stack([sensitivity(one, dataset, views, SETTINGS, seed).whole for seed in range(60)]).mean(0)
+    plain = {name: value for name, value in one.params.items() if name != "sh_rest"}
+    for row in range(one.count):
+        lit = torch.full((one.count, 3), -0.5 / 0.28209479177387814)  # black
+        lit[row] = 0.5 / 0.28209479177387814  # white: its image is its weights
+        weights = images(
+            Primitives(one.density, SphericalHarmonics(0), {**plain, "sh_dc": lit}), replace(dataset, background=torch.zeros(3)), views
+        )
+        true = float(weights.square().mean())
+        assert abs(float(mean[row]) - true) < 0.5 * true + 1e-9
+
+
+def test_the_same_seed_finds_the_same() -> None:
+    one, dataset = model(), tiny.two_primitives()
+    a, b = (sensitivity(one, dataset, [0, 1], SETTINGS, 3) for _ in range(2))
+    assert torch.equal(a.whole, b.whole) and all(torch.equal(a.pieces[name], b.pieces[name]) for name in a.pieces)

@@ -96,10 +96,14 @@ def read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     return header, tensors
 
 
-def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any]) -> None:
-    """Write what rendering needs, without what is zero (:mod:`neuprim.core.zeros`). ``extra`` (JSON-able) joins the header: background,
-    colour space, data source."""
-    tensors, apart = split_off(model.params, model.specs, pieces_by_name(model.density, model.colour))
+def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any], without_zeros: bool = False) -> None:
+    """Write what rendering needs. ``extra`` (JSON-able) joins the header: background, colour space, data source.
+
+    Args:
+        without_zeros: whether pieces that are zero are left out (:mod:`neuprim.core.zeros`), as in models that were pruned.
+    """
+    pieces = pieces_by_name(model.density, model.colour) if without_zeros else {}
+    tensors, apart = split_off(model.params, model.specs, pieces)
     write(path, "model", tensors, {**_model_header(model, task, extra), **({"apart": apart} if apart else {})})
 
 

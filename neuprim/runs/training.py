@@ -125,7 +125,7 @@ def save(fitted: Fitted) -> None:
     }
     if dataset.placement is not None:
         extra["world"] = dataset.placement.to_json()
-    checkpoint.save_model(config.output_dir / "model.safetensors", trainer.model, config.task, extra)
+    checkpoint.save_model(config.output_dir / "model.safetensors", trainer.model, config.task, extra, without_zeros=bool(trainer.zeros))
 
 
 @contextmanager

@@ -53,7 +53,10 @@ def error_line(capsys: pytest.CaptureFixture[str]) -> str:
 
 def test_the_command_says_what_became_of_every_parameter(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "m.neuprim"
-    assert main(["compress", str(whole), "--level", "2", "--bits", "W1=12", "means=20", "sh_rest=9,7", "--out", str(out)]) == 0
+    assert (
+        main(["compress", str(whole), "--seconds", "0", "--level", "2", "--bits", "W1=12", "means=20", "sh_rest=9,7", "--out", str(out)])
+        == 0
+    )
     lines = capsys.readouterr().out.splitlines()
     _, _, model, _ = load_run(whole)
     assert lines[0] == str(out) and lines[1].split() == ["bits", "bytes", "before", "after", "times"]
@@ -87,7 +90,7 @@ def test_a_run_without_its_data_is_compressed_too(tmp_path: Path, capsys: pytest
     scene = tiny.write_blender(tmp_path / "two")
     run = marked.write_run(tmp_path / "run", marked.static_model(), ["task=static", "scene=blender", f"scene.path='{scene}'"])
     shutil.rmtree(scene)
-    assert main(["compress", str(run)]) == 0
+    assert main(["compress", str(run), "--seconds", "0"]) == 0
     out = capsys.readouterr().out
     assert "psnr" not in out and "note: what this costs was not measured, as the run's data cannot be read: " in out
     assert load_run(run)[2].count == 5
@@ -96,11 +99,11 @@ def test_a_run_without_its_data_is_compressed_too(tmp_path: Path, capsys: pytest
 def test_a_file_in_the_way_stays(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "m.neuprim"
     out.write_bytes(b"mine")
-    assert main(["compress", str(whole), "--out", str(out)]) == 2
+    assert main(["compress", str(whole), "--seconds", "0", "--out", str(out)]) == 2
     assert f"{out}: exists; --force replaces it" in error_line(capsys) and out.read_bytes() == b"mine"
-    assert main(["compress", str(whole), "--output", str(tmp_path)]) == 2
+    assert main(["compress", str(whole), "--seconds", "0", "--output", str(tmp_path)]) == 2
     assert f"--out {tmp_path}: is a folder" in error_line(capsys)
-    assert main(["compress", str(whole), "--out", str(out), "--force"]) == 0
+    assert main(["compress", str(whole), "--seconds", "0", "--out", str(out), "--force"]) == 0
     assert out.read_bytes()[1:8] == b"NEUPRIM"
 
 
@@ -114,7 +117,7 @@ def test_a_file_in_the_way_stays(whole: Path, tmp_path: Path, capsys: pytest.Cap
     ],
 )
 def test_wrong_words(whole: Path, capsys: pytest.CaptureFixture[str], more: list[str], message: str) -> None:
-    assert main(["compress", str(whole), *more]) == 2
+    assert main(["compress", str(whole), "--seconds", "0", *more]) == 2
     assert message in error_line(capsys) and not (whole / "model.neuprim").exists()
 
 

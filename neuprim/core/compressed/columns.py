@@ -86,21 +86,23 @@ def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) 
 
 
 def keep_zero(columns: Columns) -> Columns:
-    """The same with ends a little further apart, so that 0 is one of the values and comes back as 0: for columns that many primitives do without.
+    """The same with ends a little closer, by two steps at most, so that 0 is one of the values and comes back as 0: for columns that many
+    primitives do without.
 
-    Ends are whole multiples of a step that is short enough in binary for both to be float32 numbers.
+    Ends are whole multiples of a step that is short enough in binary for both to be float32 numbers. As no end lies beyond what the numbers
+    reach, what was decoded is coded again as it was.
     """
     low, high, last = columns.low.double().clamp(max=0.0), columns.high.double().clamp(min=0.0), columns.last.double()
-    width = torch.where(high > low, high - low, 1.0)
-    code = (-low / width * last).round()
-    code = torch.where(low < 0, code.clamp(min=1.0), code)
-    code = torch.minimum(code, torch.where(high > 0, last - 1, last))
-    step = torch.maximum(
-        torch.where(code > 0, -low / code.clamp(min=1.0), 0.0), torch.where(code < last, high / (last - code).clamp(min=1.0), 0.0)
-    )
-    mantissa, exponent = torch.frexp(step)
+    width = high - low
+    place = -low / torch.where(width > 0, width, 1.0) * last  # of zero, between two codes
+    tried = torch.stack([place.floor(), place.ceil()])
+    below = torch.where(tried > 0, -low / tried.clamp(min=1.0), torch.inf)
+    above = torch.where(tried < last, high / (last - tried).clamp(min=1.0), torch.inf)
+    steps, better = torch.minimum(below, above).max(0)
+    code = tried.gather(0, better[None])[0]
+    mantissa, exponent = torch.frexp(steps)
     parts = torch.exp2((_MANTISSA - columns.bits).clamp(min=2).double())
-    step = torch.ldexp((mantissa * parts).ceil() / parts, exponent)
+    step = torch.ldexp((mantissa * parts).floor() / parts, exponent)
     return Columns(columns.bits, (-code * step).float(), ((last - code) * step).float())
 
 

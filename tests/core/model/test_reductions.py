@@ -240,7 +240,7 @@ def test_a_still_offset_is_the_mean_of_the_changing_one() -> None:
 def test_without_windows_primitives_are_as_dense_as_they_are_in_the_mean() -> None:
     model = in_time("window", 2)
     density = model.density
-    field, params = density.reduced(model.of(density), model.geometry, "window", 0)
+    _, params = density.reduced(model.of(density), model.geometry, "window", 0)
     times = (torch.arange(400) + 0.5) / 400
     for name in ("w2", "b2"):
         lowered = [getattr(density.lower(model.of(density), model.geometry, {"time": t}), name) for t in times]

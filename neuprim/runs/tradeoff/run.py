@@ -169,7 +169,7 @@ class _Work:
 
         if any(len(m.ms) < wanted(m) for _, m in pairs):
             take_turns(
-                *(self.subject, self.models, pairs, wanted, self.deadline(part), tell),
+                *(self.subject.truths, self.models.ready, pairs, wanted, self.deadline(part), tell),
                 lambda: self.record.write(self.file),
             )
 
@@ -215,7 +215,7 @@ def tradeoff_run(
             reference, [read_point(m.words, subject.config.renderer, subject.model) for m in record.points], record
         )
         record.write(work.file)
-        write_csv(folder / "tradeoff.csv", record, subject.model.count)
+        write_csv(folder / "tradeoff.csv", record, lambda number: subject.model.count)
         progress("pictures of the front", 0.0)
         shown = pictures(subject, record, work.models)
     write_tradeoff(folder, record.to_dict(), shown, lambda words: command(str(request.run_dir), words))

@@ -32,7 +32,7 @@ def tradeoff_models(args: argparse.Namespace) -> int:
     said = [str(a.value) for a in parse(words) if a.key == "budget"]
     if said and args.budget is not None:
         raise ConfigError(f"budget={said[-1]} and --budget {args.budget}: expected one of them")
-    budget = seconds_of(said[-1] if said else args.budget or _BUDGET)
+    budget = seconds_of(said[-1], "budget=") if said else seconds_of(args.budget or _BUDGET)
     request = DesignRequest(words, budget, args.views, args.repeats, knobs, args.seeds or 1, args.lpips)
     try:
         with DrawProgress(plain_console(stderr=True)) as progress:

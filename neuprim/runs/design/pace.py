@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import statistics
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +16,11 @@ from neuprim.runs.training import make_ready
 
 __all__ = ["Pace", "Paces"]
 
-_ROUNDS, _TURN = 4, 4
-"""Turns of so many steps: together as many as the presets have between two looks at voxels."""
+_TURN, _ROUNDS, _MOST_ROUNDS = 4, 4, 20
+"""Steps of a turn, and turns at least: together as many as the presets have between two looks at voxels; and at most."""
+
+_SECONDS = 0.4
+"""Turns go on until steps of the centre have taken as long."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,7 @@ class Paces:
     Steps are taken in the middle of the budget, where every band of colour is in use and images have their full size.
 
     Attributes:
-        seconds: per step of the centre, the mean of all its steps so far.
+        seconds: per step of the centre, the median of all its turns so far: what else the machine did for a moment does not shorten trainings.
         centre: its own pace.
         compiling: seconds that compiling kernels took, or finding them on disk.
     """
@@ -49,33 +54,34 @@ class Paces:
     def __init__(self, centre: RunConfig, dataset: Dataset) -> None:
         self._dataset, self.compiling = dataset, 0.0
         self._trainer, starting, like = self._ready(centre)
-        self._took, self._steps = 0.0, 0
+        self._turns: list[float] = []
         with one_torch_thread():
             _turn(self._trainer)
-            for _ in range(_ROUNDS):
-                self._count(_turn(self._trainer))
-        self.centre = Pace((1.0,) * _ROUNDS, 1.0, starting, like)
+            while self._short(self._turns):
+                self._turns.append(_turn(self._trainer))
+        self.centre = Pace((1.0,) * len(self._turns), 1.0, starting, like)
 
     @property
     def seconds(self) -> float:
-        return self._took / self._steps
+        return statistics.median(self._turns) / _TURN
 
     def of(self, config: RunConfig) -> Pace:
         """Raises what starting a training raises."""
         trainer, starting, like = self._ready(config)
-        own, beside = [], []
+        own, beside = list[float](), list[float]()
         with one_torch_thread():
             _turn(trainer)
-            for _ in range(_ROUNDS):
+            while self._short(beside):
                 beside.append(_turn(self._trainer))
                 own.append(_turn(trainer))
-        for seconds in beside:
-            self._count(seconds)
+        self._turns += beside
         ratios = tuple(a / b for a, b in zip(own, beside, strict=True))
         return Pace(ratios, sum(own) / sum(beside), starting, like)
 
-    def _count(self, seconds: float) -> None:
-        self._took, self._steps = self._took + seconds, self._steps + _TURN
+    @staticmethod
+    def _short(turns: Sequence[float]) -> bool:
+        """Whether more turns are needed."""
+        return len(turns) < _ROUNDS or (sum(turns) < _SECONDS and len(turns) < _MOST_ROUNDS)
 
     def _ready(self, config: RunConfig) -> tuple[Trainer, float, tuple[Any, ...]]:
         begun = time.perf_counter()

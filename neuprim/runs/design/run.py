@@ -67,6 +67,7 @@ def design_run(
         session.train(wanted, _SINGLES)
         session.take_times(_TIMED)
         session.train(session.combinations(_COMBINED), _COMBINED)
+        session.train(wanted, _COMBINED)
         session.take_times(1.0)
         _describe(session)
         record.speed, record.size = fronts(session.models)

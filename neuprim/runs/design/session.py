@@ -107,8 +107,12 @@ class Session:
         return self._planned_at + part * self.remaining - self.spent
 
     def leave_out(self, variant: Variant, reason: str) -> None:
+        one = LeftOut(variant.knob, self._said(variant), reason)
+        self.record.left_out = [other for other in self.record.left_out if other.words != one.words] + [one]
+
+    def _said(self, variant: Variant) -> tuple[str, ...]:
         length = () if variant.length == 1.0 else (f"{variant.length:g} of the length",)
-        self.record.left_out.append(LeftOut(variant.knob, (*variant.turned, *length), reason))
+        return (*variant.turned, *length)
 
     def _no_time(self) -> str:
         return f"no time left of the budget of {self.request.budget:g} s"
@@ -194,6 +198,7 @@ class Session:
             if not paid and lasts > self.left(part):
                 self.leave_out(variant, self._no_time())
                 continue
+            self.record.left_out = [one for one in self.record.left_out if one.words != self._said(variant)]
             try:
                 self._make(variant, f"training {number + 1} of {len(wanted)}, {variant.name}")
             except NeuprimError as error:

@@ -51,15 +51,15 @@ _CHORDS = 96
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
-def seconds_of(budget: str) -> float:
-    """Seconds of a budget such as 90s, 5m or 1h.
+def seconds_of(budget: str, said: str = "--budget ") -> float:
+    """Seconds of a budget such as 90s, 5m or 1h; ``said`` stands before it in messages.
 
     Raises:
         ConfigError: it is something else.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", budget)
     if match is None or float(match[1]) == 0:
-        raise ConfigError(f"--budget {budget}: expected a time such as 90s, 5m or 1h")
+        raise ConfigError(f"{said}{budget}: expected a time such as 90s, 5m or 1h")
     return float(match[1]) * _UNITS[match[2]]
 
 

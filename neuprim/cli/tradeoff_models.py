@@ -23,7 +23,7 @@ def tradeoff_models(args: argparse.Namespace) -> int:
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
     from neuprim.config.overrides import parse
-    from neuprim.report.tradeoff_models import command
+    from neuprim.runs.design.record import Model, command
     from neuprim.runs.design.run import DesignRequest, design_run
     from neuprim.runs.tradeoff.run import seconds_of
 
@@ -39,7 +39,7 @@ def tradeoff_models(args: argparse.Namespace) -> int:
             folder, record = design_run(request, progress.note, progress.show)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("; what is trained is kept, and the same command goes on") from None
-    models = [point for point in record.points if isinstance(point, _kind())]
+    models = [point for point in record.points if isinstance(point, Model)]
     console = plain_console()
     console.print(record.facts["length"], markup=False)
     for title, numbers in (("front of speed", record.speed), ("front of size", record.size)):
@@ -54,12 +54,6 @@ def tradeoff_models(args: argparse.Namespace) -> int:
     return 0
 
 
-def _kind() -> type[Model]:
-    from neuprim.runs.design.record import Model
-
-    return Model
-
-
 def _table(title: str, models: Sequence[Model], numbers: Sequence[int]) -> Table:
     """The centre, and the models of a front under the numbers that their commands have."""
     from rich import box
@@ -68,7 +62,6 @@ def _table(title: str, models: Sequence[Model], numbers: Sequence[int]) -> Table
 
     table = Table(title=title, title_justify="left", box=box.SIMPLE, padding=(0, 1, 0, 0))
     table.add_column("#", justify="right", no_wrap=True)
-    table.add_column("model")
     for name in ("PSNR", "SSIM", "time", "frames/s", "bytes", "ms/step", "steps"):
         table.add_column(name, justify="right", no_wrap=True)
     for place, number in (("centre", 0), *((str(k), number) for k, number in enumerate(numbers, 1))):
@@ -81,7 +74,7 @@ def _cells(model: Model) -> tuple[str, ...]:
     about = "" if model.spread is None else f" ± {model.spread:.3f}"
     seeds = "" if model.seed_spread is None else f" ± {model.seed_spread:.2f}"
     return (
-        *(model.name, f"{q['psnr']:.2f}{seeds}", f"{q['ssim']:.4f}"),
+        *(f"{q['psnr']:.2f}{seeds}", f"{q['ssim']:.4f}"),
         *((f"{model.ratio:.3f}{about}", f"{1e3 / model.time:.1f}") if model.ms else ("–", "–")),
         *(f"{model.bytes:,}", f"{model.ms_per_step:.2f}", f"{model.steps:,}"),
     )

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +10,16 @@ from neuprim.report.scatter import Chart, chart_svg
 from neuprim.report.text import byte_size, count, decimal, escape
 from neuprim.report.tradeoff import Page, Picture, section, write_page
 
-__all__ = ["command", "write_models"]
+__all__ = ["write_models"]
 
 
-def command(words: Sequence[str]) -> str:
-    """What trains such a model, ready to paste."""
-    return shlex.join(["neuprim", "run", *words])
-
-
-def write_models(folder: Path, record: Mapping[str, Any], pictures: Mapping[int, Picture]) -> None:
+def write_models(folder: Path, record: Mapping[str, Any], pictures: Mapping[int, Picture], command: Callable[[Sequence[str]], str]) -> None:
     """Write ``tradeoff.html`` and ``front.png`` into ``folder``.
 
     Args:
         record: content of ``tradeoff.json``.
         pictures: of models by their number in it; -1 is the ground truth.
+        command: the words of a model -> the command that trains it, ready to paste.
     """
     write_page(folder, _Models(record, pictures, command))
 

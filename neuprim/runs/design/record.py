@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import shlex
 import statistics
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
 from neuprim.runs.design.variants import Variant
 from neuprim.runs.tradeoff.record import Measured
 
-__all__ = ["Model"]
+__all__ = ["Model", "command"]
+
+
+def command(words: Sequence[str]) -> str:
+    """What trains such a model, ready to paste."""
+    return shlex.join(["neuprim", "run", *words])
 
 
 @dataclass
@@ -23,6 +29,7 @@ class Model(Measured):
         primitives: how many it has; parameters_per_primitive: numbers of each.
         steps, seconds: of its training.
         steps_in_turns: seconds per step over the centre's beside it, of each round in which both took turns.
+        centre_ms: median milliseconds per frame of the centre over all its rounds.
         seeds: PSNR of the training with each seed; ``quality`` has the means of PSNR and SSIM over them, and the other numbers of the first.
         run_dir: the first seed's, inside the folder of the set.
     """
@@ -33,6 +40,7 @@ class Model(Measured):
     parameters_per_primitive: int = 0
     steps: int = 0
     seconds: float = 0.0
+    centre_ms: float = 0.0
     steps_in_turns: tuple[float, ...] = ()
     seeds: tuple[float, ...] = ()
     run_dir: str = ""
@@ -44,6 +52,11 @@ class Model(Measured):
     @property
     def name(self) -> str:
         return self.variant.name
+
+    @property
+    def time(self) -> float:
+        """Milliseconds per frame: the centre's, times the ratio; models that were timed in different rounds, under another load, compare so."""
+        return self.ratio * self.centre_ms if self.centre_ms else super().time
 
     @property
     def ms_per_step(self) -> float:
@@ -76,6 +89,7 @@ _OWN: dict[str, Any] = {
     "parameters_per_primitive": int,
     "steps": int,
     "seconds": float,
+    "centre_ms": float,
     "run_dir": str,
 }
 _LISTS = ("turned", "steps_in_turns", "seeds")

@@ -13,7 +13,7 @@ from neuprim.runs.design.combine import fronts
 from neuprim.runs.design.kept import TRIALS, centre_of, check_folder, kept_record, number_of, old_plan, same_of
 from neuprim.runs.design.pictures import pictures
 from neuprim.runs.design.plan import Plan
-from neuprim.runs.design.record import Model
+from neuprim.runs.design.record import Model, command
 from neuprim.runs.design.request import DesignRequest, Progress, Tell
 from neuprim.runs.design.session import Session
 from neuprim.runs.design.variants import CENTRE, Variant, check_knobs, in_turn, singles
@@ -75,7 +75,7 @@ def design_run(
         write_csv(folder / "tradeoff.csv", record, lambda number: session.models[number].primitives)
         progress("pictures of the front", 0.0)
         shown = pictures(session.measuring, session.models, [*record.speed, *record.size])
-    write_models(folder, record.to_dict(), shown)
+    write_models(folder, record.to_dict(), shown, command)
     return folder, record
 
 

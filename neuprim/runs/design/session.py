@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -270,6 +271,8 @@ class Session:
     def take_times(self, part: float) -> None:
         """Rounds of all models that lack some."""
         self.measuring.take_times(self.models, self.request.repeats, time.monotonic() + self.left(part), self.write)
+        for model in self.models:
+            model.centre_ms = statistics.median(self.models[0].ms)
 
     def combinations(self, part: float) -> list[Variant]:
         """Those of an earlier session, and as many more as there is time for."""

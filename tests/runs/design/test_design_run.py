@@ -19,8 +19,8 @@ from neuprim.cli import main
 from neuprim.config import compose
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, DataError, NonFiniteError
-from neuprim.report.tradeoff_models import command
-from neuprim.runs.design.record import Model
+from neuprim.runs.design.plan import Plan
+from neuprim.runs.design.record import Model, command
 from neuprim.runs.design.run import TRIALS, DesignRequest, design_run
 from neuprim.runs.design.variants import CENTRE, COMBINED
 from neuprim.runs.events import Events
@@ -96,10 +96,10 @@ def test_the_centre_every_knob_alone_and_some_together(measured: tuple[Path, Rec
         )
     by = {model.name: model for model in found}
     assert by["primitives=80"].primitives == 80 and by["neurons=0"].parameters_per_primitive < by["neurons=8"].parameters_per_primitive
-    assert by[CENTRE].steps == STEPS and by["0.25 of the length"].steps == STEPS // 4 and by["neurons=8"].steps != STEPS, (
-        "as long, not as many"
-    )
-    assert by[CENTRE].ratios == [1.0] * 3 and by[CENTRE].bytes > by["primitives=20"].bytes
+    plan = Plan.from_dict(record.facts["plan"])
+    assert by[CENTRE].steps == STEPS == plan.steps and by["0.25 of the length"].steps == STEPS // 4
+    assert all(model.steps == plan.steps_of(model.variant) for model in found) and set(plan.paces) == {model.name for model in found}
+    assert set(by[CENTRE].ratios) == {1.0} and by[CENTRE].bytes > by["primitives=20"].bytes
 
 
 def test_the_words_of_a_point_train_it(measured: tuple[Path, Record]) -> None:

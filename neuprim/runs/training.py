@@ -49,7 +49,7 @@ def train(
     Raises:
         NeuprimError: the input's fault, or numbers that left the finite; whatever was on disk before is intact.
     """
-    ahead = compiled_ahead(config.renderer)
+    ahead = compiled_ahead(config.renderer) if dataset is None else None  # beside loading; of data that are there nothing is waited for
     edge = config.model.density.get("edge", 0)  # of a density of ours; of another's, whatever the word means there
     with compiling(None if ahead is None else ahead.name, edge if edge in EDGES else 0) as kernels:
         fitted = start(config, events, dataset, suspects, hold_out)

@@ -30,7 +30,7 @@ from neuprim.runs.truths import truths_of
 __all__ = ["Session"]
 
 _PACED = 0.2
-"""Part of the budget that finding paces may take."""
+"""Part of the budget that is left when data are loaded, which finding paces may take."""
 
 _SLOW = 10.0
 """Seconds of compiling that are said."""
@@ -128,10 +128,11 @@ class Session:
 
     def with_paces(self, wanted: Sequence[Variant]) -> list[Variant]:
         """Those whose pace could be found in time, and that are models of their own; the others are left out."""
-        kept = []
+        kept, begun = list[Variant](), self.spent
+        latest = begun + _PACED * (self.request.budget - begun)
         for number, variant in enumerate(wanted):
             self.progress(f"pace of {variant.name}", number / len(wanted))
-            late = self.spent > _PACED * self.request.budget
+            late = self.spent > latest
             reason = self._no_time() if late and not self._cheap(variant) else self._find_pace(variant)
             if reason is None:
                 kept.append(variant)

@@ -66,6 +66,7 @@ def test_a_model_is_read_back_as_it_was() -> None:
     made = Model(
         *("model.neurons", ("task=static", "model.neurons=0"), {"psnr": 29.9, "ssim": 0.9}, 800, 4096),
         turned=("model.neurons=0",),
+        centre_ms=4.0,
         primitives=100,
         parameters_per_primitive=20,
         steps=50,
@@ -74,6 +75,8 @@ def test_a_model_is_read_back_as_it_was() -> None:
         seeds=(29.8, 30.0),
         run_dir="trials/neurons-0",
     )
+    made.ratios, made.ms = [0.5, 0.6, 0.7], [9.0, 9.0, 9.0]
+    assert made.time == pytest.approx(2.4), "of the centre's, whatever the load was"
     back = Model.from_dict(made.to_dict())
     assert back == made and back.name == "neurons=0" and back.ms_per_step == 40.0 and back.seed_spread == pytest.approx(0.1414, abs=1e-4)
     assert Model.from_dict(FOUND[7].to_dict()).name == "0.5 of the length"

@@ -22,7 +22,7 @@ neuprim tradeoff RUN_DIR measures the knobs of drawing on a finished run.
 neuprim tradeoff task=NAME scene=NAME budget=20m [KEY=VALUE ...] [output_dir=DIR]
   trains a designed set of models around the one that these words of `neuprim run` name, and measures them side by side.
 
-"""
+After RUN_DIR, """
 
 
 def of_words(first: str) -> bool:

@@ -62,7 +62,7 @@ def _table(title: str, models: Sequence[Model], numbers: Sequence[int]) -> Table
 
     table = Table(title=title, title_justify="left", box=box.SIMPLE, padding=(0, 1, 0, 0))
     table.add_column("#", justify="right", no_wrap=True)
-    for name in ("PSNR", "SSIM", "time", "frames/s", "bytes", "ms/step", "steps"):
+    for name in ("PSNR", "SSIM", "exact", "time", "fps", "ms/step", "bytes", "MB"):
         table.add_column(name, justify="right", no_wrap=True)
     for place, number in (("centre", 0), *((str(k), number) for k, number in enumerate(numbers, 1))):
         table.add_row(*(Text(cell) for cell in (place, *_cells(models[number]))))
@@ -74,7 +74,7 @@ def _cells(model: Model) -> tuple[str, ...]:
     about = "" if model.spread is None else f" ± {model.spread:.3f}"
     seeds = "" if model.seed_spread is None else f" ± {model.seed_spread:.2f}"
     return (
-        *(f"{q['psnr']:.2f}{seeds}", f"{q['ssim']:.4f}"),
+        *(f"{q['psnr']:.2f}{seeds}", f"{q['ssim']:.4f}", f"{q['psnr_exact']:.0f}"),
         *((f"{model.ratio:.3f}{about}", f"{1e3 / model.time:.1f}") if model.ms else ("–", "–")),
-        *(f"{model.bytes:,}", f"{model.ms_per_step:.2f}", f"{model.steps:,}"),
+        *(f"{model.ms_per_step:.1f}", f"{model.bytes:,}", "–" if model.peak_bytes is None else f"{model.peak_bytes / 1e6:.1f}"),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from neuprim.config import suspects_of, task_of
@@ -72,11 +73,22 @@ def design_run(
         _describe(session)
         record.speed, record.size = fronts(session.models)
         session.write()
-        write_csv(folder / "tradeoff.csv", record, lambda number: session.models[number].primitives)
+        write_csv(folder / "tradeoff.csv", record, lambda number: session.models[number].primitives, _columns(session.models))
         progress("pictures of the front", 0.0)
         shown = pictures(session.measuring, session.models, [*record.speed, *record.size])
     write_models(folder, record.to_dict(), shown, command)
     return folder, record
+
+
+def _columns(models: Sequence[Model]) -> dict[str, Callable[[int], object]]:
+    """Of the table, beside those that every point has."""
+    return {
+        "numbers per primitive": lambda number: models[number].parameters_per_primitive,
+        "training steps": lambda number: models[number].steps,
+        "training seconds": lambda number: f"{models[number].seconds:.3f}",
+        "ms per step": lambda number: f"{models[number].ms_per_step:.4f}",
+        "command": lambda number: command(models[number].words),
+    }
 
 
 def _describe(session: Session) -> None:

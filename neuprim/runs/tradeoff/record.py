@@ -10,6 +10,7 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 from neuprim.core.errors import DataError
@@ -187,23 +188,26 @@ def read_record(path: Path, kind: type[Measured] = Measured) -> Record | None:
         raise DataError(f"{path}: not a record of `neuprim tradeoff` ({what}); delete it to measure anew") from error
 
 
-def write_csv(path: Path, record: Record, primitives: Callable[[int], int]) -> None:
+def write_csv(
+    path: Path, record: Record, primitives: Callable[[int], int], more: Mapping[str, Callable[[int], object]] = MappingProxyType({})
+) -> None:
     """The table, a row per point; empty cells are not measured. LPIPS is the survey's, of VGG; another network's is left out.
 
     Args:
         primitives: number of a point -> how many it has.
+        more: further columns, and what stands in them, of a point's number.
     """
     perceived = "lpips_3dgs" if record.same.get("lpips") == "vgg" else ""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow((*COLUMNS, *_MORE))
+    writer.writerow((*COLUMNS, *_MORE, *more))
     for number, point in enumerate(record.points):
         q = point.quality
         own = (point.name, _cell(q.get("psnr")), _cell(q.get("ssim_3dgs")), _cell(q.get(perceived)), point.bytes, primitives(number))
         times = (f"{point.ratio:.4f}", f"{point.time:.4f}", f"{1e3 / point.time:.2f}") if point.ms else ("", "", "")
         peak = "" if point.peak_bytes is None else point.peak_bytes
         fronts = (int(number in record.speed), int(number in record.size))
-        writer.writerow((*own, *times, _cell(q.get("psnr_exact")), peak, *fronts))
+        writer.writerow((*own, *times, _cell(q.get("psnr_exact")), peak, *fronts, *(cell(number) for cell in more.values())))
     write_text(path, buffer.getvalue())
 
 

@@ -267,6 +267,8 @@ def test_the_table_has_the_columns_of_the_survey(measured: tuple[Path, Record]) 
     assert list(rows[0])[: len(COLUMNS)] == list(COLUMNS) and len(rows) == len(record.points)
     for row, model in zip(rows, models(record), strict=True):
         assert row["Submethod"] == model.name and int(row["#Gaussians"]) == model.primitives and int(row["Size [Bytes]"]) == model.bytes
+        assert int(row["training steps"]) == model.steps and float(row["ms per step"]) == pytest.approx(model.ms_per_step, abs=1e-3)
+        assert row["command"] == command(model.words) and int(row["numbers per primitive"]) == model.parameters_per_primitive
         assert float(row["PSNR"]) == pytest.approx(model.quality["psnr"], rel=1e-5)
 
 

@@ -20,7 +20,7 @@ from neuprim.cli.export_help import export_help
 from neuprim.cli.metrics_report import print_metrics
 from neuprim.cli.operating_words import DRAWN, OPERATING, operating_words
 from neuprim.cli.prune import for_prune, prune
-from neuprim.cli.tradeoff import for_tradeoff, tradeoff
+from neuprim.cli.tradeoff import FORMS, for_tradeoff, of_words, tradeoff
 from neuprim.core.errors import DISK, ConfigError, NeuprimError, nearest
 from neuprim.core.notices import warnings_as_lines
 from neuprim.version import __version__
@@ -96,7 +96,12 @@ def _dispatch(words: list[str]) -> int:
     if args.command in ("run", "bench"):
         args.overrides += [word for word in rest if not word.startswith("-")]  # argparse gives up on words after a flag
         rest = [word for word in rest if word.startswith("-")]
-    if args.command in DRAWN:
+    if args.command == "tradeoff" and of_words(args.run_dir):
+        args.words, rest = (
+            [word for word in rest if not word.startswith("-")],
+            [word for word in rest if word.startswith("-") and word != "--"],
+        )
+    elif args.command in DRAWN:
         args.words, rest = operating_words(rest)
     if args.command in ("render", "inspect"):
         args.conditions, rest = _conditions(args.run_dir, rest, args.command, commands[args.command])
@@ -139,7 +144,10 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
     arguments.for_render(render)
     add_environment_flags(render)
 
-    trade = command("tradeoff", _tradeoff, "measure what speed and size cost in accuracy, of a run", OPERATING)
+    trade = command(
+        "tradeoff", _tradeoff, "measure what speed and size cost in accuracy: how a run is drawn, or what is trained", FORMS + OPERATING
+    )
+    trade.usage = "neuprim tradeoff RUN_DIR | KEY=VALUE ... [KEY=VALUE ...] [--views N] [--repeats N] [--knobs NAME ...] [--budget TIME] [--seeds N] [--lpips FILE]"
     for_tradeoff(trade)
 
     export = command("export", _export, "write a run's model in another format", export_help(asked))
@@ -260,7 +268,11 @@ def _render(args: argparse.Namespace) -> int:
 
 
 def _tradeoff(args: argparse.Namespace) -> int:
-    _run_directory(args.run_dir)
+    if of_words(args.run_dir):
+        from neuprim.cli.tradeoff_models import tradeoff_models
+
+        return tradeoff_models(args)
+    args.run_dir = _run_directory(Path(args.run_dir))
     return tradeoff(args)
 
 

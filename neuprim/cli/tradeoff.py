@@ -8,22 +8,38 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuprim.cli import arguments
+from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from neuprim.runs.tradeoff.record import Measured, Record
 
-__all__ = ["for_tradeoff", "tradeoff"]
+__all__ = ["FORMS", "for_tradeoff", "of_words", "tradeoff"]
+
+FORMS = """\
+neuprim tradeoff RUN_DIR measures the knobs of drawing on a finished run.
+neuprim tradeoff task=NAME scene=NAME budget=20m [KEY=VALUE ...] [output_dir=DIR]
+  trains a designed set of models around the one that these words of `neuprim run` name, and measures them side by side.
+
+After RUN_DIR, """
+
+
+def of_words(first: str) -> bool:
+    """Whether the first argument is a word of ``neuprim run`` and not a run's directory."""
+    return "=" in first and not Path(first).exists()
 
 
 def for_tradeoff(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments."""
-    parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    parser.add_argument("run_dir", metavar="RUN_DIR|KEY=VALUE", help="a finished run, or words of `neuprim run`")
     parser.add_argument("--views", type=arguments.count, default=5, metavar="N", help="held-out views, evenly spread (default: 5)")
     parser.add_argument("--repeats", type=arguments.count, default=15, metavar="N", help="rounds of timing (default: 15)")
     parser.add_argument("--knobs", nargs="+", default=[], metavar="NAME", help="some of them, e.g. alpha_min sort (default: all)")
-    parser.add_argument("--budget", default="5m", metavar="TIME", help="about how long, e.g. 90s or 10m; what does not fit is left out")
+    parser.add_argument(
+        "--budget", metavar="TIME", help="about how long, e.g. 90s or 10m; what does not fit is left out (default: 5m, 20m of trainings)"
+    )
+    parser.add_argument("--seeds", type=arguments.count, metavar="N", help="trainings of every model (default: 1)")
     parser.add_argument("--lpips", type=Path, metavar="FILE", help="measure LPIPS with these weights of your own, a file or a folder")
 
 
@@ -36,7 +52,9 @@ def tradeoff(args: argparse.Namespace) -> int:
 
     words = [*args.words, *(word for word in args.knobs if "=" in word)]  # after --knobs they look like names
     knobs = [word for word in args.knobs if "=" not in word]
-    request = Request(args.run_dir, args.views, args.repeats, knobs, seconds_of(args.budget), words, args.lpips)
+    if args.seeds is not None:
+        raise ConfigError("--seeds: of models that are trained (neuprim tradeoff task=NAME ...); a finished run has one")
+    request = Request(args.run_dir, args.views, args.repeats, knobs, seconds_of(args.budget or "5m"), words, args.lpips)
     folder = args.run_dir / FOLDER
     try:
         with DrawProgress(plain_console(stderr=True)) as progress:

@@ -36,6 +36,7 @@ from neuprim.conformance.parameters import (
     check_initialisers,
     check_members,
     check_parameter_specs,
+    check_trade,
 )
 from neuprim.conformance.population import check_clone, check_divide, check_on_split, check_scale_density
 from neuprim.conformance.subject import ConformanceError, Subject
@@ -60,6 +61,7 @@ CHECKS: dict[str, Callable[[Subject], None]] = {
     for function in (
         check_members,
         check_files,
+        check_trade,
         check_fields,
         check_parameter_specs,
         check_initialisers,

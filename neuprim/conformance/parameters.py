@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict
 from typing import Any
 
 import torch
 
 from neuprim.config import check_groups, preset_settings, presets, task_choices
+from neuprim.config.declared import complete_options
 from neuprim.conformance.subject import Subject
+from neuprim.core.checked import checked
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.model.schema import InitContext, ParameterSpec
 from neuprim.core.task import API_VERSION
+from neuprim.core.train.settings import ModelSettings
 from neuprim.core.uses import build_settings
 from neuprim.plugins.members import fault
+from neuprim.plugins.trading import traded
 
-__all__ = ["check_fields", "check_files", "check_initialisers", "check_members", "check_parameter_specs"]
+__all__ = ["check_fields", "check_files", "check_initialisers", "check_members", "check_parameter_specs", "check_trade"]
 
 
 def check_members(t: Subject) -> None:
@@ -47,6 +52,24 @@ def check_files(t: Subject) -> None:
             t.require(False, f"preset {preset}", f"model settings that TaskSpec.check refuses ({error})", "settings that it accepts")
     for scene in t.task.scenes:
         preset_settings(t.task, choice.preset, scene.name)
+
+
+def check_trade(t: Subject) -> None:
+    """What the task offers to trade are settings that exist, at values that its own check accepts, so that no training of a designed set is offered in vain."""
+    offered = traded(t.task, build_settings(t.task, t.settings.model, t.options))
+    for name, values in offered.items():
+        for value in values:
+            tree: dict[str, Any] = {"model": asdict(t.settings.model), "task": {"options": dict(t.options)}}
+            *path, last = name.split(".")
+            node = tree
+            for part in path:
+                node = node.setdefault(part, {})
+            node[last] = value
+            try:
+                options = complete_options(t.task.options, tree["task"]["options"], f"task {t.task.name!r}")
+                t.task.check(build_settings(t.task, checked(ModelSettings, tree["model"], "model"), options))
+            except ConfigError as error:
+                t.require(False, f"trade: {name}={value}", f"a setting that is refused ({error})", "settings that the task takes")
 
 
 def check_fields(t: Subject) -> None:

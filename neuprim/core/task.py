@@ -131,6 +131,11 @@ class TaskSpec:
     """(data set, number of frames) -> views circling the scene, with every condition of the task; see
     :meth:`~neuprim.core.data.dataset.Dataset.orbit`, which is taken without one."""
 
+    trade: Callable[[Mapping[str, Any]], Mapping[str, Sequence[Any]]] = lambda model: {}
+    """(what ``build`` gets) -> settings of the model that trade quality for speed or size, as the user types them, with the values that are
+    worth training: ``{"model.neurons": (0, 2, 4, 8)}``. ``neuprim tradeoff task=NAME`` turns them, beside the number of primitives and the length
+    of the training, which every task has. Names begin with ``model.`` or ``task.options.``; values are numbers, texts, true or false."""
+
     def parameter_names(self) -> set[str]:
         """Names of the parameters that the task's fields have at any settings.
 

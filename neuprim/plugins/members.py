@@ -27,7 +27,7 @@ _TEXTS: dict[type, tuple[str, ...]] = {
     Inspector: ("name", "summary"),
 }
 _CALLS: dict[type, tuple[str, ...]] = {
-    TaskSpec: ("build", "loss", "check", "mask", "judge", "diagnose", "clips", "facts", "orbit"),
+    TaskSpec: ("build", "loss", "check", "mask", "judge", "diagnose", "clips", "facts", "orbit", "trade"),
     SceneSpec: ("load",),
     SceneExtension: (),
     ConditionSpec: ("parse",),

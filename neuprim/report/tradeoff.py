@@ -21,7 +21,7 @@ from neuprim.report.pictures import Inlined, color_bar, error_map, inline
 from neuprim.report.scatter import Chart, Dot, chart_svg, write_charts
 from neuprim.report.text import byte_size, count, decimal, escape
 
-__all__ = ["Picture", "write_tradeoff"]
+__all__ = ["DIFFERENCE", "Page", "Picture", "section", "write_page", "write_tradeoff"]
 
 DIFFERENCE = 0.05
 """Difference from the reference point at the bright end of its colours."""
@@ -53,9 +53,13 @@ def write_tradeoff(
         pictures: of points by their number in it; -1 is the ground truth.
         command: the words of a point -> the command that draws it, ready to paste.
     """
-    page = _Page(record, pictures, command)
+    write_page(folder, Page(record, pictures, command))
+
+
+def write_page(folder: Path, page: Page) -> None:
+    """Write ``tradeoff.html`` and ``front.png`` into ``folder``."""
     template = Template(files("neuprim.report").joinpath("tradeoff.html").read_text(encoding="utf-8"))
-    title = f"{record['task']} / {record['scene']}"
+    title = f"{page.record['task']} / {page.record['scene']}"
     sections = {name: getattr(page, name)() for name in ("heading", "headline", "charts", "speed", "size", "table", "left_out", "facts")}
     write_charts(folder / "front.png", page.fronts())
     write_text(folder / "tradeoff.html", template.substitute(title=escape(title), style=_style(), **sections))
@@ -67,11 +71,16 @@ def _style() -> str:
     return text.partition("<style>")[2].partition("</style>")[0]
 
 
-class _Page:
+class Page:
+    """What both pages of `neuprim tradeoff` have; texts are those of a finished run's drawing."""
+
     def __init__(self, record: Mapping[str, Any], pictures: Mapping[int, Picture], command: Callable[[Sequence[str]], str]) -> None:
         self.record, self.points, self.command = record, record["points"], command
         self.front_of: dict[str, list[int]] = {name: list(record["front"][name]) for name in ("speed", "size")}
         self.pictures = pictures
+
+    eyebrow, reference_is, time_is = "speed and accuracy of a finished run", "the reference", TIME
+    difference = DIFFERENCE
 
     # ------------------------------------------------------------ numbers
 
@@ -97,7 +106,7 @@ class _Page:
 
     def heading(self) -> str:
         r = self.record
-        html = f'<p class="eyebrow">speed and accuracy of a finished run</p>\n<h1>{escape(r["task"])} / {escape(r["scene"])}</h1>'
+        html = f'<p class="eyebrow">{self.eyebrow}</p>\n<h1>{escape(r["task"])} / {escape(r["scene"])}</h1>'
         if r["data_source"] != "real":
             html += f'\n<p class="badge"><strong>{escape(r["data_source"])} data</strong></p>'
         return html
@@ -112,6 +121,10 @@ class _Page:
             *self._within("speed", "Fastest", lambda i: f"{1 / self.ratio(i):.2f}"),
             *self._within("size", "Smallest", lambda i: f"{base['bytes'] / self.points[i]['bytes']:.2f}"),
         ]
+        return self.tiles(tiles)
+
+    def tiles(self, tiles: Sequence[tuple[str, str, str, str]]) -> str:
+        """Label, value, unit and note of each; those after the third stand out."""
         cells = "".join(
             f'<div class="tile{" lead" if i > 2 else ""}"><dt>{label}</dt><dd>{value}<small>{unit}</small></dd>'
             f'<dd class="note" title="{note}">{note}</dd></div>'
@@ -134,7 +147,7 @@ class _Page:
         in_time = self._dots("speed", range(len(self.points)), self.ratio, self.spread, "psnr")
         in_bytes = self._dots("size", smaller, lambda i: bytes_of[i], lambda i: 0.0, "psnr")
         return [
-            Chart("PSNR against time", TIME, "PSNR, dB", in_time, most=SLOWEST),
+            Chart("PSNR against time", self.time_is, "PSNR, dB", in_time, most=SLOWEST),
             Chart("PSNR against size", "bytes of the model file", "PSNR, dB", in_bytes),
         ]
 
@@ -146,7 +159,7 @@ class _Page:
 
     def charts(self) -> str:
         near = self._dots("speed", range(len(self.points)), self.ratio, self.spread, "psnr_exact")
-        more = [Chart("PSNR against the exact image", TIME, "dB", near, joined=False, most=SLOWEST), *self._marching()]
+        more = [Chart("PSNR against the exact image", self.time_is, "dB", near, joined=False, most=SLOWEST), *self._marching()]
         panels = ""
         for chart in [*self.fronts(), *more]:
             drawn = chart_svg(chart)
@@ -156,7 +169,7 @@ class _Page:
             '<p class="note">Ringed: the reference. Orange and numbered: the front. Bars: half the range between the quartiles of all rounds.'
             f"{self._march_note()}</p>"
         )
-        return _section("Fronts", f'<div class="charts">{panels}</div>{note}')
+        return section("Fronts", f'<div class="charts">{panels}</div>{note}')
 
     def _marching(self) -> list[Chart]:
         rows = self.record["marching"].get("rows", [])
@@ -188,11 +201,11 @@ class _Page:
     def _cards(self, title: str, note: str, front: str, gain: Any) -> str:
         cards = [self._card(None, -1, "ground truth", "")] if -1 in self.pictures else []
         if 0 not in self.front_of[front]:
-            cards.append(self._card(None, 0, self.name(0), "the reference"))
+            cards.append(self._card(None, 0, self.name(0), self.reference_is))
         for k, number in enumerate(self.front_of[front]):
             cards.append(self._card(k + 1, number, self.name(number), gain(number)))
-        ticks = f'<p class="note">Difference: 0<span class="bar" style="background: {color_bar()}"></span>{DIFFERENCE:g} or more.</p>'
-        return _section(title, f'<p class="note">{note}</p>{ticks}<div class="points">{"".join(cards)}</div>')
+        ticks = f'<p class="note">Difference: 0<span class="bar" style="background: {color_bar()}"></span>{self.difference:g} or more.</p>'
+        return section(title, f'<p class="note">{note}</p>{ticks}<div class="points">{"".join(cards)}</div>')
 
     def _card(self, place: int | None, number: int, name: str, gain: str) -> str:
         head = f"{place}. {escape(name)}" if place else escape(name)
@@ -211,7 +224,7 @@ class _Page:
     def _pair(self, picture: Picture, name: str) -> str:
         images = [picture.image]
         if picture.against is not None:
-            images.append(torch.from_numpy(error_map(picture.image, picture.against, DIFFERENCE)).float() / 255)
+            images.append(torch.from_numpy(error_map(picture.image, picture.against, self.difference)).float() / 255)
         drawn = [_inlined(image) for image in images]
         captions = (escape(name), f"difference of {escape(name)}")
         return '<div class="pair">' + "".join(_figure(one, text) for one, text in zip(drawn, captions, strict=False)) + "</div>"
@@ -238,7 +251,7 @@ class _Page:
         rows = "".join(self._row(i, i in marked) for i in range(len(self.points)))
         table = f'<div class="scroll"><table class="numbers"><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
         note = '<p class="note">Time and ± are multiples of the reference’s of the same round; orange: on a front.</p>'
-        return _section(f"All {count(len(self.points))} points", table + note)
+        return section(f"All {count(len(self.points))} points", table + note)
 
     def _row(self, i: int, marked: bool) -> str:
         p = self.points[i]
@@ -260,7 +273,7 @@ class _Page:
         if not rows:
             return ""
         head = "<tr><th>knob</th><th>point</th><th>why</th></tr>"
-        return _section("Not measured", f'<div class="scroll"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>')
+        return section("Not measured", f'<div class="scroll"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>')
 
     def facts(self) -> str:
         r, same = self.record, self.record["same"]
@@ -282,7 +295,7 @@ class _Page:
             *((f"{name} not measured", str(why)) for name, why in r.get("not_measured", {}).items()),
         ]
         cells = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in pairs)
-        return _section("Where the numbers come from", f'<dl class="facts">{cells}</dl>')
+        return section("Where the numbers come from", f'<dl class="facts">{cells}</dl>')
 
 
 def _inlined(image: Tensor) -> Inlined | None:
@@ -299,5 +312,5 @@ def _figure(picture: Inlined | None, text: str) -> str:
     return f'<figure><img src="{picture.url}" width="{picture.width}" height="{picture.height}" alt="{text}"{kind}></figure>'
 
 
-def _section(title: str, body: str) -> str:
+def section(title: str, body: str) -> str:
     return f"<section><h2>{title}</h2>{body}</section>\n"

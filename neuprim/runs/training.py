@@ -18,6 +18,7 @@ from neuprim.core.errors import CheckpointError
 from neuprim.core.io.files import write_text
 from neuprim.core.model.edge import EDGES
 from neuprim.core.render.backends import choose, compiled_ahead
+from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.blame import Suspects
 from neuprim.plugins.judging import facts_of
 from neuprim.plugins.provenance import check_resumed
@@ -26,7 +27,7 @@ from neuprim.runs.curve import open_curve
 from neuprim.runs.events import Events, Note, Preparing, silent
 from neuprim.runs.fit import Fitted, compile_kernels, one_torch_thread, start, steps
 
-__all__ = ["save", "train"]
+__all__ = ["make_ready", "save", "train"]
 
 _COMPILING = "compiling kernels, once per installation (about a minute)"
 
@@ -48,7 +49,7 @@ def train(
     Raises:
         NeuprimError: the input's fault, or numbers that left the finite; whatever was on disk before is intact.
     """
-    ahead = compiled_ahead(config.renderer)
+    ahead = compiled_ahead(config.renderer) if dataset is None else None  # beside loading; of data that are there nothing is waited for
     edge = config.model.density.get("edge", 0)  # of a density of ours; of another's, whatever the word means there
     with compiling(None if ahead is None else ahead.name, edge if edge in EDGES else 0) as kernels:
         fitted = start(config, events, dataset, suspects, hold_out)
@@ -59,6 +60,19 @@ def train(
             events(Preparing(_COMPILING))
             kernels.wait()
         return fitted, _train(fitted, events)
+
+
+def make_ready(trainer: Trainer, events: Events = silent) -> None:
+    """Have kernels compiled outside the training clock, and remember for later runs that they are."""
+    view = trainer.dataset.train.view(0)
+    lowered = trainer.model.lower(view.camera, view.conditions, trainer.renderer)
+    form = variant(type(lowered.colour).__name__, lowered.density.edge)
+    backend = choose(lowered, trainer.renderer, view.camera)
+    if backend.compiles and not compiled(backend.name, form):
+        events(Preparing(_COMPILING))
+    compile_kernels(trainer)
+    if backend.compiles:
+        mark_compiled(backend.name, form)
 
 
 def _resume(fitted: Fitted, events: Events) -> None:
@@ -76,15 +90,7 @@ def _resume(fitted: Fitted, events: Events) -> None:
 def _train(fitted: Fitted, events: Events) -> bool:
     """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
     trainer, config = fitted.trainer, fitted.config
-    view = fitted.dataset.train.view(0)
-    lowered = trainer.model.lower(view.camera, view.conditions, trainer.renderer)
-    form = variant(type(lowered.colour).__name__, lowered.density.edge)
-    backend = choose(lowered, trainer.renderer, view.camera)
-    if backend.compiles and not compiled(backend.name, form):
-        events(Preparing(_COMPILING))
-    compile_kernels(trainer)
-    if backend.compiles:
-        mark_compiled(backend.name, form)
+    make_ready(trainer, events)
     curve = open_curve(config.output_dir / "metrics.jsonl", trainer.step)
     last_saved = time.monotonic()
     interrupted = False

@@ -16,6 +16,7 @@ import trimesh
 
 from neuprim.cli import _parsers
 from neuprim.cli.operating_words import DRAWN, operating_words
+from neuprim.cli.tradeoff import of_words
 from neuprim.config import compose, compose_all
 from neuprim.core.cameras.file import read_cameras
 from neuprim.core.conditions import read_conditions, split_words
@@ -196,7 +197,11 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
         rest += args.overrides
         compose(["scene=blender", "scene.path=DIR", *(word for word in rest if not word.startswith("-"))], False)
         rest = [word for word in rest if word.startswith("-")]
-    if args.command in DRAWN:
+    if args.command == "tradeoff" and of_words(args.run_dir):
+        typed = [word for word in (args.run_dir, *rest) if not word.startswith(("-", "budget="))]
+        compose(typed, False)
+        rest = [word for word in rest if word.startswith("-")]
+    elif args.command in DRAWN:
         _, rest = operating_words(rest)
     if args.command in ("render", "inspect", "export"):
         given, rest = split_words(rest, conditions)
@@ -227,6 +232,8 @@ def test_commands(block: Block, conditions: list[ConditionSpec], tmp_path: Path,
         "neuprim run task=static scene=solid",
         "neuprim run -m task=static model.neurons=0,99",
         "neuprim run task=static --cgf",
+        "neuprim tradeoff task=static budget=5m model.primitive=3",
+        "neuprim tradeoff task=static --seed 3",
         "neuprim render RUN_DIR --camera orbit --sise 3x3",
         "neuprim render RUN_DIR --camera orbit --time 2",
         "neuprim export RUN_DIR --format vdb gird=8",

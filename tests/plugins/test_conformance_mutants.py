@@ -328,6 +328,11 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("members", "build is of type int", replace(TASK, build=3)),  # type: ignore[arg-type]
     ("members", "judge is of type int; expected a function", replace(TASK, judge=3)),  # type: ignore[arg-type]
     ("members", "TaskSpec.fields", replace(TASK, fields=None)),
+    ("trade", "trade: 'neurons'; expected the name of a setting", replace(TASK, trade=lambda model: {"neurons": (1,)})),
+    ("trade", "trade: model.neurons=99: found a setting that is refused", replace(TASK, trade=lambda model: {"model.neurons": (4, 99)})),
+    ("trade", "trade: model.density.edges=1: found a setting that", replace(TASK, trade=lambda model: {"model.density.edges": (1,)})),
+    ("trade", "trade: model.neuron=4: found a setting that", replace(TASK, trade=lambda model: {"model.neuron": (4,)})),
+    ("trade", "trade: task.options.haze=1: found a setting that", replace(TASK, trade=lambda model: {"task.options.haze": (1,)})),
     ("files", "scene/static/ghost.yaml", replace(TASK, scenes=(*TASK.scenes, GHOST))),
     ("files", "train.rates.W1", replace(TASK, fields={"SphericalHarmonics": SphericalHarmonics})),
     ("fields", "ForgetsNeurons(**settings)", using(ForgetsNeurons)),

@@ -7,10 +7,13 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from neuprim.core.data import View
 from neuprim.core.metrics import psnr, ssim, ssim_3dgs
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.operating import OperatingPoint
@@ -18,9 +21,9 @@ from neuprim.runs.storage import file_bytes
 from neuprim.runs.tradeoff.memory import peak_bytes
 from neuprim.runs.tradeoff.record import Measured
 from neuprim.runs.tradeoff.subject import Exact, Subject
-from neuprim.runs.truths import masked
+from neuprim.runs.truths import Truth, masked
 
-__all__ = ["Models", "look", "take_turns"]
+__all__ = ["Drawing", "Models", "look", "take_turns"]
 
 _KEPT = 1 << 29
 """Bytes of models that are kept between rounds."""
@@ -30,6 +33,13 @@ _BESIDE = 6
 
 _TINY = 16
 """Pixels on a side of an image that is drawn beforehand, so that what is compiled and loaded at a first one is no part of a frame."""
+
+
+Drawing = Callable[[View], Tensor]
+"""A view -> its (H, W, C) image."""
+
+P = TypeVar("P")
+M = TypeVar("M", bound=Measured)
 
 
 class Models:
@@ -50,6 +60,11 @@ class Models:
             self._kept[key] = found
         return self._kept[key]
 
+    def ready(self, point: OperatingPoint) -> Drawing:
+        """What draws the views of a point, with its model at hand."""
+        model = self.of(point)
+        return lambda view: point.draw(model, view, self._subject.background)
+
 
 def look(subject: Subject, models: Models, knob: str, point: OperatingPoint, exact: Exact) -> tuple[Measured, float]:
     """A point's images against ground truth and exact images, its size and memory; and the seconds that all images took together.
@@ -62,7 +77,7 @@ def look(subject: Subject, models: Models, knob: str, point: OperatingPoint, exa
     rows: list[dict[str, float]] = []
     peaks: list[int] = []
     seconds = 0.0
-    _warm(subject, model, point)
+    _warm(models.ready(point), subject.truths[0].view)
     for truth, ideal in zip(subject.truths, exact.images, strict=True):
         start = time.perf_counter()
         image, peak = peak_bytes(lambda: point.draw(model, truth.view, subject.background), card)  # noqa: B023 - called at once
@@ -84,10 +99,10 @@ def look(subject: Subject, models: Models, knob: str, point: OperatingPoint, exa
 
 
 def take_turns(
-    subject: Subject,
-    models: Models,
-    points: Sequence[tuple[OperatingPoint, Measured]],
-    rounds: Callable[[Measured], int],
+    truths: Sequence[Truth],
+    ready: Callable[[P], Drawing],
+    points: Sequence[tuple[P, M]],
+    rounds: Callable[[M], int],
     deadline: float,
     tell: Callable[[int, int], None],
     done: Callable[[], None],
@@ -99,7 +114,9 @@ def take_turns(
     median of the reference's beside it, of these the median over the views, so that what else the machine does for a moment decides nothing.
 
     Args:
-        points: the reference first. It is drawn in every round; others until they have their ``rounds``.
+        truths: of the views to draw.
+        ready: a point -> what draws it; finding that is no part of a frame's time.
+        points: what is drawn, an operating point or a model, and its numbers; the reference first. It is drawn in every round; others until they have their ``rounds``.
         rounds: how many a point is to have.
         deadline: of :func:`time.monotonic`, after which no round is begun; but one always is.
         tell: called with (round, of how many) before each.
@@ -117,20 +134,19 @@ def take_turns(
         turn = [reference, *due]
         if not warm:
             for point, _ in turn:
-                _warm(subject, models.of(point), point)
+                _warm(ready(point), truths[0].view)
             warm = True
         often = 1 + len(due) // _BESIDE
         slots = torch.tensor([0] * often + list(range(1, len(turn))))
         milliseconds: list[list[float]] = [[] for _ in turn]
         ratios: list[list[float]] = [[] for _ in turn]
-        for truth in subject.truths:
+        for truth in truths:
             times: list[list[float]] = [[] for _ in turn]
             for i in slots[torch.randperm(len(slots), generator=order)].tolist():
-                point = turn[i][0]
-                model = models.of(point)
-                point.draw(model, truth.view, subject.background)
+                draw = ready(turn[i][0])
+                draw(truth.view)
                 begin = time.perf_counter()
-                point.draw(model, truth.view, subject.background)
+                draw(truth.view)
                 times[i].append(time.perf_counter() - begin)
             beside = statistics.median(times[0])
             for i, own in enumerate(times):
@@ -144,6 +160,5 @@ def take_turns(
             return
 
 
-def _warm(subject: Subject, model: Primitives, point: OperatingPoint) -> None:
-    view = subject.truths[0].view
-    point.draw(model, replace(view, camera=view.camera.resized(_TINY, _TINY)), subject.background)
+def _warm(draw: Drawing, view: View) -> None:
+    draw(replace(view, camera=view.camera.resized(_TINY, _TINY)))

@@ -7,10 +7,11 @@ import io
 import json
 import shlex
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Self
 
 from neuprim.core.errors import DataError
 from neuprim.core.io.files import write_json, write_text
@@ -97,7 +98,7 @@ class Measured:
         return {"knob": self.knob, "words": list(self.words), "quality": numbers, **own}
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Measured:
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
         names = [name.removesuffix("_infinite") for name in data["quality"]]
         quality = {name: value for name in names if (value := from_json(data["quality"], name)) is not None}
         own = {name: data[name] for name in ("bytes", "peak_bytes", "ms", "ratios", "rounds")}
@@ -158,8 +159,11 @@ def _derived(point: Measured) -> dict[str, Any]:
     return {**times, "time_ratio_spread": point.spread, "time_ratio_doubt": point.doubt}
 
 
-def read_record(path: Path) -> Record | None:
+def read_record(path: Path, kind: type[Measured] = Measured) -> Record | None:
     """The record in a file; None where there is none.
+
+    Args:
+        kind: of its points.
 
     Raises:
         DataError: the file is not one.
@@ -173,7 +177,7 @@ def read_record(path: Path) -> Record | None:
     try:
         if data["format"] != FORMAT:
             raise DataError(f"{path}: format {data['format']!r}; this neuprim reads {FORMAT}; delete it to measure anew")
-        points = [Measured.from_dict(entry) for entry in data["points"]]
+        points = [kind.from_dict(entry) for entry in data["points"]]
         out = [LeftOut(entry["knob"], tuple(entry["words"]), entry["reason"]) for entry in data["left_out"]]
         front = data["front"]
         known = ("format", "same", "points", "left_out", "front", "marching")
@@ -184,19 +188,26 @@ def read_record(path: Path) -> Record | None:
         raise DataError(f"{path}: not a record of `neuprim tradeoff` ({what}); delete it to measure anew") from error
 
 
-def write_csv(path: Path, record: Record, primitives: int) -> None:
-    """The table, a row per point; empty cells are not measured. LPIPS is the survey's, of VGG; another network's is left out."""
+def write_csv(
+    path: Path, record: Record, primitives: Callable[[int], int], more: Mapping[str, Callable[[int], object]] = MappingProxyType({})
+) -> None:
+    """The table, a row per point; empty cells are not measured. LPIPS is the survey's, of VGG; another network's is left out.
+
+    Args:
+        primitives: number of a point -> how many it has.
+        more: further columns, and what stands in them, of a point's number.
+    """
     perceived = "lpips_3dgs" if record.same.get("lpips") == "vgg" else ""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow((*COLUMNS, *_MORE))
+    writer.writerow((*COLUMNS, *_MORE, *more))
     for number, point in enumerate(record.points):
         q = point.quality
-        own = (point.name, _cell(q.get("psnr")), _cell(q.get("ssim_3dgs")), _cell(q.get(perceived)), point.bytes, primitives)
+        own = (point.name, _cell(q.get("psnr")), _cell(q.get("ssim_3dgs")), _cell(q.get(perceived)), point.bytes, primitives(number))
         times = (f"{point.ratio:.4f}", f"{point.time:.4f}", f"{1e3 / point.time:.2f}") if point.ms else ("", "", "")
         peak = "" if point.peak_bytes is None else point.peak_bytes
         fronts = (int(number in record.speed), int(number in record.size))
-        writer.writerow((*own, *times, _cell(q.get("psnr_exact")), peak, *fronts))
+        writer.writerow((*own, *times, _cell(q.get("psnr_exact")), peak, *fronts, *(cell(number) for cell in more.values())))
     write_text(path, buffer.getvalue())
 
 

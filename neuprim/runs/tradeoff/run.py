@@ -51,15 +51,15 @@ _CHORDS = 96
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
-def seconds_of(budget: str) -> float:
-    """Seconds of a budget such as 90s, 5m or 1h.
+def seconds_of(budget: str, said: str = "--budget ") -> float:
+    """Seconds of a budget such as 90s, 5m or 1h; ``said`` stands before it in messages.
 
     Raises:
         ConfigError: it is something else.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", budget)
     if match is None or float(match[1]) == 0:
-        raise ConfigError(f"--budget {budget}: expected a time such as 90s, 5m or 1h")
+        raise ConfigError(f"{said}{budget}: expected a time such as 90s, 5m or 1h")
     return float(match[1]) * _UNITS[match[2]]
 
 
@@ -169,7 +169,7 @@ class _Work:
 
         if any(len(m.ms) < wanted(m) for _, m in pairs):
             take_turns(
-                *(self.subject, self.models, pairs, wanted, self.deadline(part), tell),
+                *(self.subject.truths, self.models.ready, pairs, wanted, self.deadline(part), tell),
                 lambda: self.record.write(self.file),
             )
 
@@ -215,7 +215,7 @@ def tradeoff_run(
             reference, [read_point(m.words, subject.config.renderer, subject.model) for m in record.points], record
         )
         record.write(work.file)
-        write_csv(folder / "tradeoff.csv", record, subject.model.count)
+        write_csv(folder / "tradeoff.csv", record, lambda number: subject.model.count)
         progress("pictures of the front", 0.0)
         shown = pictures(subject, record, work.models)
     write_tradeoff(folder, record.to_dict(), shown, lambda words: command(str(request.run_dir), words))

@@ -100,12 +100,15 @@ class Subject:
         return candidate.knob != "backend" or self.backend(candidate.point).name != self.backend(self.reference).name
 
 
-def load_subject(run_dir: Path, words: Sequence[str], views: int, lpips: str | Path | None = None) -> Subject:
+def load_subject(
+    run_dir: Path, words: Sequence[str], views: int, lpips: str | Path | None = None, shown: tuple[Dataset, list[Truth]] | None = None
+) -> Subject:
     """A finished run with ``views`` of its held-out views, evenly spread.
 
     Args:
         words: of the operating point that is the reference, over how the run draws.
         lpips: weights for LPIPS; without, those that the run names.
+        shown: the run's data set and the views to measure on, if they are loaded already.
 
     Raises:
         NeuprimError: no such run, no held-out views, or words that do not fit.
@@ -115,9 +118,11 @@ def load_subject(run_dir: Path, words: Sequence[str], views: int, lpips: str | P
     weights = lpips or config.metrics.lpips
     distance = None if weights is None else Lpips.load(weights)
     suspects = suspects_of(config)
-    dataset = load_dataset(config, task, run_dir=run_dir)
+    if shown is None:
+        dataset = load_dataset(config, task, run_dir=run_dir)
+        shown = dataset, truths_of(dataset, views)
+    dataset, truths = shown
     suspects.know(dataset)
-    truths = truths_of(dataset, views)
     if not truths:
         raise DataError(f"{run_dir}: {dataset.name} has no held-out views; expected some to measure on")
     channels, file = channels_of(task, dataset), model_file(run_dir)

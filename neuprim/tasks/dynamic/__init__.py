@@ -8,7 +8,7 @@ from typing import Any
 from neuprim.core.checked import choose
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
-from neuprim.core.model.densities.cosine import DENSITY_OPTIONS
+from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
@@ -37,6 +37,12 @@ def _check(model: Mapping[str, Any]) -> None:
 
 def _density(model: Mapping[str, Any]) -> TimeDensity:
     return TimeDensity(model["neurons"], **model["density"])
+
+
+def _trade(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
+    parts = ("none", "phase", "window", "window+motion", "phase+window+motion")
+    bands: dict[str, tuple[Any, ...]] = {"model.sh_degree": (0, 1, 2, 3), "model.colour.powers": (0, 2, 4), "model.colour.waves": (0, 2, 4)}
+    return {**DENSITY_TRADE, "model.density.time": parts, **bands}
 
 
 def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
@@ -80,6 +86,7 @@ TASK = TaskSpec(
     build=_build,
     loss=photometric,
     check=_check,
+    trade=_trade,
     conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_times, sweep="0:1"),),
     fields={"TimeDensity": TimeDensity, "TimeHarmonics": TimeHarmonics},
     uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),

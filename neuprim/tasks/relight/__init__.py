@@ -8,7 +8,7 @@ from typing import Any
 from neuprim.core.checked import choose
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
-from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, CosineDensity
+from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE, CosineDensity
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import l1
@@ -47,6 +47,11 @@ def _check(model: Mapping[str, Any]) -> None:
         raise ConfigError(f"model.colour: {error}") from error
 
 
+def _trade(model: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+    harmonics = model["colour"].get("form") == "harmonics"
+    return {**DENSITY_TRADE, **({"model.colour.degree": (1, 2, 3, 5)} if harmonics else {"model.colour.hidden": (0, 4, 8, 12)})}
+
+
 def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
     if dataset.channels != 3:
         raise ConfigError(f"{dataset.name}: {dataset.channels} colour channels; task relight expects 3, as light_intensity has")
@@ -81,6 +86,7 @@ TASK = TaskSpec(
     build=_build,
     loss=l1,
     check=_check,
+    trade=_trade,
     conditions=(
         ConditionSpec("light", (3,), "position, scene units", (-1e6, 1e6), parse_lights, sweep="orbit"),
         ConditionSpec("light_intensity", (3,), "radiometric", (0.0, 1e6), parse_intensities),

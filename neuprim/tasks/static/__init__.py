@@ -8,7 +8,7 @@ from typing import Any
 from neuprim.core.checked import choose
 from neuprim.core.data import Dataset
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, CosineDensity
+from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE, CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
@@ -31,6 +31,11 @@ def _check(model: Mapping[str, Any]) -> None:
     if model["density"].get("form") == "gaussian" and others:
         raise ConfigError(f"model.density.{others[0]}: of densities of the form cosine; expected none with model.density.form=gaussian")
     choose(model["colour"], "model.colour", {})
+
+
+def _trade(model: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+    cosine = model["density"].get("form", "cosine") == "cosine"
+    return {**(DENSITY_TRADE if cosine else {}), "model.sh_degree": (0, 1, 2, 3)}
 
 
 # Loaders are imported when used: each pulls in a library of its own.
@@ -97,6 +102,7 @@ TASK = TaskSpec(
     build=_build,
     loss=photometric,
     check=_check,
+    trade=_trade,
     facts=_facts,
     diagnose=lambda dataset, model: _facts(dataset),
     fields={"CosineDensity": CosineDensity, "GaussianDensity": GaussianDensity, "SphericalHarmonics": SphericalHarmonics},

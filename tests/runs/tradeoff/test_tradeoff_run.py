@@ -177,7 +177,7 @@ def test_in_a_round_every_point_is_timed_once_a_view(bare: Path, monkeypatch: py
 
     monkeypatch.setattr(OperatingPoint, "draw", noted)
     pairs = [(point, Measured("", subject.words(point), {}, 0)) for point in points]
-    take_turns(subject, Models(subject), pairs, lambda m: 4, 1e18, lambda number, count: None, lambda: None)
+    take_turns(subject.truths, Models(subject).ready, pairs, lambda m: 4, 1e18, lambda number, count: None, lambda: None)
     assert all(len(m.ms) == 4 for _, m in pairs) and pairs[0][1].ratios == [1.0] * 4
     views = [truth.view.name for truth in subject.truths]
     assert sorted(drawn) == sorted((i, view) for i in range(4) for view in views for _ in range(8)), "once to warm up, once to time"
@@ -189,7 +189,7 @@ def test_in_a_round_every_point_is_timed_once_a_view(bare: Path, monkeypatch: py
 def test_times_end_at_the_deadline_but_not_before_one_round(bare: Path) -> None:
     subject = load_subject(bare, (), 1)
     pairs = [(subject.reference, Measured("reference", (), {}, 0))]
-    take_turns(subject, Models(subject), pairs, lambda m: 1000, 0.0, lambda number, count: None, lambda: None)
+    take_turns(subject.truths, Models(subject).ready, pairs, lambda m: 1000, 0.0, lambda number, count: None, lambda: None)
     assert len(pairs[0][1].ms) == 1
 
 

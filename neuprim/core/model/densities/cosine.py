@@ -24,7 +24,7 @@ from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.tensors import number_fault
 
-__all__ = ["DENSITY_OPTIONS", "OMEGA0", "CosineDensity", "amplified", "cosine_density", "split_cosine", "split_scale"]
+__all__ = ["DENSITY_OPTIONS", "DENSITY_TRADE", "OMEGA0", "CosineDensity", "amplified", "cosine_density", "split_cosine", "split_scale"]
 
 OMEGA0 = 30.0
 """SIREN boost: multiplies the whole phase."""
@@ -36,6 +36,10 @@ products with the other weights stay far from the ends of float32."""
 
 DENSITY_OPTIONS: dict[str, Any] = {"edge": EDGES, "gain": bool, "omega0": Annotated[float, Range(above=0)]}
 """What ``model.density`` may say for it, in every task (:func:`neuprim.core.checked.choose`)."""
+
+
+DENSITY_TRADE: dict[str, tuple[int, ...]] = {"model.neurons": (0, 2, 4, 8), "model.density.edge": EDGES}
+"""What of it trades quality for speed or size, in every task (:attr:`neuprim.core.task.TaskSpec.trade`)."""
 
 
 class CosineDensity(DensityField):

@@ -41,6 +41,8 @@ commonest keys:
   renderer.backend=auto|NAME           `neuprim doctor` lists them
   renderer.sort=center|entry           renderer.samples=N (rays per pixel side) renderer.threads=N
   seed=N
+  target.psnr=DB budget=10m            the smallest model that has it, searched and trained in that time; also target.ssim=S,
+                                       with target.megabytes=M and target.fps=F as limits, or these alone: the best within them
 `neuprim run task=NAME scene=NAME --cfg` shows every key with its value. A value that contains , = or brackets is quoted
 twice, for the shell and for the grammar: "scene.path='a=b, c'"."""
 
@@ -186,12 +188,20 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
 
 def _run(args: argparse.Namespace) -> int:
     from neuprim.config import compose, compose_all
+    from neuprim.config.target import target_words
 
     check = not args.cfg
-    configs = compose_all(args.overrides, check) if args.multirun else [compose(args.overrides, check)]
+    wanted, words = target_words(args.overrides)
+    if wanted is not None and args.multirun:
+        raise ConfigError(f"-m with {wanted[0]}: a target is for one run; expected one of them")
+    configs = compose_all(words, check) if args.multirun else [compose(words, check)]
     if args.cfg:
         print("---\n".join(config.to_yaml() for config in configs), end="")
         return 0
+    if wanted is not None:
+        from neuprim.cli.target import fit_target
+
+        return fit_target(configs[0], *wanted, args.overrides)
     if len(configs) == 1:
         print(_fit(configs[0], args.overrides))
         return 0

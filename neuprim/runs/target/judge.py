@@ -1,0 +1,153 @@
+"""What the trials of a search say together: the margin of every size that was tried, had it a full run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from neuprim.config.target import Target
+from neuprim.runs.target.pace import linear
+from neuprim.runs.target.prediction import FIRST_GAIN, Forecast, decibels, forecast, undecibels
+from neuprim.runs.target.record import Attempt, Record
+from neuprim.runs.target.search import Curve
+
+__all__ = ["Judge"]
+
+ALLOWANCE = 0.1
+"""dB above the target that a full run aims at: what storing the model in few bits costs."""
+
+
+@dataclass(frozen=True)
+class Judge:
+    """The record, read with a target in mind.
+
+    Attributes:
+        steps: primitives -> steps of a full run with so many.
+    """
+
+    target: Target
+    record: Record
+    steps: Callable[[int], float]
+
+    @property
+    def measures(self) -> tuple[str, ...]:
+        """What is forecast: the target's measures of quality, else PSNR."""
+        return tuple(self.target.quality) or ("psnr",)
+
+    def margin(self, values: Mapping[str, float]) -> float:
+        """dB by which the least of the measures is above the target; without measures of quality the PSNR itself."""
+        wanted = self.target.quality
+        if not wanted:
+            return values["psnr"]
+        return min(decibels(name, values[name]) - decibels(name, goal) for name, goal in wanted.items())
+
+    def forecasts(self) -> dict[int, dict[str, Forecast]]:
+        """Primitives -> measure -> what a full run would have, with the settings that were turned, on the scale of decibels.
+
+        Counts that were tried longer are known better; by how much these turned out otherwise than their short trials had promised, all others
+        are moved.
+        """
+        found = {name: self._of(name) for name in self.measures}
+        counts = next(iter(found.values())).keys()
+        return {count: {name: found[name][count] for name in self.measures} for count in sorted(counts)}
+
+    def _of(self, name: str) -> dict[int, Forecast]:
+        lengths = self._lengths(name)
+        full = {a.count: a for a in self.record.done("full")}
+        gains = [f for values in lengths.values() if (f := _gain(values)) is not None]
+        gain = sum(gains) / len(gains) if gains else FIRST_GAIN
+        short = {
+            n: forecast({s: v for s, v in values.items() if s <= self.record.length} or values, self.steps(n), gain)
+            for n, values in lengths.items()
+        }
+        best = {n: forecast(values, self.steps(n), gain) for n, values in lengths.items()}
+        moved = [best[n].value - short[n].value for n, values in lengths.items() if max(values) > self.record.length]
+        shift, tested = (sum(moved) / len(moved), True) if moved else (0.0, False)
+        made = {}
+        for n, values in lengths.items():
+            longer = max(values) > self.record.length
+            doubt = best[n].doubt if longer or not tested else max(short[n].doubt / 2, min(f.doubt for f in best.values()))
+            made[n] = best[n] if longer else Forecast(short[n].value + shift, doubt)
+        curve = Curve.through([(n, f.value) for n, f in made.items()]) if made else None
+        misses = [self._now(name, a) - curve.at(a.count) for a in full.values()] if curve is not None else []
+        if misses:  # a full run tells what the trials' forecasts are worth
+            made = {n: Forecast(f.value + misses[-1], 2 * ALLOWANCE) for n, f in made.items()}
+        return made | {n: Forecast(self._now(name, a), ALLOWANCE) for n, a in full.items()}
+
+    def _lengths(self, name: str) -> dict[int, dict[int, float]]:
+        """Primitives -> steps -> quality of the trials."""
+        found: dict[int, dict[int, float]] = {}
+        for attempt in self.record.done("size", "longer"):
+            found.setdefault(attempt.count, {})[int(attempt.outcome["steps"])] = self._now(name, attempt)  # type: ignore[index]
+        return found
+
+    def _now(self, name: str, attempt: Attempt) -> float:
+        """What a training would have had with the settings of now."""
+        turned = [
+            t for t in self.record.turns if t.adopted and attempt.words.get(t.key) != t.after and not self._beyond(attempt, t.key, t.after)
+        ]
+        return decibels(name, attempt.quality(name)) - sum(turn.loss.get(name, 0.0) for turn in turned)
+
+    def _beyond(self, attempt: Attempt, key: str, after: int) -> bool:
+        """Whether a training had a setting turned further than that already."""
+        return attempt.words.get(key, after + 1) < after
+
+    def curve(self) -> Curve:
+        """Margins over sizes."""
+        return Curve.through([(n, self._margin(values)) for n, values in self.forecasts().items()])
+
+    def tried(self) -> list[tuple[int, float]]:
+        """(primitives, margin) of every size."""
+        return [(n, self._margin(values)) for n, values in self.forecasts().items()]
+
+    def _margin(self, values: Mapping[str, Forecast]) -> float:
+        return self.margin({name: undecibels(name, f.value) for name, f in values.items()})
+
+    @property
+    def doubt(self) -> float:
+        """dB by which a margin may be wrong, at the size that is known best."""
+        found = [max(f.doubt for f in values.values()) for values in self.forecasts().values()]
+        return min(found, default=1.0)
+
+    def predicted(self, primitives: int) -> dict[str, list[float]]:
+        """Measure -> [value, doubt] of a full run; values as measured, doubts in dB of :func:`decibels`."""
+        known = self.forecasts()
+        made = {}
+        for name in self.measures:
+            curve = Curve.through([(n, values[name].value) for n, values in known.items()])
+            near = min(known, key=lambda n: abs(math.log2(n / primitives)))
+            made[name] = [undecibels(name, curve.at(primitives)), known[near][name].doubt]
+        return made
+
+    # ------------------------------------------------------------ limits
+
+    def most(self) -> int | None:
+        """Primitives that the target's limits allow; None without limits, or before a trial."""
+        limits = []
+        tried = [a for a in self.record.done("size", "longer", "full") if a.packed]
+        if self.target.megabytes is not None and tried:
+            limits.append(0.97 * 1e6 * self.target.megabytes / self.bytes_each())
+        if self.target.fps is not None and tried:
+            known, allowed = [(a.count, a.quality("ms_per_frame")) for a in tried], 1e3 / self.target.fps
+            low, high = 1.0, 1e8
+            for _ in range(60):
+                middle = math.sqrt(low * high)
+                low, high = (middle, high) if linear(known, middle) <= allowed else (low, middle)
+            limits.append(low)
+        return max(int(min(limits)), 1) if limits else None
+
+    def bytes_each(self) -> float:
+        """Bytes of a primitive in the compressed model, with the settings of now."""
+        tried = [a for a in self.record.done("size", "longer", "full") if a.packed]
+        largest = max(tried, key=lambda a: (a.words == self.record.words, a.count))
+        size = largest.packed / largest.count
+        for turn in self.record.turns:
+            if turn.adopted and largest.words.get(turn.key, turn.before) > turn.after:
+                size *= turn.size
+        return size
+
+
+def _gain(values: Mapping[int, float]) -> float | None:
+    tried = sorted(values)
+    return None if len(tried) < 2 else (values[tried[-1]] - values[tried[-2]]) / math.log2(tried[-1] / tried[-2])

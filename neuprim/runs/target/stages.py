@@ -1,0 +1,182 @@
+"""What becomes of the full run that was chosen: a usual run directory, and a model in as few bytes as the target lets it have."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neuprim.config import suspects_of, task_of
+from neuprim.config.target import Target
+from neuprim.core.checkpoint import load_model, save_compressed
+from neuprim.core.compressed import LEVELS, bit_table
+from neuprim.core.data.held_out import held_out
+from neuprim.core.io.files import atomic_path, write_text
+from neuprim.core.metrics import psnr, ssim
+from neuprim.core.model.primitives import Primitives
+from neuprim.runs.compress import compress_run
+from neuprim.runs.events import Finishing
+from neuprim.runs.finish import finish
+from neuprim.runs.measure import draw
+from neuprim.runs.open import COMPRESSED, placed, read_metrics
+from neuprim.runs.target.judge import ALLOWANCE, Judge
+from neuprim.runs.target.record import Attempt
+from neuprim.runs.target.trying import VIEWS, Trying
+from neuprim.runs.target.words import shortfall
+from neuprim.runs.training import train
+from neuprim.runs.truths import masked, truths_of
+
+__all__ = ["STAGES", "Finished", "chosen", "publish"]
+
+_LEVELS = (4, 3, 2, 1)
+"""Of compression, those tried for a target of quality, fewest bits first."""
+
+_KEPT = ("model.safetensors", "checkpoint.safetensors", "metrics.jsonl")
+
+
+@dataclass(frozen=True)
+class Finished:
+    """The result as it is after a stage.
+
+    Attributes:
+        run_dir: a run directory; that of the search unless a stage made another.
+        held: measures on the views held out.
+        packed: bytes of its smallest file.
+        test: measures on the test views, where a stage measured them.
+    """
+
+    run_dir: Path
+    held: dict[str, float]
+    packed: int
+    test: dict[str, float]
+    facts: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Workshop:
+    """What stages work with."""
+
+    trying: Trying
+    target: Target
+    judge: Judge
+    attempt: Attempt
+
+    def measured(self, model: Primitives) -> dict[str, float]:
+        """PSNR and SSIM on the views held out that judged the trainings."""
+        trying = self.trying
+        judged = held_out(trying.dataset, trying.record.hold_out)
+        truths, rows = truths_of(judged, VIEWS), []
+        settings = trying.config.renderer
+        with torch.no_grad():
+            model = placed(model, settings, truths[0].view)
+            for truth in truths:
+                image = masked(draw(model, truth.view, settings, judged.background), truth)
+                rows.append((psnr(image, truth.image, truth.mask), ssim(image, truth.image)))
+        return dict(zip(("psnr", "ssim"), (float(np.mean(column)) for column in zip(*rows, strict=True)), strict=True))
+
+
+def publish(trying: Trying, target: Target, judge: Judge) -> None:
+    """Makes the run's directory of the full run that is best by the target, takes it through :data:`STAGES`, and records what was achieved."""
+    attempt = chosen(judge)
+    trying.record.chosen = attempt.folder
+    finished = _directory(trying, attempt)
+    for stage in STAGES:
+        finished = stage(Workshop(trying, target, judge, attempt), finished)
+    record = trying.record
+    metrics = read_metrics(trying.folder)
+    margin = judge.margin(finished.held) if target.quality else 0.0
+    limit = shortfall(target, attempt, finished.packed)
+    if limit is not None or margin < 0:
+        missed = limit or f"{_missed(target, finished.held)} on the views held out"
+        record.warning = record.warning or f"{target} is missed: {missed}; the best found is made"
+    else:
+        record.warning = None
+    record.why.append("the target is missed" if record.warning else f"{target} is met on the views held out")
+    record.achieved = {
+        "run_dir": str(finished.run_dir),
+        "primitives": attempt.count,
+        "held_out": finished.held,
+        "test_before_storing": {name: metrics[name] for name in ("psnr", "ssim")},
+        "test": finished.test,
+        "fps": 1e3 / attempt.quality("ms_per_frame"),
+        "model_bytes": (finished.run_dir / "model.safetensors").stat().st_size,
+        "packed_bytes": finished.packed,
+        **finished.facts,
+        "predicted": attempt.predicted,
+        "seconds": trying.spent,
+    }
+
+
+def chosen(judge: Judge) -> Attempt:
+    """Of the full runs that meet the target the smallest; if none does, the best."""
+    done = judge.record.done("full")
+    within = [a for a in done if shortfall(judge.target, a) is None] or done
+
+    def margin(a: Attempt) -> float:
+        return judge.margin({name: a.quality(name) for name in judge.measures})
+
+    met = [a for a in within if judge.target.quality and margin(a) >= 0]
+    return min(met, key=lambda a: a.packed) if met else max(within, key=margin)
+
+
+def _directory(trying: Trying, attempt: Attempt) -> Finished:
+    """The run's directory from that of the training: its files, and what every run has beside them."""
+    config = trying.config_of(attempt)
+    trying.events(Finishing("measuring held-out views"))
+    fitted, _ = train(replace(config, resume=True), suspects_of(config), dataset=trying.dataset, hold_out=trying.record.hold_out)
+    for name in _KEPT:
+        with atomic_path(trying.folder / name) as temporary:
+            shutil.copyfile(config.output_dir / name, temporary)
+    final = replace(fitted.config, output_dir=trying.folder, resume=False)
+    write_text(trying.folder / "config.yaml", final.to_yaml())
+    dataset = replace(trying.dataset, train=fitted.dataset.train)
+    finish(replace(fitted, config=final, dataset=dataset), trying.folder)
+    metrics = read_metrics(trying.folder)
+    return Finished(
+        trying.folder,
+        {name: attempt.quality(name) for name in ("psnr", "ssim")},
+        int(metrics["model_bytes"]),
+        {name: float(metrics[name]) for name in ("psnr", "ssim")},
+        {},
+    )
+
+
+def quantised(shop: Workshop, before: Finished) -> Finished:
+    """The model in the fewest bits with which it still meets the target; where it does not anyway, those that cost next to nothing. With a limit of
+    bytes alone, in the most bits that it allows."""
+    task = task_of(shop.trying.config)
+    model, _ = load_model(before.run_dir / "model.safetensors", task)
+    draft = before.run_dir / "draft.neuprim"
+    target, judge = shop.target, shop.judge
+    levels = _LEVELS if target.quality or target.megabytes is None else sorted(LEVELS)
+    least = min(0.0, judge.margin(before.held)) - (ALLOWANCE if judge.margin(before.held) < 0 else 0.0)
+    picked, held = levels[-1], before.held
+    for level in levels:
+        shop.trying.events(Finishing(f"storing in few bits, level {level}"))
+        save_compressed(draft, model, task.name, {}, bit_table(level, (), model.specs))
+        picked, held = level, shop.measured(load_model(draft, task)[0])
+        if target.quality:
+            enough = judge.margin(held) >= least
+        elif target.megabytes is not None:
+            enough = draft.stat().st_size <= 1e6 * target.megabytes
+        else:
+            enough = before.held["psnr"] - held["psnr"] <= ALLOWANCE
+        if enough:
+            break
+    draft.unlink(missing_ok=True)
+    made = compress_run(before.run_dir, picked, out=before.run_dir / COMPRESSED, overwrite=True)
+    test = {name: pair[1] for name, pair in made.measured.items()} or before.test
+    return replace(before, held=held, packed=made.after, test=test, facts={**before.facts, "level": picked, "file": str(made.file)})
+
+
+STAGES: tuple[Callable[[Workshop, Finished], Finished], ...] = (quantised,)
+"""In their order; each makes the model smaller as far as the target lets it."""
+
+
+def _missed(target: Target, held: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {held[name]:.4g}" for name, goal in target.quality.items() if held[name] < goal)

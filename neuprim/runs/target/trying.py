@@ -1,0 +1,159 @@
+"""One training of the search: its configuration, its folder, its outcome in the record, and its line for the user."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from neuprim.config import RunConfig, task_of
+from neuprim.core.checkpoint import load_model, save_compressed
+from neuprim.core.compressed import USUAL_LEVEL, bit_table
+from neuprim.core.data import Dataset
+from neuprim.runs.events import Events, Note
+from neuprim.runs.target.pace import Stopwatch, linear
+from neuprim.runs.target.record import Attempt, Record
+from neuprim.runs.trials import Trial, run_trial
+
+__all__ = ["FOLDER", "VIEWS", "Trying", "changed"]
+
+FOLDER = "target"
+"""Of the run's directory, for the trainings of the search."""
+
+VIEWS = 16
+"""Views held out that are measured, at most."""
+
+_PSNR_MAX = 200.0  # dB; equal images have an infinite one, which JSON does not
+
+
+def changed(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
+    """A configuration with other settings, by dotted names below ``model`` and ``train``, and with its record of what is not a default."""
+    groups: dict[str, dict[str, Any]] = {}
+    different = dict(config.non_default)
+    for key, value in values.items():
+        group, _, name = key.partition(".")
+        groups.setdefault(group, {})[name] = value
+        before = getattr(getattr(config, group), name)
+        default = different.pop(key, (before, before))[0]
+        if value != default:
+            different[key] = (default, value)
+    made = {group: replace(getattr(config, group), **settings) for group, settings in groups.items()}
+    return replace(config, **made, non_default=different)
+
+
+@dataclass
+class Trying:
+    """Trains what is asked for, unless the record has it.
+
+    Attributes:
+        config: what the search starts from.
+        dataset: its scene, whole.
+        clock: seconds, monotonic.
+    """
+
+    config: RunConfig
+    dataset: Dataset
+    record: Record
+    events: Events
+    clock: Callable[[], float] = time.monotonic
+    begun: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.begun = self.clock() - self.record.spent
+
+    @property
+    def folder(self) -> Path:
+        return self.config.output_dir
+
+    @property
+    def spent(self) -> float:
+        """Seconds of the budget that are used."""
+        return self.clock() - self.begun
+
+    @property
+    def left(self) -> float:
+        return self.record.asked["budget"] - self.spent
+
+    def write(self) -> None:
+        self.record.spent = self.spent
+        self.record.write(self.folder)
+
+    def tell(self, text: str) -> None:
+        self.events(Note(text))
+
+    def config_of(self, attempt: Attempt) -> RunConfig:
+        """The configuration of a training, in its folder."""
+        values = {
+            **attempt.words,
+            "model.primitives": attempt.primitives,
+            "train.iterations": attempt.steps,
+            "train.max_seconds": attempt.max_seconds,
+        }
+        made = changed(self.config, values)
+        return replace(made, output_dir=self.folder / FOLDER / attempt.folder, resume=attempt.purpose == "full")
+
+    def run(self, attempt: Attempt) -> Attempt:
+        """The attempt, done; the one of the record where it has an equal one.
+
+        KeyboardInterrupt leaves it unfinished in the record; it goes on from its checkpoint.
+        """
+        known = next((a for a in self.record.attempts if _same(a, attempt)), None)
+        attempt = known or attempt
+        if attempt.outcome is not None:
+            return attempt
+        if known is None:
+            self.record.attempts.append(attempt)
+        self.write()
+        watch, start = Stopwatch(self.clock, self.events), self.clock()
+        config = self.config_of(attempt)
+        try:
+            outcome = run_trial(Trial(config, self.record.hold_out, VIEWS), self.dataset, watch)
+        finally:
+            attempt.seconds += self.clock() - start
+            attempt.pace = watch.pace or attempt.pace
+            self.write()
+        found = {k: v for k, v in dataclasses.asdict(outcome).items() if k != "curve"}
+        attempt.outcome = {**found, "psnr": min(outcome.psnr, _PSNR_MAX)}
+        if attempt.pace is None:  # read back, or two steps at most
+            attempt.pace = outcome.seconds / max(outcome.steps, 1)
+        if attempt.purpose != "pace":
+            attempt.packed = self._packed(config)
+        self.write()
+        return attempt
+
+    def _packed(self, config: RunConfig) -> int:
+        """Bytes of a training's model in few bits."""
+        task, file = task_of(config), config.output_dir / "packed.neuprim"
+        model, _ = load_model(config.output_dir / "model.safetensors", task)
+        save_compressed(file, model, task.name, {}, bit_table(USUAL_LEVEL, (), model.specs))
+        size = file.stat().st_size
+        file.unlink()
+        return size
+
+    # ------------------------------------------------------------ time
+
+    def pace(self, primitives: float) -> float:
+        """Seconds of a step with so many primitives. The pace of trials counts by the primitives they had, the last of equal ones alone."""
+        known = {a.count: a.pace for a in self.record.done("pace", "size", "longer", "full") if a.pace is not None}
+        if len(known) > 1:  # a few steps of a young model are the poorest guess
+            known = {a.count: a.pace for a in self.record.done("size", "longer", "full") if a.pace is not None} or known
+        return linear(list(known.items()), primitives)
+
+    def overhead(self) -> float:
+        """Seconds of a trial beside its steps: starting points, measuring."""
+        done = self.record.done("size", "longer") or self.record.done("pace")
+        return max((a.seconds - (a.pace or 0.0) * a.steps for a in done[-3:]), default=0.0)
+
+    def cost(self, primitives: int, steps: float) -> float:
+        """Seconds that a trial will take."""
+        return self.pace(primitives) * steps + max(self.overhead(), 0.0)
+
+
+def _same(a: Attempt, b: Attempt) -> bool:
+    def alike(x: Attempt) -> tuple[Any, ...]:
+        return x.words, x.primitives, x.steps, x.purpose == "full", x.max_seconds
+
+    return alike(a) == alike(b)

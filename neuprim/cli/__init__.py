@@ -196,6 +196,8 @@ def _run(args: argparse.Namespace) -> int:
         raise ConfigError(f"-m with {wanted[0]}: a target is for one run; expected one of them")
     configs = compose_all(words, check) if args.multirun else [compose(words, check)]
     if args.cfg:
+        if wanted is not None:
+            print(f"# {wanted[0]} budget={wanted[1]:g}s; the search starts from")
         print("---\n".join(config.to_yaml() for config in configs), end="")
         return 0
     if wanted is not None:

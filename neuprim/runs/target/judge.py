@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from neuprim.config.target import Target
@@ -16,6 +16,9 @@ __all__ = ["Judge"]
 
 ALLOWANCE = 0.1
 """dB above the target that a full run aims at: what storing the model in few bits costs."""
+
+_FULL_FILE = 0.97
+"""Of the bytes allowed, those that are planned with."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +74,8 @@ class Judge:
             made[n] = best[n] if longer else Forecast(short[n].value + shift, doubt)
         curve = Curve.through([(n, f.value) for n, f in made.items()]) if made else None
         misses = [self._now(name, a) - curve.at(a.count) for a in full.values()] if curve is not None else []
-        if misses:  # a full run tells what the trials' forecasts are worth
-            made = {n: Forecast(f.value + misses[-1], 2 * ALLOWANCE) for n, f in made.items()}
+        if misses:  # full runs tell what the trials' forecasts are worth
+            made = {n: Forecast(f.value + sum(misses) / len(misses), 2 * ALLOWANCE) for n, f in made.items()}
         return made | {n: Forecast(self._now(name, a), ALLOWANCE) for n, a in full.items()}
 
     def _lengths(self, name: str) -> dict[int, dict[int, float]]:
@@ -95,11 +98,17 @@ class Judge:
 
     def curve(self) -> Curve:
         """Margins over sizes."""
-        return Curve.through([(n, self._margin(values)) for n, values in self.forecasts().items()])
+        return Curve.through(self.tried())
 
     def tried(self) -> list[tuple[int, float]]:
-        """(primitives, margin) of every size."""
-        return [(n, self._margin(values)) for n, values in self.forecasts().items()]
+        """(primitives, margin) of every size; of those between two full runs, one too small and one large enough, these two alone."""
+        found = [(n, self._margin(values)) for n, values in self.forecasts().items()]
+        full = {a.count for a in self.record.done("full")}
+        low = max((n for n, margin in found if n in full and margin < ALLOWANCE), default=None)
+        high = min((n for n, margin in found if n in full and margin >= ALLOWANCE), default=None)
+        if low is None or high is None:
+            return found
+        return [(n, margin) for n, margin in found if n in full or not min(low, high) < n < max(low, high)]
 
     def _margin(self, values: Mapping[str, Forecast]) -> float:
         return self.margin({name: undecibels(name, f.value) for name, f in values.items()})
@@ -127,25 +136,30 @@ class Judge:
         limits = []
         tried = [a for a in self.record.done("size", "longer", "full") if a.packed]
         if self.target.megabytes is not None and tried:
-            limits.append(0.97 * 1e6 * self.target.megabytes / self.bytes_each())
+            limits.append(_largest(self._sizes(tried), _FULL_FILE * 1e6 * self.target.megabytes))
         if self.target.fps is not None and tried:
-            known, allowed = [(a.count, a.quality("ms_per_frame")) for a in tried], 1e3 / self.target.fps
-            low, high = 1.0, 1e8
-            for _ in range(60):
-                middle = math.sqrt(low * high)
-                low, high = (middle, high) if linear(known, middle) <= allowed else (low, middle)
-            limits.append(low)
+            limits.append(_largest([(a.count, a.quality("ms_per_frame")) for a in tried], 1e3 / self.target.fps))
         return max(int(min(limits)), 1) if limits else None
 
-    def bytes_each(self) -> float:
-        """Bytes of a primitive in the compressed model, with the settings of now."""
-        tried = [a for a in self.record.done("size", "longer", "full") if a.packed]
-        largest = max(tried, key=lambda a: (a.words == self.record.words, a.count))
-        size = largest.packed / largest.count
-        for turn in self.record.turns:
-            if turn.adopted and largest.words.get(turn.key, turn.before) > turn.after:
-                size *= turn.size
-        return size
+    def _sizes(self, tried: Sequence[Attempt]) -> list[tuple[int, float]]:
+        """(primitives, bytes of the compressed model), with the settings of now."""
+        found = []
+        for attempt in tried:
+            size = float(attempt.packed)
+            for turn in self.record.turns:
+                if turn.adopted and attempt.words.get(turn.key, turn.before) > turn.after:
+                    size *= turn.size
+            found.append((attempt.count, size))
+        return found
+
+
+def _largest(known: Sequence[tuple[int, float]], allowed: float) -> float:
+    """The largest number of primitives whose bytes, or time, are allowed."""
+    low, high = 1.0, 1e8
+    for _ in range(60):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if linear(known, middle) <= allowed else (low, middle)
+    return low
 
 
 def _gain(values: Mapping[int, float]) -> float | None:

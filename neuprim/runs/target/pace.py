@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from neuprim.runs.events import Event, Events, Step
+from neuprim.runs.events import Event, Events, Preparing, Step
+from neuprim.runs.training import COMPILING
 
 __all__ = ["Stopwatch", "linear"]
+
+_FEW = 64
+"""Steps of which a single slow one would spoil the mean."""
 
 _FIXED = 0.5
 """Share of a step's time that does not depend on the number of primitives, where only one number was tried."""
@@ -36,24 +41,31 @@ class Stopwatch:
 
     Attributes:
         clock: seconds; monotonic.
+        compiling: seconds that kernels were compiled for, which happens once per installation.
     """
 
     clock: Callable[[], float]
     events: Events
-    _first: float | None = field(default=None)
-    _last: float = field(default=0.0)
-    _steps: int = field(default=0)
+    compiling: float = 0.0
+    _steps: list[float] = field(default_factory=list)
+    _last: float | None = None
+    _compiling: float | None = None
 
     def __call__(self, event: Event) -> None:
         self.events(event)
+        now = self.clock()
+        if isinstance(event, Preparing) and event.text == COMPILING and self._compiling is None:
+            self._compiling = now
         if isinstance(event, Step):
-            self._last = self.clock()
-            if self._first is None:
-                self._first = self._last
-            else:
-                self._steps += 1
+            if self._compiling is not None:
+                self.compiling, self._compiling = self.compiling + now - self._compiling, None
+            if self._last is not None:
+                self._steps.append(now - self._last)
+            self._last = now
 
     @property
     def pace(self) -> float | None:
-        """Seconds of a step; None of fewer than two."""
-        return None if self._first is None or not self._steps else max((self._last - self._first) / self._steps, 1e-9)
+        """Seconds of a step, the mean; of few steps the median. None of fewer than two."""
+        if not self._steps:
+            return None
+        return max((statistics.median if len(self._steps) < _FEW else statistics.mean)(self._steps), 1e-9)

@@ -97,6 +97,7 @@ class Record:
         spent: seconds of the budget that are used.
         chosen: folder of the full run that was chosen.
         achieved: what the result has: measures on the test views and on the views held out, bytes, frames per second.
+        out_of_reach: the line that says so, where the trials alone do.
         why: why the search ended as it did, a line each; warning: the line that says that the target was missed.
     """
 
@@ -109,6 +110,7 @@ class Record:
     turns: list[Turn] = field(default_factory=list)
     chosen: str | None = None
     achieved: dict[str, Any] = field(default_factory=dict)
+    out_of_reach: str | None = None
     why: list[str] = field(default_factory=list)
     warning: str | None = None
 

@@ -39,10 +39,16 @@ _FEWEST = 16
 
 _PACE_STEPS = 24
 
-_MOST_SIZES, _MOST_TURNS, _MOST_FULL = 6, 4, 3
+_MOST_SIZES, _MOST_TURNS, _MOST_FULL = 6, 4, 5
 
 _OVER = 0.3
 """dB above the target that are close enough."""
+
+_BEYOND = 2.0
+"""How many times more primitives than any trial had a full run may have."""
+
+_STEP = 1.07
+"""From the size of a full run that missed to the next, at least."""
 
 _SLOWER = 1.5
 """How many times slower than measured a full run may become before it is cut short."""
@@ -125,16 +131,17 @@ def _kept(config: RunConfig, asked: dict[str, float]) -> Record:
             f"{config.output_dir / 'target.json'}: begun with another {', '.join(different)}; expected the same words, or a new output_dir"
         )
     if before.asked != asked:
-        before.asked, before.spent, before.chosen, before.achieved, before.why, before.warning = asked, 0.0, None, {}, [], None
+        before.asked, before.spent, before.chosen, before.achieved = asked, 0.0, None, {}
+        before.why, before.out_of_reach, before.warning = [], None, None
     return before
 
 
 def _hold_out(dataset: Dataset) -> int:
-    """Every how many-th training view judges: an eighth of them, more of few."""
+    """Every how many-th training view judges: one of eight, more of few, as the mean of a few views says little."""
     count = len(dataset.train)
     if count < 4:
         raise DataError(f"{dataset.name}: {count} training views; a target needs 4 or more, as some are held out to judge by")
-    return min(8, count // 2)
+    return min(8, max(2, count // 8))
 
 
 @dataclass
@@ -161,7 +168,8 @@ class _Search:
     def run(self) -> None:
         self.measure_pace()
         self.sizes()
-        if self.target.quality or self.target.megabytes is not None:
+        self.say_what_is_out_of_reach()
+        if self.target.megabytes is not None or (self.target.quality and not self.record.out_of_reach):
             self.knobs()
         self.longer()
         self.full_runs()
@@ -194,13 +202,13 @@ class _Search:
         return self.trying.spent + self.trying.cost(primitives, steps) <= share * self.record.asked["budget"]
 
     def highest(self) -> int:
-        """Primitives whose full run would still be as long as a trial, and that limits allow."""
+        """Primitives whose full run would still have twice the steps of a trial, and that limits allow."""
         low = high = self.config.model.primitives
-        while self.steps(high) > self.record.length and high < 2**24:
+        while self.steps(high) > 2 * self.record.length and high < 2**24:
             low, high = high, 2 * high
         while high - low > max(low // 50, 1):
             middle = (low + high) // 2
-            low, high = (middle, high) if self.steps(middle) > self.record.length else (low, middle)
+            low, high = (middle, high) if self.steps(middle) > 2 * self.record.length else (low, middle)
         offered = [a.count for a in self.record.done("size") if a.count < 0.95 * a.primitives]
         limit = self.judge.most()
         return max(1, min([low, *offered, *([] if limit is None else [limit])]))
@@ -222,7 +230,10 @@ class _Search:
 
     def sizes(self) -> None:
         """Sizes, until the one that meets the target is known, the budget's share is used or the target is out of reach."""
-        self.probe(min(self.config.model.primitives, self.highest()))
+        first = min(self.config.model.primitives, self.highest())
+        self.probe(first)
+        if self.longer_trials():
+            self.probe(first)
         for _ in range(_MOST_SIZES - 1):
             proposal = self.proposal()
             if proposal.kind != "try":
@@ -233,6 +244,15 @@ class _Search:
             if any(a.primitives == proposal.primitives and a.words == self.record.words for a in self.record.done("size")):
                 break
             self.probe(proposal.primitives)
+
+    def longer_trials(self) -> bool:
+        """Doubles the trials' length while a step turns out to be faster than the first few had it."""
+        before = self.record.length
+        if self.record.turns or len(self.record.done("size")) > 2:
+            return False
+        while self.steps(self.config.model.primitives) >= 1.9 * _SHORTER * self.record.length:
+            self.record.length *= 2
+        return self.record.length > before
 
     def proposal(self) -> Any:
         judge, highest = self.judge, self.highest()
@@ -250,8 +270,24 @@ class _Search:
         if not self.target.quality:
             proposal = climb(judge.tried(), 1, highest)
             return proposal.primitives if proposal.kind == "take" else highest
-        found = judge.curve().count_for(ALLOWANCE, 1, highest)
-        return highest if found is None else found
+        curve, tried = judge.curve(), judge.tried()
+        found = curve.count_for(ALLOWANCE, 1, highest)
+        top, best = max(tried)[0], max(tried, key=lambda pair: pair[1])[0]
+        if found is not None and found <= _BEYOND * top:
+            return self.beside(found)
+        if found is None and curve.at(highest) + judge.doubt < ALLOWANCE and best < top:
+            return best  # more primitives only had fewer steps
+        return self.beside(min(highest, round(_BEYOND * top)))
+
+    def beside(self, found: int) -> int:
+        """``found``, but no nearer to a full run that missed than makes a difference, on the side that it missed on."""
+        for attempt in self.record.done("full"):
+            margin = self.judge.margin({name: attempt.quality(name) for name in self.judge.measures})
+            if margin < 0:
+                found = max(found, math.ceil(attempt.count * _STEP))
+            elif margin > _OVER and attempt.count > 1:
+                found = min(found, math.floor(attempt.count / _STEP))
+        return max(found, 1)
 
     def knobs(self) -> None:
         """Other settings that save bytes, each tried once at the size tried that is nearest to the one wanted."""
@@ -277,7 +313,7 @@ class _Search:
             self.record.turns.append(Turn(key, before, after, loss, size, adopted))
             self.trying.write()
             kept = "kept" if adopted else "not worth it"
-            self.trying.tell(f"{key}={after}: {size:.0%} of the bytes, {loss['psnr']:+.2f} dB lost; {kept}")
+            self.trying.tell(f"{key}={after}: {size:.0%} of the bytes, {-loss['psnr']:+.2f} dB; {kept}")
 
     def longer(self) -> None:
         """The size wanted for twice as long: what more steps bring is surest from the longest."""
@@ -333,11 +369,9 @@ class _Search:
         if number and steps < max(least, 0.75 * done[-1].steps):
             self.because(f"no time for another full run: {max(left, 0):.0f} s are left")
             return None
-        if number and any(abs(math.log2(wanted / a.count)) < 0.05 for a in done):
+        if number and any(abs(math.log2(wanted / a.count)) < math.log2(_STEP) / 2 for a in done):
             self.because("another size promises nothing better")
             return None
-        if not number:
-            self.say_what_is_out_of_reach()
         steps = max(steps, least)
         seconds = round(max(min(_SLOWER * steps * self.trying.pace(wanted), left), 0.02 * self.record.asked["budget"], 1.0), 1)
         return Attempt("full", self.record.words, wanted, steps, seconds, self.judge.predicted(wanted))
@@ -354,12 +388,13 @@ class _Search:
         """One line as soon as it is known."""
         if not self.target.quality:
             return
-        judge, highest = self.judge, self.highest()
-        missed = ALLOWANCE - judge.curve().at(highest)
-        if missed > judge.doubt:
-            best = " ".join(f"{name} {value:.4g}" for name, (value, _) in judge.predicted(highest).items())
-            limit = " that the limits allow" if judge.most() is not None and highest == judge.most() else " that the budget can train"
-            self.record.warning = (
-                f"{self.target} is out of reach: with {highest:,} primitives, the most{limit}, {best} is expected; the best found is made"
+        self.record.out_of_reach = None
+        judge, best = self.judge, self.wanted()
+        if max(judge.curve().at(best), *(margin for _, margin in judge.tried())) + judge.doubt < ALLOWANCE:
+            found = ", ".join(f"{name} {value:.4g} ± {doubt:.2g} dB" for name, (value, doubt) in judge.predicted(best).items())
+            limits = judge.most()
+            limit = "the limits allow" if limits is not None and self.highest() == limits else "the budget can train"
+            self.record.out_of_reach = (
+                f"{self.target} is out of reach: {found} is the best that {limit}, of {best:,} primitives; that is made"
             )
-            self.trying.tell(self.record.warning)
+            self.trying.tell(self.record.out_of_reach)

@@ -93,10 +93,11 @@ def publish(trying: Trying, target: Target, judge: Judge) -> None:
     limit = shortfall(target, attempt, finished.packed)
     if limit is not None or margin < 0:
         missed = limit or f"{_missed(target, finished.held)} on the views held out"
-        record.warning = record.warning or f"{target} is missed: {missed}; the best found is made"
+        record.warning = f"{target} is missed: {missed}; the best found is made"
+        record.why += [record.out_of_reach] if record.out_of_reach else []
     else:
         record.warning = None
-    record.why.append("the target is missed" if record.warning else f"{target} is met on the views held out")
+        record.why.append(f"{target} is met on the views held out")
     record.achieved = {
         "run_dir": str(finished.run_dir),
         "primitives": attempt.count,
@@ -158,7 +159,8 @@ def quantised(shop: Workshop, before: Finished) -> Finished:
     picked, held = levels[-1], before.held
     for level in levels:
         shop.trying.events(Finishing(f"storing in few bits, level {level}"))
-        save_compressed(draft, model, task.name, {}, bit_table(level, (), model.specs))
+        words = (before.run_dir / "config.yaml").read_text(encoding="utf-8")
+        save_compressed(draft, model, task.name, {}, bit_table(level, (), model.specs), words)
         picked, held = level, shop.measured(load_model(draft, task)[0])
         if target.quality:
             enough = judge.margin(held) >= least

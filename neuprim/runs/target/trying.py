@@ -112,7 +112,8 @@ class Trying:
         try:
             outcome = run_trial(Trial(config, self.record.hold_out, VIEWS), self.dataset, watch)
         finally:
-            attempt.seconds += self.clock() - start
+            self.begun += watch.compiling
+            attempt.seconds += self.clock() - start - watch.compiling
             attempt.pace = watch.pace or attempt.pace
             self.write()
         found = {k: v for k, v in dataclasses.asdict(outcome).items() if k != "curve"}
@@ -128,7 +129,8 @@ class Trying:
         """Bytes of a training's model in few bits."""
         task, file = task_of(config), config.output_dir / "packed.neuprim"
         model, _ = load_model(config.output_dir / "model.safetensors", task)
-        save_compressed(file, model, task.name, {}, bit_table(USUAL_LEVEL, (), model.specs))
+        words = (config.output_dir / "config.yaml").read_text(encoding="utf-8")
+        save_compressed(file, model, task.name, {}, bit_table(USUAL_LEVEL, (), model.specs), words)
         size = file.stat().st_size
         file.unlink()
         return size

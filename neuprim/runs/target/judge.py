@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from neuprim.config.target import Target
 from neuprim.runs.target.pace import linear
 from neuprim.runs.target.prediction import FIRST_GAIN, Forecast, decibels, forecast, undecibels
-from neuprim.runs.target.record import Attempt, Record
+from neuprim.runs.target.record import Attempt, Purpose, Record, Turn
 from neuprim.runs.target.search import Curve
 
 __all__ = ["Judge"]
@@ -57,7 +57,7 @@ class Judge:
 
     def _of(self, name: str) -> dict[int, Forecast]:
         lengths = self._lengths(name)
-        full = {a.count: a for a in self.record.done("full")}
+        full = {a.count: a for a in self._done("full")}
         gains = [f for values in lengths.values() if (f := _gain(values)) is not None]
         gain = sum(gains) / len(gains) if gains else FIRST_GAIN
         short = {
@@ -81,20 +81,21 @@ class Judge:
     def _lengths(self, name: str) -> dict[int, dict[int, float]]:
         """Primitives -> steps -> quality of the trials."""
         found: dict[int, dict[int, float]] = {}
-        for attempt in self.record.done("size", "longer"):
+        for attempt in self._done("size", "longer"):
             found.setdefault(attempt.count, {})[int(attempt.outcome["steps"])] = self._now(name, attempt)  # type: ignore[index]
         return found
 
+    def _done(self, *purposes: Purpose) -> list[Attempt]:
+        """Trainings that tell something about the settings of now: made with these, or with others that were turned to them since."""
+        now = self.record.words
+        return [a for a in self.record.done(*purposes) if all(key in now and value >= now[key] for key, value in a.words.items())]
+
     def _now(self, name: str, attempt: Attempt) -> float:
         """What a training would have had with the settings of now."""
-        turned = [
-            t for t in self.record.turns if t.adopted and attempt.words.get(t.key) != t.after and not self._beyond(attempt, t.key, t.after)
-        ]
-        return decibels(name, attempt.quality(name)) - sum(turn.loss.get(name, 0.0) for turn in turned)
+        return decibels(name, attempt.quality(name)) - sum(turn.loss.get(name, 0.0) for turn in self._turned_since(attempt))
 
-    def _beyond(self, attempt: Attempt, key: str, after: int) -> bool:
-        """Whether a training had a setting turned further than that already."""
-        return attempt.words.get(key, after + 1) < after
+    def _turned_since(self, attempt: Attempt) -> list[Turn]:
+        return [turn for turn in self.record.turns if turn.adopted and attempt.words.get(turn.key, turn.before) > turn.after]
 
     def curve(self) -> Curve:
         """Margins over sizes."""
@@ -103,7 +104,7 @@ class Judge:
     def tried(self) -> list[tuple[int, float]]:
         """(primitives, margin) of every size; of those between two full runs, one too small and one large enough, these two alone."""
         found = [(n, self._margin(values)) for n, values in self.forecasts().items()]
-        full = {a.count for a in self.record.done("full")}
+        full = {a.count for a in self._done("full")}
         low = max((n for n, margin in found if n in full and margin < ALLOWANCE), default=None)
         high = min((n for n, margin in found if n in full and margin >= ALLOWANCE), default=None)
         if low is None or high is None:
@@ -134,7 +135,7 @@ class Judge:
     def most(self) -> int | None:
         """Primitives that the target's limits allow; None without limits, or before a trial."""
         limits = []
-        tried = [a for a in self.record.done("size", "longer", "full") if a.packed]
+        tried = [a for a in self._done("size", "longer", "full") if a.packed]
         if self.target.megabytes is not None and tried:
             limits.append(_largest(self._sizes(tried), _FULL_FILE * 1e6 * self.target.megabytes))
         if self.target.fps is not None and tried:
@@ -146,9 +147,8 @@ class Judge:
         found = []
         for attempt in tried:
             size = float(attempt.packed)
-            for turn in self.record.turns:
-                if turn.adopted and attempt.words.get(turn.key, turn.before) > turn.after:
-                    size *= turn.size
+            for turn in self._turned_since(attempt):
+                size *= turn.size
             found.append((attempt.count, size))
         return found
 

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from neuprim.core.errors import DataError
 from neuprim.core.io.files import write_json
 
-__all__ = ["FILE", "Attempt", "Record", "read_record"]
+__all__ = ["FILE", "Attempt", "Purpose", "Record", "Turn", "read_record"]
 
 FILE = "target.json"
 """Of the run's directory."""
@@ -93,6 +93,7 @@ class Record:
         asked: the target and its budget, seconds.
         same: what must be the same for trainings to be kept.
         hold_out: every n-th training view is held out of the trainings and judges them.
+        stage: how many of the search's stages are over.
         length: steps of a trial; 0 until it is known how fast the machine is.
         spent: seconds of the budget that are used.
         chosen: folder of the full run that was chosen.
@@ -104,6 +105,7 @@ class Record:
     asked: dict[str, float]
     same: dict[str, Any]
     hold_out: int = 0
+    stage: int = 0
     length: int = 0
     spent: float = 0.0
     attempts: list[Attempt] = field(default_factory=list)

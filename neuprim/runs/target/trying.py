@@ -100,7 +100,7 @@ class Trying:
 
         KeyboardInterrupt leaves it unfinished in the record; it goes on from its checkpoint.
         """
-        known = next((a for a in self.record.attempts if _same(a, attempt)), None)
+        known = self._find(attempt)
         attempt = known or attempt
         if attempt.outcome is not None:
             return attempt
@@ -124,6 +124,14 @@ class Trying:
             attempt.packed = self._packed(config)
         self.write()
         return attempt
+
+    def known(self, attempt: Attempt) -> bool:
+        """Whether an equal attempt is done already."""
+        found = self._find(attempt)
+        return found is not None and found.outcome is not None
+
+    def _find(self, attempt: Attempt) -> Attempt | None:
+        return next((a for a in self.record.attempts if _same(a, attempt)), None)
 
     def _packed(self, config: RunConfig) -> int:
         """Bytes of a training's model in few bits."""

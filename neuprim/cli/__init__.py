@@ -193,7 +193,7 @@ def _run(args: argparse.Namespace) -> int:
     check = not args.cfg
     wanted, words = target_words(args.overrides)
     if wanted is not None and args.multirun:
-        raise ConfigError(f"-m with {wanted[0]}: a target is for one run; expected one of them")
+        raise ConfigError(f"{wanted[0]}: a target is for one run; expected no -m beside it")
     configs = compose_all(words, check) if args.multirun else [compose(words, check)]
     if args.cfg:
         if wanted is not None:

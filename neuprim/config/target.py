@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from neuprim.config.duration import seconds_of
-from neuprim.config.overrides import Assignment, parse
+from neuprim.config.overrides import Assignment, parse, swept_keys
 from neuprim.core.checked import Range, checked, shown
 from neuprim.core.errors import ConfigError, nearest
 
@@ -61,6 +61,8 @@ def target_words(words: Sequence[str]) -> tuple[tuple[Target, float] | None, lis
     own = [word for word in words if _is_own(word)]
     if not own:
         return None, list(words)
+    for key in swept_keys(own):
+        raise ConfigError(f"{key}: several values; expected one, as a target is for one run")
     said = {a.key: a for a in parse(own)}
     budget = said.pop("budget", None)
     if not said:

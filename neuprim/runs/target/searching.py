@@ -43,6 +43,9 @@ _OVER = 0.3
 _BEYOND = 2.0
 """How many times more primitives than any trial had a full run may have."""
 
+_ENOUGH = 0.75
+"""Of the steps of another full run, those with which it can be compared."""
+
 _STEP = 1.07
 """From the size of a full run that missed to the next, at least."""
 
@@ -140,7 +143,10 @@ class Search:
         self.probe(first)
         if self.longer_trials():
             self.probe(first)
-        for _ in range(_MOST_SIZES - 1):
+        begun = list(dict.fromkeys(a.primitives for a in self.record.attempts if a.purpose == "size" and a.words == self.record.words))
+        for count in begun:  # before an interruption
+            self.probe(count)
+        for _ in range(_MOST_SIZES - len(begun)):
             proposal = self.proposal()
             if proposal.kind != "try":
                 break
@@ -181,9 +187,10 @@ class Search:
         top, best = max(tried)[0], max(tried, key=lambda pair: pair[1])[0]
         if found is not None and found <= _BEYOND * top:
             return self.beside(found)
-        if found is None and curve.at(highest) + judge.doubt < ALLOWANCE and best < top:
-            return best  # more primitives only had fewer steps
-        return self.beside(min(highest, round(_BEYOND * top)))
+        more = min(highest, round(_BEYOND * top))
+        if found is None and (best < top or self.steps(more) < _ENOUGH * self.steps(top)):
+            return min(best, highest)  # more primitives would only have fewer steps
+        return self.beside(more)
 
     def beside(self, found: int) -> int:
         """``found``, but no nearer to a full run that missed than makes a difference, on the side that it missed on."""
@@ -274,7 +281,7 @@ class Search:
         wanted = self.wanted()
         least = self.record.length * (4 if number else 1)
         steps = int(min(self.cap, share / self.trying.pace(wanted)))
-        if number and steps < max(least, 0.75 * done[-1].steps):
+        if number and steps < max(least, _ENOUGH * done[-1].steps):
             self.because(f"no time for another full run: {max(left, 0):.0f} s are left")
             return None
         if number and any(abs(math.log2(wanted / a.count)) < math.log2(_STEP) / 2 for a in done):

@@ -13,6 +13,7 @@ from neuprim.config import RunConfig, task_of
 from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compressed import USUAL_LEVEL, bit_table
 from neuprim.core.data import Dataset
+from neuprim.core.train.settings import PopulationSettings
 from neuprim.runs.events import Events, Note
 from neuprim.runs.target.pace import Stopwatch, linear
 from neuprim.runs.target.record import Attempt, Record
@@ -26,6 +27,9 @@ FOLDER = "target"
 VIEWS = 16
 """Views held out that are measured, at most."""
 
+_EVERY = 5
+"""Steps between two interventions, at least: fewer tell nothing about who is used."""
+
 _PSNR_MAX = 200.0  # dB; equal images have an infinite one, which JSON does not
 
 
@@ -36,12 +40,19 @@ def changed(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
     for key, value in values.items():
         group, _, name = key.partition(".")
         groups.setdefault(group, {})[name] = value
-        before = getattr(getattr(config, group), name)
-        default = different.pop(key, (before, before))[0]
-        if value != default:
-            different[key] = (default, value)
+        for own, was, now in _leaves(key, getattr(getattr(config, group), name), value):
+            default = different.pop(own, (was, was))[0]
+            if now != default:
+                different[own] = (default, now)
     made = {group: replace(getattr(config, group), **settings) for group, settings in groups.items()}
     return replace(config, **made, non_default=different)
+
+
+def _leaves(key: str, before: Any, after: Any) -> list[tuple[str, Any, Any]]:
+    """(dotted name, value before, value after) of a setting, or of every setting of a group."""
+    if not dataclasses.is_dataclass(before):
+        return [(key, before, after)]
+    return [(f"{key}.{f.name}", getattr(before, f.name), getattr(after, f.name)) for f in dataclasses.fields(before)]
 
 
 @dataclass
@@ -91,9 +102,17 @@ class Trying:
             "model.primitives": attempt.primitives,
             "train.iterations": attempt.steps,
             "train.max_seconds": attempt.max_seconds,
+            "train.population": self._population(attempt.steps),
         }
         made = changed(self.config, values)
         return replace(made, output_dir=self.folder / FOLDER / attempt.folder, resume=attempt.purpose == "full")
+
+    def _population(self, steps: int) -> PopulationSettings:
+        """With as many interventions as in a run of whole length: with fewer, short runs are half a decibel worse than they need be."""
+        whole, settings = self.config.train.iterations, self.config.train.population
+        if whole is None or steps >= whole:
+            return settings
+        return replace(settings, every=max(round(settings.every * steps / whole), min(_EVERY, settings.every)))
 
     def run(self, attempt: Attempt) -> Attempt:
         """The attempt, done; the one of the record where it has an equal one.

@@ -15,6 +15,7 @@ from neuprim.config.target import Target
 from neuprim.runs.events import Event, Note, Step
 from neuprim.runs.target import Record, target_run
 from neuprim.runs.target.record import FILE
+from neuprim.runs.target.words import promised
 
 __all__ = ["fit_target", "print_record"]
 
@@ -51,7 +52,7 @@ def print_record(record: Record, console: Console) -> None:
 
     found = record.achieved
     for name, (value, doubt) in found["predicted"].items():
-        text = f"{name}: predicted {value:.4g} ± {doubt:.2g} dB; held out {found['held_out'][name]:.4g}"
+        text = f"predicted {promised(name, value, doubt)}; held out {found['held_out'][name]:.4g}"
         line(f"{text}; test views {found['test'][name]:.4g}, {found['test_before_storing'][name]:.4g} before storing")
     whole, packed = Path(found["run_dir"]) / "model.safetensors", Path(found["file"])
     line(

@@ -54,7 +54,7 @@ def test_a_search_prints_what_it_tried_and_what_came_of_it(
         "static/solids: 40 primitives, 32 steps",
         "target.psnr=50 is out of reach",
         "full run: ",
-        "psnr: predicted ",
+        "predicted psnr ",
         "model.neuprim ",
         "s of 300 s used",
         "neuprim: warning: target.psnr=50 is missed: psnr ",

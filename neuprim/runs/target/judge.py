@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from neuprim.config.target import Target
 from neuprim.runs.target.pace import linear
-from neuprim.runs.target.prediction import FIRST_GAIN, Forecast, decibels, forecast, undecibels
+from neuprim.runs.target.prediction import FIRST_GAIN, RATIO, Forecast, decibels, forecast, undecibels
 from neuprim.runs.target.record import Attempt, Purpose, Record, Turn
 from neuprim.runs.target.search import Curve
 
@@ -59,13 +59,18 @@ class Judge:
         lengths = self._lengths(name)
         full = {a.count: a for a in self._done("full")}
         gains = [f for values in lengths.values() if (f := _gain(values)) is not None]
-        gain = sum(gains) / len(gains) if gains else FIRST_GAIN
-        short = {
-            n: forecast({s: v for s, v in values.items() if s <= self.record.length} or values, self.steps(n), gain)
-            for n, values in lengths.items()
-        }
-        best = {n: forecast(values, self.steps(n), gain) for n, values in lengths.items()}
-        moved = [best[n].value - short[n].value for n, values in lengths.items() if max(values) > self.record.length]
+        mean = sum(gains) / len(gains) if gains else FIRST_GAIN
+
+        def gain(steps: int) -> float:
+            return mean * RATIO ** max(math.log2(steps / max(self.record.length, 1)), 0.0)
+
+        def told(n: int, values: Mapping[int, float]) -> Forecast:
+            return forecast(values, self.steps(n), gain(max(values)))
+
+        length = self.record.length
+        best = {n: told(n, values) for n, values in lengths.items()}
+        short = {n: told(n, {s: v for s, v in values.items() if s <= length} or values) for n, values in lengths.items()}
+        moved = [best[n].value - short[n].value for n, values in lengths.items() if min(values) <= length < max(values)]
         shift, tested = (sum(moved) / len(moved), True) if moved else (0.0, False)
         made = {}
         for n, values in lengths.items():
@@ -81,7 +86,7 @@ class Judge:
     def _lengths(self, name: str) -> dict[int, dict[int, float]]:
         """Primitives -> steps -> quality of the trials."""
         found: dict[int, dict[int, float]] = {}
-        for attempt in self._done("size", "longer"):
+        for attempt in self._done("size", "knob", "longer"):
             found.setdefault(attempt.count, {})[int(attempt.outcome["steps"])] = self._now(name, attempt)  # type: ignore[index]
         return found
 

@@ -19,9 +19,9 @@ _FIXED = 0.5
 
 
 def linear(known: Sequence[tuple[int, float]], primitives: float) -> float:
-    """A time at a number of primitives, from (primitives, time) pairs: a least-squares line that neither falls nor is ever below its times' least half.
+    """A time at a number of primitives, from (primitives, time) pairs: a least-squares line that neither falls nor starts below nothing.
 
-    Later pairs count as much as earlier ones, so a machine that became slower is noticed with the next trial.
+    Of one number alone half is taken to be the same for all.
     """
     counts, times = [float(n) for n, _ in known], [t for _, t in known]
     mean_n, mean_t = sum(counts) / len(counts), sum(times) / len(times)
@@ -32,7 +32,7 @@ def linear(known: Sequence[tuple[int, float]], primitives: float) -> float:
         else (1 - _FIXED) * mean_t / mean_n
     )
     slope = min(max(slope, 0.0), mean_t / mean_n)
-    return max(mean_t + slope * (primitives - mean_n), min(times) / 2 if primitives < mean_n else 0.0)
+    return mean_t + slope * (primitives - mean_n)
 
 
 @dataclass

@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-__all__ = ["FIRST_GAIN", "Forecast", "decibels", "forecast", "ratio_of", "undecibels"]
+__all__ = ["FIRST_GAIN", "RATIO", "Forecast", "decibels", "forecast", "ratio_of", "undecibels"]
 
 RATIO = 0.75
 """Of a doubling's gain to that of the one before it."""
@@ -62,7 +62,7 @@ def forecast(lengths: Mapping[int, float], steps: float, gain: float = FIRST_GAI
     Args:
         lengths: steps of a trial -> its quality, dB, of trials that differ in nothing else; one or more.
         steps: of the run to come.
-        gain: dB of a doubling, used where only one length was tried.
+        gain: dB of the doubling that ends with the trial, used where only one length was tried.
     """
     tried = sorted(lengths)
     pairs = list(itertools.pairwise(tried))

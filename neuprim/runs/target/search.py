@@ -137,6 +137,8 @@ def climb(tried: Sequence[tuple[int, float]], lowest: int, highest: int, worth: 
     """
     counts = sorted({count for count, _ in tried})
     top = counts[-1]
+    if highest < counts[0] / 2**_CLOSE:  # all that was tried is above the limit, which is not known well from there
+        return Proposal("try", max(highest, round(counts[0] / 2**_FURTHEST), lowest))
     if top >= highest / 2**_CLOSE:
         if len(counts) > 1 or highest <= lowest:
             return Proposal("take", _best(tried, lowest, highest, worth))

@@ -20,7 +20,7 @@ from neuprim.runs.target.prediction import decibels
 from neuprim.runs.target.record import Attempt, Record, Turn
 from neuprim.runs.target.search import Proposal, climb, propose
 from neuprim.runs.target.trying import VIEWS, Trying
-from neuprim.runs.target.words import described, shortfall
+from neuprim.runs.target.words import described, promised, shortfall
 
 __all__ = ["Search"]
 
@@ -40,8 +40,11 @@ _MOST_SIZES, _MOST_TURNS, _MOST_FULL = 6, 4, 5
 _OVER = 0.3
 """dB above the target that are close enough."""
 
-_BEYOND = 2.0
-"""How many times more primitives than any trial had a full run may have."""
+_BEYOND, _BELOW = 2.0, 3.0
+"""How many times more, and fewer, primitives than any training had a full run may have: curves are not known further away."""
+
+_MORE = 1.25
+"""How many times more primitives limits must allow for another full run to be worth it."""
 
 _ENOUGH = 0.75
 """Of the steps of another full run, those with which it can be compared."""
@@ -182,11 +185,11 @@ class Search:
         if not self.target.quality:
             proposal = climb(judge.tried(), 1, highest)
             return proposal.primitives if proposal.kind == "take" else highest
-        curve, tried = judge.curve(), judge.tried()
+        curve, tried, known = judge.curve(), judge.tried(), min(judge.tried())[0]
         found = curve.count_for(ALLOWANCE, 1, highest)
         top, best = max(tried)[0], max(tried, key=lambda pair: pair[1])[0]
         if found is not None and found <= _BEYOND * top:
-            return self.beside(found)
+            return self.beside(max(found, min(round(known / _BELOW), highest)))
         more = min(highest, round(_BEYOND * top))
         if found is None and (best < top or self.steps(more) < _ENOUGH * self.steps(top)):
             return min(best, highest)  # more primitives would only have fewer steps
@@ -236,7 +239,7 @@ class Search:
         if self.record.done("longer") or self.record.done("full"):
             return
         wanted = self.wanted()
-        near = [a.primitives for a in self.record.done("size") if a.words == self.record.words and a.steps == self.record.length]
+        near = [a.primitives for a in self.record.done("size", "knob") if a.words == self.record.words and a.steps == self.record.length]
         count = min(near, key=lambda n: abs(math.log2(n / wanted)), default=wanted)
         if steps > self.steps(count) or not self.fits(count, steps, _SEARCH + 0.07):
             return
@@ -258,17 +261,15 @@ class Search:
                 if planned is None:
                     return
                 attempt = planned
-            expected = ", ".join(f"{v:.4g} ± {d:.2f}" for v, d in attempt.predicted.values())
-            self.trying.tell(
-                f"full run: {attempt.primitives:,} primitives, {attempt.steps:,} steps; expected {' '.join(self.judge.measures)} {expected}"
-            )
+            expected = ", ".join(promised(name, *pair) for name, pair in attempt.predicted.items())
+            self.trying.tell(f"full run: {attempt.primitives:,} primitives, {attempt.steps:,} steps; expected {expected}")
             done_now = self.trying.run(attempt)
             self.trying.tell(described(done_now, {}))
 
     def close(self, attempt: Attempt) -> bool:
         """Whether a full run is as good as another could hope to be."""
         if not self.target.quality:
-            return shortfall(self.target, attempt) is None
+            return shortfall(self.target, attempt) is None and self.wanted() <= _MORE * attempt.count
         margin = self.judge.margin({name: attempt.quality(name) for name in self.judge.measures})
         return 0.0 <= margin <= _OVER and shortfall(self.target, attempt) is None
 
@@ -306,7 +307,7 @@ class Search:
         self.record.out_of_reach = None
         judge, best = self.judge, self.wanted()
         if max(judge.curve().at(best), *(margin for _, margin in judge.tried())) + judge.doubt < ALLOWANCE:
-            found = ", ".join(f"{name} {value:.4g} ± {doubt:.2g} dB" for name, (value, doubt) in judge.predicted(best).items())
+            found = ", ".join(promised(name, *pair) for name, pair in judge.predicted(best).items())
             limits = judge.most()
             limit = "the limits allow" if limits is not None and self.highest() == limits else "the budget can train"
             self.record.out_of_reach = (

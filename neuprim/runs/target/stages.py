@@ -25,6 +25,7 @@ from neuprim.runs.finish import finish
 from neuprim.runs.measure import draw
 from neuprim.runs.open import COMPRESSED, placed, read_metrics
 from neuprim.runs.target.judge import ALLOWANCE, Judge
+from neuprim.runs.target.prediction import decibels
 from neuprim.runs.target.record import Attempt
 from neuprim.runs.target.trying import VIEWS, Trying
 from neuprim.runs.target.words import shortfall
@@ -35,6 +36,9 @@ __all__ = ["STAGES", "Finished", "chosen", "publish"]
 
 _LEVELS = (4, 3, 2, 1)
 """Of compression, those tried for a target of quality, fewest bits first."""
+
+_APART = 0.3
+"""dB between the test views and the views held out that are worth a line."""
 
 _KEPT = ("model.safetensors", "checkpoint.safetensors", "metrics.jsonl")
 
@@ -98,6 +102,13 @@ def publish(trying: Trying, target: Target, judge: Judge) -> None:
     else:
         record.warning = None
         record.why.append(f"{target} is met on the views held out")
+    for name, goal in target.quality.items():
+        apart = decibels(name, finished.test[name]) - decibels(name, finished.held[name])
+        if abs(apart) > _APART:
+            side = "above" if decibels(name, finished.test[name]) >= decibels(name, goal) else "below"
+            record.why.append(
+                f"{name} of the test views is {apart:+.2f} dB from that of the views held out, and {side} the target: they are other views, and decide nothing"
+            )
     record.achieved = {
         "run_dir": str(finished.run_dir),
         "primitives": attempt.count,

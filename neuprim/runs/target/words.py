@@ -5,18 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from neuprim.config.target import Target
+from neuprim.runs.target.prediction import decibels, undecibels
 from neuprim.runs.target.record import Attempt
 
-__all__ = ["described", "shortfall"]
+__all__ = ["described", "promised", "shortfall"]
 
 
 def described(attempt: Attempt, predicted: Mapping[str, Sequence[float]]) -> str:
     """A training in a line."""
     turned = "".join(f" {key.rpartition('.')[2]}={value}" for key, value in sorted(attempt.words.items()))
-    full = {name: f"{value:.4g} ± {doubt:.2g} dB" for name, (value, doubt) in predicted.items()}
-    ends = f"; a full run: {', '.join(f'{name} {text}' for name, text in full.items())}" if full else ""
+    ends = "; a full run: " + ", ".join(promised(name, *pair) for name, pair in predicted.items()) if predicted else ""
     found = f"{attempt.quality('psnr'):.2f} dB, ssim {attempt.quality('ssim'):.4f}"
     return f"{attempt.count:,} primitives{turned}, {attempt.steps:,} steps, {attempt.packed / 1e3:.1f} kB: held out {found}{ends} ({attempt.seconds:.1f} s)"
+
+
+def promised(name: str, value: float, doubt: float) -> str:
+    """A measure that is expected, with its doubt, dB, in its own unit."""
+    if name == "psnr":
+        return f"{name} {value:.2f} ± {doubt:.2g} dB"
+    low, high = (undecibels(name, decibels(name, value) + sign * doubt) for sign in (-1, 1))
+    return f"{name} {value:.4f} ± {(high - low) / 2:.2g}"
 
 
 def shortfall(target: Target, attempt: Attempt, packed: int | None = None) -> str | None:

@@ -55,7 +55,7 @@ class Scene:
 
 SCENES = {
     "solids": Scene(("scene=solids", "scene.size=64", "train.iterations=3000"), (40, 80, 160, 320), (26.0, 28.0), 90.0, 400),
-    "chair": Scene(("scene=blender", "scene.downsample=2", "train.iterations=3000"), (100, 200, 400, 800), (29.0, 31.0), 150.0, 1000),
+    "chair": Scene(("scene=blender", "scene.downsample=2", "train.iterations=3000"), (50, 100, 200, 400), (29.0, 31.0), 150.0, 1000),
 }
 DEGREES = (3, 1)
 

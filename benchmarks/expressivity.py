@@ -188,7 +188,7 @@ def forms_table(found: dict[str, Any]) -> str:
     seeds = sorted({len(runs) for runs in groups.values()})
     lines.append(
         f"\nPreset `quick`, {' to '.join(str(n) for n in dict.fromkeys((seeds[0], seeds[-1])))} seed(s), mean ± half the spread; *bytes of* so many of the paper's primitives; steps: as many as fit into "
-        "the seconds of the paper's form, at paces measured in turns over whole runs (lit_solids: with rates of the colour network twice those that the preset has had since); *error of σ*: relative L2 over the files' voxels, early / middle / late; *last doubling*: what the second half of the budget brought, first seed. PSNR is of "
+        "the seconds of the paper's form, at paces measured in turns over whole runs; *error of σ*: relative L2 over the files' voxels, early / middle / late; *last doubling*: what the second half of the budget brought, first seed. PSNR is of "
         f"the whole image (solids, chair at 200×200 on white), inside the mask (fire, smoke_fire), clamped linear (lit_solids). {found['cpu']}, one thread."
     )
     return "\n".join(lines)

@@ -19,6 +19,7 @@ from neuprim.cli.environment_flags import add_environment_flags, environment_of
 from neuprim.cli.export_help import export_help
 from neuprim.cli.metrics_report import print_metrics
 from neuprim.cli.operating_words import DRAWN, OPERATING, operating_words
+from neuprim.cli.prune import for_prune, prune
 from neuprim.cli.tradeoff import for_tradeoff, tradeoff
 from neuprim.core.errors import DISK, ConfigError, NeuprimError, nearest
 from neuprim.core.notices import warnings_as_lines
@@ -152,6 +153,8 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
     export.add_argument("--json", action="store_true", help="print JSON")
 
     arguments.for_compress(command("compress", _compress, "write a run's model in few bits, as one file that every command reads"))
+
+    for_prune(command("prune", _prune, "remove what a run's scene does not require, and write the rest as a run"))
 
     back = command("import", _import, "make a run directory of an exported .ply or .npz, or of a .neuprim")
     back.add_argument("file", type=Path, metavar="FILE")
@@ -292,8 +295,13 @@ def _compress(args: argparse.Namespace) -> int:
     from neuprim.runs.compress import compress_run
 
     progress = LineProgress(plain_console(stderr=True))
-    print_compression(compress_run(run_dir, args.level, args.bits, args.out, args.force, progress))
+    print_compression(compress_run(run_dir, args.level, args.bits, args.out, args.force, progress, args.seconds, args.steps))
     return 0
+
+
+def _prune(args: argparse.Namespace) -> int:
+    _run_directory(args.run_dir)
+    return prune(args)
 
 
 def _import(args: argparse.Namespace) -> int:

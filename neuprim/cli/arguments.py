@@ -7,7 +7,20 @@ import math
 import re
 from pathlib import Path
 
-__all__ = ["count", "for_bench", "for_compress", "for_inspect", "for_render", "numbers", "rate", "row", "size"]
+__all__ = [
+    "count",
+    "decibels",
+    "duration",
+    "for_bench",
+    "for_compress",
+    "for_inspect",
+    "for_render",
+    "numbers",
+    "rate",
+    "row",
+    "size",
+    "whole",
+]
 
 
 def for_bench(parser: argparse.ArgumentParser) -> None:
@@ -62,6 +75,8 @@ def for_compress(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--level", type=count, default=3, metavar="1-5", help="1 keeps nearly everything, 5 very little (default: 3)")
     words = "bits of a parameter, or of all others, over the level's: means=16 sh_rest=6,5 others=8"
     parser.add_argument("--bits", nargs="+", default=[], metavar="NAME=BITS", help=words)
+    parser.add_argument("--seconds", type=duration, default=30.0, metavar="S", help="of training for few bits; 0 for none (default: 30)")
+    parser.add_argument("--steps", type=whole, metavar="N", help="of training instead, for the same file on every machine")
     parser.add_argument("--out", "--output", type=Path, metavar="FILE", help="where to write (default: RUN_DIR/model.neuprim)")
     parser.add_argument("--force", action="store_true", help="replace a file that exists")
 
@@ -79,6 +94,29 @@ def count(text: str) -> int:
     if not re.fullmatch(r"[1-9]\d{0,6}", text):
         raise argparse.ArgumentTypeError(f"{text!r}: expected a positive count")
     return int(text)
+
+
+def whole(text: str) -> int:
+    """A whole number, from 0."""
+    if not re.fullmatch(r"\d{1,7}", text):
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number, from 0")
+    return int(text)
+
+
+def decibels(text: str) -> float:
+    """0.1 or 0.1dB -> 0.1."""
+    match = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?(?:dB)?", text, re.IGNORECASE)
+    if match is None or not 0 < float(match[1]) <= 100:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected decibels above 0, for example 0.1dB")
+    return float(match[1])
+
+
+def duration(text: str) -> float:
+    """Seconds, 0 or more: 30, 90s, 5m."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)(s|m|h|)", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a time, for example 30s or 5m")
+    return float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]]
 
 
 def row(text: str) -> int:

@@ -21,7 +21,8 @@ def print_compression(made: Compression) -> None:
         print(f"{name:5} {before:.{digits}f} -> {after:.{digits}f}{unit} ({after - before:+.{digits}f}), mean of the held-out views")
     for note in made.notes:
         print(f"note: {note}")
-    print(f"compressed in {made.seconds:.2f} s")
+    trained = f", with {made.steps:,} steps of training" if made.steps else ""
+    print(f"compressed in {made.seconds:.2f} s{trained}")
 
 
 def _times(before: int, after: int) -> str:

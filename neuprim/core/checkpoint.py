@@ -19,9 +19,10 @@ from torch import Tensor
 from neuprim.core import compressed
 from neuprim.core.errors import CheckpointError, nearest
 from neuprim.core.io.files import atomic_path
-from neuprim.core.model.fields import ColourField, DensityField
+from neuprim.core.model.fields import ColourField, DensityField, pieces_by_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
+from neuprim.core.zeros import split_off, whole
 
 __all__ = ["FORMAT", "load_model", "read", "read_header", "save_compressed", "save_model", "stored_config", "write"]
 
@@ -96,30 +97,40 @@ def read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 
 def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any]) -> None:
-    """Write what rendering needs. ``extra`` (JSON-able) joins the header: background, colour space, data source."""
-    write(path, "model", model.params, _model_header(model, task, extra))
+    """Write what rendering needs, without what is zero (:mod:`neuprim.core.zeros`). ``extra`` (JSON-able) joins the header: background,
+    colour space, data source."""
+    tensors, apart = split_off(model.params, model.specs, pieces_by_name(model.density, model.colour))
+    write(path, "model", tensors, {**_model_header(model, task, extra), **({"apart": apart} if apart else {})})
 
 
 def save_compressed(
-    path: Path, model: Primitives, task: str, extra: Mapping[str, Any], table: compressed.BitTable, config: str | None = None
+    path: Path,
+    model: Primitives,
+    task: str,
+    extra: Mapping[str, Any],
+    table: compressed.BitTable,
+    config: str | None = None,
+    made: compressed.Schemes | None = None,
 ) -> dict[str, compressed.Stored]:
     """As :func:`save_model`, in few bits; returns what the file has of every parameter.
 
     Args:
         table: how many.
         config: text of the run's ``config.yaml``, so that a run directory can be made of the file.
+        made: of a model that is folded and was trained for them; then the table is not asked.
 
     Raises:
         CheckpointError: numbers that cannot be stored, or the file could not be written; names it and the reason.
     """
-    model = compressed.folded(model)
-    schemes = compressed.schemes(model, table)
-    sections = compressed.encode(model, schemes)
+    if made is None:
+        model = compressed.folded(model)
+        made = compressed.schemes(model, table)
+    sections = compressed.encode(model, made)
     if config is not None:
         sections.insert(0, compressed.Section(compressed.CONFIG, compressed.TEXT, (), planes=(config.encode(),)))
     header = {"format": FORMAT, "kind": "model", **_model_header(model, task, extra)}
     sizes = compressed.write_compressed(path, header, model.count, sections)
-    return {name: compressed.Stored(compressed.bits_in_words(scheme), sizes[name]) for name, scheme in schemes.items()}
+    return {name: compressed.Stored(compressed.bits_in_words(scheme), sizes[name]) for name, scheme in made.items()}
 
 
 def stored_config(path: Path) -> str | None:
@@ -154,6 +165,9 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
         raise CheckpointError(
             f"{path}: density and colour fields are {type(density).__name__} and {type(colour).__name__}; expected one of each"
         )
+    if "apart" in header:
+        known = pieces_by_name(density, colour)
+        tensors = whole(tensors, header["apart"], (*density.parameters(), *colour.parameters()), known, str(path))
     try:
         model = Primitives(density, colour, tensors)
     except (ValueError, KeyError, TypeError, IndexError) as error:

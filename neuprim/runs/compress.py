@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.io.drafts import refuse_taken
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
+from neuprim.runs.few_bits import train_for
 from neuprim.runs.measure import measure
 from neuprim.runs.open import COMPRESSED, LOGS, load_dataset, load_run, placed
 
@@ -44,7 +45,7 @@ class Compression:
     Attributes:
         file: where it is; before: bytes of its numbers in float32; after: of the file.
         measured: "psnr" and "ssim" -> means over the held-out views before and after; empty where the run's data are not there.
-        seconds: of taking apart and writing.
+        seconds: of training, taking apart and writing; steps: of training.
     """
 
     file: Path
@@ -53,6 +54,7 @@ class Compression:
     after: int
     measured: dict[str, tuple[float, float]]
     seconds: float
+    steps: int = 0
     notes: tuple[str, ...] = ()
 
 
@@ -63,8 +65,13 @@ def compress_run(
     out: Path | None = None,
     overwrite: bool = False,
     progress: Progress = lambda text, fraction: None,
+    seconds: float = 0.0,
+    steps: int | None = None,
 ) -> Compression:
     """Write a run's model as a compressed file, whole or not at all, and measure what that costs where the run's data are there.
+
+    With ``seconds`` or ``steps`` the numbers are trained for the few bits first: every image of a step is drawn of what will be read back, and
+    gradients go to the numbers themselves (straight through). What training views say is better of both, trained or not, is written.
 
     Args:
         level: 1 (nearly everything) to 5 (very little), see :data:`neuprim.core.compressed.LEVELS`.
@@ -72,6 +79,7 @@ def compress_run(
         out: the file; None: ``model.neuprim`` in the run directory.
         overwrite: whether a file that exists may be replaced.
         progress: called with (text, fraction 0..1).
+        seconds: of fine-tuning, about; steps: so many instead, which gives the same file again.
 
     Raises:
         NeuprimError: no such run, level or parameter, numbers that cannot be stored, or a file in the way.
@@ -81,27 +89,34 @@ def compress_run(
         raise ConfigError(f"--out {final}: is a folder; expected the name of a file")
     refuse_taken(final, overwrite)
     config, task, model, header = load_run(run_dir)
+    config = replace(config, output_dir=run_dir)
     table = bit_table(level, bits, model.specs)
-    extra = {k: v for k, v in header.items() if k not in ("format", "kind", "task", "primitives", "density", "colour")}
-    start = time.perf_counter()
-    with suspects_of(config).watch(run_dir / LOGS):
-        stored = save_compressed(final, model, task.name, extra, table, (run_dir / "config.yaml").read_text(encoding="utf-8"))
-    seconds = time.perf_counter() - start
-    parameters = tuple(
-        StoredParameter(s.name, stored[s.name].bits, 4 * model.count * s.size, stored[s.name].size) for s in model.specs if s.size
-    )
-    again, _ = load_model(final, task)
+    extra = {k: v for k, v in header.items() if k not in ("format", "kind", "task", "primitives", "density", "colour", "apart")}
     notes = ["its primitives are in another order than the run's"]
-    measured: dict[str, tuple[float, float]] = {}
+    dataset: Dataset | None = None
     try:
         progress("reading the run's data", 0.0)
         dataset = _dataset(run_dir, config, task)
     except NeuprimError as error:
-        notes.append(f"what this costs was not measured, as the run's data cannot be read: {error}")
-    else:
+        training = " and it was not trained for few bits" if steps or (steps is None and seconds > 0) else ""
+        notes.append(f"what this costs was not measured{training}, as the run's data cannot be read: {error}")
+    start = time.perf_counter()
+    with suspects_of(config).watch(run_dir / LOGS):
+        whole, made, trained = model, None, 0
+        if dataset is not None and (steps or (steps is None and seconds > 0)):
+            whole, made, trained, said = train_for(config, task, dataset, model, table, seconds, steps, progress)
+            notes += said
+        stored = save_compressed(final, whole, task.name, extra, table, (run_dir / "config.yaml").read_text(encoding="utf-8"), made)
+    taken = time.perf_counter() - start
+    parameters = tuple(
+        StoredParameter(s.name, stored[s.name].bits, 4 * model.count * s.size, stored[s.name].size) for s in model.specs if s.size
+    )
+    again, _ = load_model(final, task)
+    measured: dict[str, tuple[float, float]] = {}
+    if dataset is not None:
         measured = _costs(run_dir, config, task, dataset, model, again, progress)
     before = sum(p.before for p in parameters)
-    return Compression(final, parameters, before, final.stat().st_size, measured, seconds, tuple(notes))
+    return Compression(final, parameters, before, final.stat().st_size, measured, taken, trained, tuple(notes))
 
 
 def _dataset(run_dir: Path, config: RunConfig, task: TaskSpec) -> Dataset:

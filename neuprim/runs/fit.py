@@ -15,10 +15,12 @@ from neuprim.core.data import Dataset
 from neuprim.core.data.check import check_dataset
 from neuprim.core.data.held_out import held_out
 from neuprim.core.metrics.lpips import Lpips
+from neuprim.core.model.less import fewer_fields
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
 from neuprim.core.task import Loss, TaskSpec
 from neuprim.core.train.initial import initial_model
+from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.core.uses import build_settings, loss_settings
 from neuprim.plugins.blame import Suspects, blamed
@@ -183,17 +185,23 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss
     origin = suspects_of(config).task.origin
     with blamed(origin, f"build of task {task.name!r}", config.output_dir / LOGS):
         density, colour = task.build(build_settings(task, config.model, config.options), dataset)
+    density, colour = fewer_fields(density, colour, config.model.reduced)
     check_fields(density, colour, dataset, f"build of task {task.name!r} of {origin.origin}")
     model = initial_model(density, colour, dataset, replace(config.model, primitives=_first(config)), config.seed)
-    # A preset has rates for every density and colour of its task; the trainer refuses names that the model does not have.
-    others = task.parameter_names() - model.params.keys()
-    rates = {k: v for k, v in config.train.rates.items() if k not in others}
-    units = {k: v for k, v in config.train.rate_units.items() if k not in others}
     population = config.train.population
     if population.grow_to is None:
         population = replace(population, grow_to=config.model.primitives)
-    settings = replace(config.train, rates=rates, rate_units=units, population=population)
+    settings = settings_for(replace(config.train, population=population), task, model)
     return Trainer(model, dataset, loss or make_loss(config, task), settings, config.renderer, config.seed)
+
+
+def settings_for(train: TrainSettings, task: TaskSpec, model: Primitives) -> TrainSettings:
+    """Training settings as a model's trainer takes them: a preset has rates for every density and colour of its task, and the trainer
+    refuses names that the model does not have."""
+    others = task.parameter_names() - model.params.keys()
+    rates = {k: v for k, v in train.rates.items() if k not in others}
+    units = {k: v for k, v in train.rate_units.items() if k not in others}
+    return replace(train, rates=rates, rate_units=units)
 
 
 def _first(config: RunConfig) -> int:

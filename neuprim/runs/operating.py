@@ -25,7 +25,7 @@ from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.checked import Range, checked, converted
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError, nearest
-from neuprim.core.model.fields import ColourField, DensityField
+from neuprim.core.model.less import KINDS, check_less, less_of, with_less
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, backends, render
 from neuprim.runs.storage import ALL, FORMATS, FULL, GROUPS, rounded
@@ -35,7 +35,6 @@ __all__ = ["HEADS", "OperatingPoint", "read_point"]
 HEADS = ("renderer", "resolution", "density", "colour", "store")
 """What the words of an operating point begin with."""
 
-_FIELDS = ("density", "colour")
 _Resolution = Annotated[float, Range(above=0, at_most=1, says="a factor above 0, at most 1")]
 
 
@@ -73,15 +72,10 @@ class OperatingPoint:
         Raises:
             ConfigError: a format does not hold some value.
         """
-        params, fields = dict(model.params), {"density": model.density, "colour": model.colour}
+        smaller = model
         for (kind, name), value in self.reduced.items():
-            now = fields[kind]
-            own = {spec.name: params.pop(spec.name).detach() for spec in now.parameters()}
-            fields[kind], fewer = now.reduced(own, model.geometry, name, value)
-            params |= fewer
-        density, colour = fields["density"], fields["colour"]
-        assert isinstance(density, DensityField) and isinstance(colour, ColourField), "a field is reduced to one of its kind"
-        return rounded(Primitives(density, colour, params) if self.reduced else model, self.stored)
+            smaller = with_less(smaller, kind, name, value)
+        return rounded(smaller, self.stored)
 
     def seen(self, view: View) -> View:
         """The view at the resolution that it is drawn at."""
@@ -120,33 +114,21 @@ def read_point(words: Sequence[str], usual: RenderSettings, model: Primitives) -
             resolution = converted(assignment.value, _Resolution, "resolution")
         elif head == "renderer" and dot:
             values[name] = assignment.value
-        elif head in _FIELDS and dot:
-            reduced[head, name] = _smaller(model, head, name, assignment.value)
+        elif head in KINDS and dot:
+            reduced[head, name] = check_less(model.density, model.colour, head, name, assignment.value)
         elif head == "store" and dot:
             stored |= dict.fromkeys(GROUPS if name == ALL else [name], _format(name, assignment.value))
         else:
-            known = [f"renderer.{name}" for name in values] + ["resolution", *(f"store.{name}" for name in (*GROUPS, ALL)), *_less(model)]
+            known = [f"renderer.{name}" for name in values] + [
+                "resolution",
+                *(f"store.{name}" for name in (*GROUPS, ALL)),
+                *less_of(model.density, model.colour),
+            ]
             raise ConfigError(f"{assignment.key}: nothing that a finished run is drawn by{nearest(assignment.key, known)}")
     settings = checked(RenderSettings, values, "renderer")
     backends.check_name(settings.backend)
     backends.check_pair(settings)
     return OperatingPoint(settings, resolution, dict(sorted(reduced.items())), dict(sorted(stored.items())))
-
-
-def _less(model: Primitives) -> list[str]:
-    fields = zip(_FIELDS, (model.density, model.colour), strict=True)
-    return [f"{kind}.{name}" for kind, own in fields for name in own.reductions()]
-
-
-def _smaller(model: Primitives, kind: str, name: str, value: Any) -> int:
-    own = model.density if kind == "density" else model.colour
-    offered = own.reductions()
-    if name not in offered:
-        what = nearest(f"{kind}.{name}", _less(model)) or "; nothing of this model can be"
-        raise ConfigError(f"{kind}.{name}: nothing that {type(own).__name__} can do with less of{what}")
-    if isinstance(value, bool) or value not in offered[name]:
-        raise ConfigError(f"{kind}.{name}={value}: expected {' or '.join(map(str, offered[name]))}, less than the model has")
-    return int(value)
 
 
 def _format(group: str, name: Any) -> str:

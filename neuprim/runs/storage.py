@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from neuprim.core.checkpoint import read_header
 from neuprim.core.compressed import is_compressed
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.geometry import GEOMETRY_SPECS
@@ -86,9 +87,10 @@ def stored_bytes(model: Primitives, stored: Mapping[str, str]) -> int:
 def file_bytes(path: Path, whole: Primitives, part: Primitives, stored: Mapping[str, str]) -> int:
     """Bytes of a run's model file if it held ``part`` of the ``whole`` model that is in it, in formats.
 
-    A compressed file has its own size as it is; less of it, or other formats, are counted as the tensors of a file that is not compressed.
+    A compressed file, and one that leaves zeros out, has its own size as it is; less of it, or other formats, are counted as the tensors of a
+    file that is not compressed and leaves nothing out.
     """
     size, after = path.stat().st_size, stored_bytes(part, stored)
-    if not is_compressed(path):
+    if not is_compressed(path) and "apart" not in read_header(path, "model"):
         return size - stored_bytes(whole, {}) + after
     return size if after == stored_bytes(whole, {}) else after

@@ -26,7 +26,7 @@ from neuprim.runs.curve import open_curve
 from neuprim.runs.events import Events, Note, Preparing, silent
 from neuprim.runs.fit import Fitted, compile_kernels, one_torch_thread, start, steps
 
-__all__ = ["COMPILING", "train"]
+__all__ = ["COMPILING", "save", "train"]
 
 COMPILING = "compiling kernels, once per installation (about a minute)"
 
@@ -100,16 +100,17 @@ def _train(fitted: Fitted, events: Events) -> bool:
                 curve.write(json.dumps(line) + "\n")
                 curve.flush()
             if time.monotonic() - last_saved > config.train.checkpoint_every_seconds:
-                _save(fitted)
+                save(fitted)
                 last_saved = time.monotonic()
             if stop.is_set():
                 interrupted = True
                 break
-    _save(fitted)
+    save(fitted)
     return interrupted
 
 
-def _save(fitted: Fitted) -> None:
+def save(fitted: Fitted) -> None:
+    """Checkpoint and model, into the run's directory."""
     trainer, config, dataset = fitted.trainer, fitted.config, fitted.dataset
     tensors, header = trainer.state()
     made_by = {} if config.made_by is None else {"made_by": config.made_by.to_dict()}

@@ -11,12 +11,14 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compressed.bits import BitTable
-from neuprim.core.compressed.columns import MOST_BITS, Columns, fit_columns, spread_error
+from neuprim.core.compressed.columns import MOST_BITS, Columns, fit_columns, keep_zero, spread_error
 from neuprim.core.compressed.order import morton
 from neuprim.core.compressed.rotations import Rotations
 from neuprim.core.compressed.sections import COLUMNS, POSITIONS, ROTATIONS, Section, pack
 from neuprim.core.errors import CheckpointError, FormError
 from neuprim.core.model.checks import method
+from neuprim.core.model.fields import pieces_by_name
+from neuprim.core.model.pieces import alive
 from neuprim.core.model.primitives import Primitives
 
 __all__ = ["Schemes", "Stored", "bits_in_words", "encode", "file_order", "folded", "rounded", "schemes"]
@@ -70,6 +72,7 @@ def folded(model: Primitives) -> Primitives:
 def schemes(model: Primitives, table: BitTable) -> Schemes:
     """How a folded model's numbers are coded: ends from its own numbers, bits from the table and, where it leaves it open, from them."""
     found: Schemes = {}
+    sparse = _sparse(model)
     for spec in model.specs:
         x, bits = model.params[spec.name].reshape(model.count, spec.size), table.of(spec.name, spec.shape)
         if spec.name == "quats":
@@ -82,8 +85,14 @@ def schemes(model: Primitives, table: BitTable) -> Schemes:
                 spiky = spread_error(x, columns) > _SPIKY
                 if bool(spiky.any()):
                     columns = fit_columns(x, [min(2 * b, 16) if more else b for b, more in zip(bits, spiky.tolist(), strict=True)])
-            found[spec.name] = columns
+            found[spec.name] = keep_zero(columns) if spec.name in sparse else columns
     return found
+
+
+def _sparse(model: Primitives) -> set[str]:
+    """Parameters of pieces that some primitives do without: these come back without them."""
+    pieces = pieces_by_name(model.density, model.colour).values()
+    return {name for piece in pieces if not bool(alive(piece, model.params).all()) for name in piece.places}
 
 
 def _positions(model: Primitives, x: Tensor, bits: int, exact: bool) -> Columns:

@@ -17,10 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["CLIPS", "MOST_BITS", "Columns", "fit_columns", "spread_error"]
+__all__ = ["CLIPS", "MOST_BITS", "Columns", "fit_columns", "keep_zero", "spread_error"]
 
 MOST_BITS = 20
 """Of a column's codes: products of a float32 and a code stay exact in double precision with room to spare."""
+
+_MANTISSA = 24
+"""Bits of a float32."""
 
 CLIPS = (0.0, 1e-4, 1e-3, 1e-2)
 """Shares of a column that may lie beyond either end; the one with the least mean square of errors is taken."""
@@ -80,6 +83,25 @@ def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) 
         least = torch.where(better, error, least)
         best = Columns(wanted, torch.where(better, low, best.low), torch.where(better, high, best.high))
     return best
+
+
+def keep_zero(columns: Columns) -> Columns:
+    """The same with ends a little further apart, so that 0 is one of the values and comes back as 0: for columns that many primitives do without.
+
+    Ends are whole multiples of a step that is short enough in binary for both to be float32 numbers.
+    """
+    low, high, last = columns.low.double().clamp(max=0.0), columns.high.double().clamp(min=0.0), columns.last.double()
+    width = torch.where(high > low, high - low, 1.0)
+    code = (-low / width * last).round()
+    code = torch.where(low < 0, code.clamp(min=1.0), code)
+    code = torch.minimum(code, torch.where(high > 0, last - 1, last))
+    step = torch.maximum(
+        torch.where(code > 0, -low / code.clamp(min=1.0), 0.0), torch.where(code < last, high / (last - code).clamp(min=1.0), 0.0)
+    )
+    mantissa, exponent = torch.frexp(step)
+    parts = torch.exp2((_MANTISSA - columns.bits).clamp(min=2).double())
+    step = torch.ldexp((mantissa * parts).ceil() / parts, exponent)
+    return Columns(columns.bits, (-code * step).float(), ((last - code) * step).float())
 
 
 def _quantile(ordered: np.ndarray, q: float) -> np.ndarray:

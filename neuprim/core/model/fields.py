@@ -18,6 +18,7 @@ from torch import Tensor
 from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.model.forms import Constant, Cosine, LoweredColour, LoweredDensity, Opaque, OpaqueColour, RayNet, Shade, Shading
 from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import ParameterSpec, Params
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ __all__ = [
     "RayNet",
     "Shade",
     "Shading",
+    "pieces_by_name",
 ]
 
 Conditions = Mapping[str, Tensor]
@@ -118,8 +120,16 @@ class Field(ABC):
         Args:
             params, geometry: of all primitives.
             name, value: a setting, and one of the values that it can have.
+
+        Returns:
+            the field, and its tensors by name; with "means" among them where the primitives' centres (N, 3) change with it, as they do
+            where a density moves them.
         """
         raise NotImplementedError(f"{type(self).__name__} names {name} in reductions() and does not know how to reduce it")
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """What single primitives can do without, each a set of numbers that mean nothing once they are zero; no number is in two of them."""
+        return ()
 
     def folded(self, params: Params) -> dict[str, Tensor]:
         """The same field in numbers that lie as close together as they can, for files where each has few bits.
@@ -128,6 +138,11 @@ class Field(ABC):
         rounding alone; folding what is folded changes no bit.
         """
         return dict(params)
+
+
+def pieces_by_name(density: DensityField, colour: ColourField) -> dict[str, Piece]:
+    """The pieces of both fields, as ``density.neuron 0`` and ``colour.band 1``."""
+    return {f"{kind}.{piece.name}": piece for kind, own in (("density", density), ("colour", colour)) for piece in own.pieces()}
 
 
 class DensityField(Field):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from neuprim.core.checked import Range, text, verify
+from neuprim.core.checked import Accepts, Range, text, verify
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.schema import RateUnit
 
@@ -13,6 +14,10 @@ __all__ = ["ModelSettings", "PopulationSettings", "TrainSettings"]
 
 Share = Annotated[float, Range(0, 1, says="a fraction of the budget, 0 to 1")]
 NotNegative = Annotated[float, Range(at_least=0)]
+
+
+def _says_less(words: list[Any]) -> bool:
+    return all(isinstance(word, str) and re.fullmatch(r"(density|colour)\.\w+=\d{1,4}", word) for word in words)
 
 
 @dataclass
@@ -27,6 +32,8 @@ class ModelSettings:
         sh_degree: spherical-harmonics degree of the colour, 0..3.
         sh_every: fraction of the budget after which one more SH band is unlocked; 0 unlocks all at once.
         init: free settings of the fields' initialisers, see the preset files.
+        reduced: what density and colour do with less of than the settings above say, as ``density.neurons=0`` and ``colour.degree=1``, one
+            after the other; what ``neuprim prune`` found that a scene does not require.
     """
 
     primitives: Annotated[int, Range(at_least=1)] = 2000
@@ -36,6 +43,7 @@ class ModelSettings:
     sh_degree: Annotated[int, Range(0, 3)] = 3
     sh_every: Annotated[float, Range(at_least=0, says="a fraction of the budget, 0 for all bands at once")] = 0.1
     init: dict[str, Any] = field(default_factory=dict)
+    reduced: Annotated[list, Accepts(_says_less, "a list such as [density.neurons=0, colour.degree=1]")] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         verify(self, "model")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -76,6 +76,8 @@ class Trainer:
     Attributes:
         device: where the training's tensors are.
         step, elapsed: steps done and seconds of training they took (held-out evaluations and file writes not counted).
+        stored: parameters -> what will be kept of them, with the gradients of the parameters: images are drawn of that. None: of themselves.
+        zeros: parameter -> (N, ...) bool of the numbers that stay zero; empty for none.
     """
 
     def __init__(
@@ -113,6 +115,8 @@ class Trainer:
         self.order = torch.empty(0, dtype=torch.int64)
         self.step = 0
         self.elapsed = 0.0
+        self.stored: Callable[[dict[str, Tensor]], dict[str, Tensor]] | None = None
+        self.zeros: dict[str, Tensor] = {}
         self._watch()
 
     # ------------------------------------------------------------ the budget
@@ -197,6 +201,8 @@ class Trainer:
         assert tally is not None
         self.population.observe(model, tally if not others else together([*(other.tally for other in others), tally], model.count))
         self.optimizer.step(model.params, self.rates())
+        for name, zero in self.zeros.items():
+            model.params[name].detach()[zero] = 0
         if self.exposures is not None:
             self.exposures.step()
         if self.angles is not None:
@@ -231,7 +237,7 @@ class Trainer:
         view, pixels = reduced(self.dataset.train.view(index), pixels, factor)
         background = self._background().to(self.device, non_blocking=True)
         truth = pixels.over(background)
-        output = render(self.model, view.camera, view.conditions, self.renderer, background)
+        output = render(self._drawn(), view.camera, view.conditions, self.renderer, background)
         rgb = output.rgb if self.exposures is None else self.exposures.apply(index, output.rgb)
         if pixels.mask is not None:
             rgb = torch.where(pixels.mask[..., None], rgb, truth)
@@ -245,6 +251,11 @@ class Trainer:
             mse = torch.dot(flat, flat).item() / counted
         psnr = -10 * math.log10(max(mse, 1e-20)) if math.isfinite(mse) else math.nan
         return _ImageStep(loss, parts, psnr, view.name, truth, tally)
+
+    def _drawn(self) -> Primitives:
+        """What images are drawn of."""
+        model = self.model
+        return model if self.stored is None else Primitives(model.density, model.colour, self.stored(model.params))
 
     def _pixels(self, index: int) -> Pixels:
         """Those of a training view, where the training is."""
@@ -261,7 +272,7 @@ class Trainer:
         """Draw points of known extinction and compare."""
         points = self.dataset.points
         assert points is not None, "refused at the start"
-        return point_step(self.model, self.dataset, points, self.settings, self.generator, self.renderer.threads)
+        return point_step(self._drawn(), self.dataset, points, self.settings, self.generator, self.renderer.threads)
 
     def _refuse(self, value: float, seen: _ImageStep | None, known: PointStep | None) -> None:
         """Say why a loss is not finite.
@@ -293,6 +304,7 @@ class Trainer:
     def _apply(self, change: Change) -> None:
         self.model.params = {spec.name: change.params[spec.name].contiguous() for spec in self.model.specs}
         self.optimizer.select(change.origin, change.fresh)
+        self.zeros = {name: zero[change.origin] for name, zero in self.zeros.items()}
         self._watch()
 
     def _watch(self) -> None:
@@ -307,6 +319,7 @@ class Trainer:
         tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
         tensors |= {f"population.{k}": v for k, v in self.population.state().items()}
         tensors |= {f"exposure.{k}": v for k, v in (self.exposures.state() if self.exposures else {}).items()}
+        tensors |= {f"zeros.{k}": v for k, v in self.zeros.items()}
         tensors |= {"generator": self.generator.get_state(), "order": self.order}
         tensors = {name: value.cpu() for name, value in tensors.items()}
         return tensors, {"step": self.step, "elapsed": self.elapsed, "views": len(self.dataset.train), "names": self._names()}
@@ -357,6 +370,10 @@ class Trainer:
             for name, value in population.items():
                 if value.dim() > 0 and value.shape != (model.count,):
                     raise ValueError(f"statistic {name} has shape {tuple(value.shape)}; expected ({model.count},)")
+            zeros = part("zeros.")
+            for name, zero in zeros.items():
+                if name not in model.params or zero.shape != model.params[name].shape or zero.dtype != torch.bool:
+                    raise ValueError(f"zeros of {name!r} are {zero.dtype} {tuple(zero.shape)}")
             exposures = part("exposure.")
             if bool(exposures) != (self.exposures is not None):
                 raise ValueError(f"it has {'' if exposures else 'no '}exposures, train.exposure_rate is {self.settings.exposure_rate:g}")
@@ -370,5 +387,6 @@ class Trainer:
             optimizer.load_state(part("adam."))
         self.optimizer, self.order, self.generator = optimizer, order.clone(), generator
         self.population.load_state({name: value.to(self.device) for name, value in population.items()})
+        self.zeros = {name: zero.to(self.device) for name, zero in zeros.items()}
         self.step, self.elapsed = step, float(elapsed)
         self._watch()

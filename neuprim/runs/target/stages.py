@@ -24,6 +24,7 @@ from neuprim.runs.events import Finishing
 from neuprim.runs.finish import finish
 from neuprim.runs.measure import draw
 from neuprim.runs.open import COMPRESSED, placed, read_metrics
+from neuprim.runs.prune.run import Request, prune_run
 from neuprim.runs.target.judge import ALLOWANCE, Judge
 from neuprim.runs.target.prediction import decibels
 from neuprim.runs.target.record import Attempt
@@ -39,6 +40,9 @@ _LEVELS = (4, 3, 2, 1)
 
 _APART = 0.3
 """dB between the test views and the views held out that are worth a line."""
+
+_PRUNED = 600
+"""Steps of fine-tuning without which pruning leaves a model worse than it need be."""
 
 _KEPT = ("model.safetensors", "checkpoint.safetensors", "metrics.jsonl")
 
@@ -92,7 +96,7 @@ def publish(trying: Trying, target: Target, judge: Judge) -> None:
     for stage in STAGES:
         finished = stage(Workshop(trying, target, judge, attempt), finished)
     record = trying.record
-    metrics = read_metrics(trying.folder)
+    metrics = read_metrics(finished.run_dir)
     margin = judge.margin(finished.held) if target.quality else 0.0
     limit = shortfall(target, attempt, finished.packed)
     if limit is not None or margin < 0:
@@ -111,7 +115,7 @@ def publish(trying: Trying, target: Target, judge: Judge) -> None:
             )
     record.achieved = {
         "run_dir": str(finished.run_dir),
-        "primitives": attempt.count,
+        "primitives": finished.facts.get("pruned", {}).get("primitives", attempt.count),
         "held_out": finished.held,
         "test_before_storing": {name: metrics[name] for name in ("psnr", "ssim")},
         "test": finished.test,
@@ -187,7 +191,37 @@ def quantised(shop: Workshop, before: Finished) -> Finished:
     return replace(before, held=held, packed=made.after, test=test, facts={**before.facts, "level": picked, "file": str(made.file)})
 
 
-STAGES: tuple[Callable[[Workshop, Finished], Finished], ...] = (quantised,)
+def pruned(shop: Workshop, before: Finished) -> Finished:
+    """Without what its views do not require, as far as the target lets it, in half of the time that is left; as it was where that is not enough, or
+    what is left misses the target."""
+    trying, attempt, margin = shop.trying, shop.attempt, shop.judge.margin(before.held)
+    if not shop.target.quality or margin < 0:
+        return before
+    steps = int(min(trying.left / 2 / trying.pace(attempt.count), attempt.steps))
+    if steps < _PRUNED:
+        trying.record.why.append(f"no time to prune: {max(trying.left, 0):.0f} s are left")
+        return before
+    folder = before.run_dir / "pruned"
+    request = Request(before.run_dir, max(margin, ALLOWANCE), steps=steps, out=folder, overwrite=True, hold_out=trying.record.hold_out)
+    made = prune_run(request, lambda text, fraction: trying.events(Finishing(f"pruning: {text}")))
+    if made.run_dir is None:
+        trying.record.why.append("nothing could be pruned")
+        return before
+    model, _ = load_model(made.run_dir / "model.safetensors", task_of(trying.config))
+    held = shop.measured(model)
+    metrics = read_metrics(made.run_dir)
+    size = int(made.after["bytes"])
+    share = f"{size / made.before['bytes']:.0%} of the bytes with {model.count:,} primitives"
+    kept = shop.judge.margin(held) >= 0 and size < made.before["bytes"]
+    trying.tell(f"pruned: {share}, held out {held['psnr']:.2f} dB, ssim {held['ssim']:.4f}; {'kept' if kept else 'not worth it'}")
+    if not kept:
+        return before
+    test = {name: float(metrics[name]) for name in ("psnr", "ssim")}
+    facts = {**before.facts, "pruned": {"primitives": model.count, "bytes": size, "bytes_before": int(made.before["bytes"])}}
+    return Finished(made.run_dir, held, size, test, facts)
+
+
+STAGES: tuple[Callable[[Workshop, Finished], Finished], ...] = (pruned, quantised)
 """In their order; each makes the model smaller as far as the target lets it."""
 
 

@@ -13,6 +13,7 @@ from neuprim.core.compute import device
 from neuprim.core.model.colours import sh
 from neuprim.core.model.fields import ColourField, Conditions, Constant
 from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.tasks.dynamic.density import time_of
 
@@ -114,6 +115,11 @@ class TimeHarmonics(ColourField):
             if name in params:
                 dc = dc + (params[name] * device.beside(basis, dc)[:, None]).sum(1)
         return dc, params.get("sh_rest")
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """Bands, and terms in time one by one."""
+        terms = zip(_TIME, (self.powers, self.waves, self.waves), strict=True)
+        return (*sh.bands(self.degree, "sh_rest"), *(Piece(f"{name} {i + 1}", {name: (i,)}) for name, count in terms for i in range(count)))
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         dc, rest = self.harmonics(params, conditions)

@@ -24,8 +24,10 @@ from neuprim.core.model.densities.fewer import fewer_neurons
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
 from neuprim.core.model.folding import fold_cosines
 from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.train.population import SPLIT_LONG, SPLIT_SHIFT
+from neuprim.tasks.dynamic.stilled import stilled
 
 __all__ = ["PARTS", "TimeDensity", "time_of"]
 
@@ -169,11 +171,29 @@ class TimeDensity(DensityField):
         return self.static.from_gaussians(alphas)
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
-        return self.static.reductions()
+        """Neurons, and every part of time, which is either there or not."""
+        return {**self.static.reductions(), **{part: (0,) for part in PARTS if part in self.parts}}
 
     def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[TimeDensity, dict[str, Tensor]]:
-        field = TimeDensity(**{**self.settings(), "neurons": value})
-        return field, fewer_neurons(params, geometry, value, self.static.omega0)
+        """Without a part of time: its mean over the sequence, see :mod:`neuprim.tasks.dynamic.stilled`."""
+        if name == "neurons":
+            field = TimeDensity(**{**self.settings(), "neurons": value})
+            return field, fewer_neurons(params, geometry, value, self.static.omega0)
+        fewer = stilled(params, geometry, name, self.static.omega0)
+        left = "+".join(part for part in PARTS if part in self.parts and part != name) or "none"
+        field = TimeDensity(**{**self.settings(), "time": left})
+        kept = {"means", *(spec.name for spec in field.parameters())}
+        return field, {key: value for key, value in fewer.items() if key in kept}
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """Neurons, and what changes in time but for windows, without which nothing would be left."""
+        turning = ("W_t",) if "phase" in self.parts else ()
+        found = [Piece(one.name, {**one.places, **dict.fromkeys(turning, one.places["b1"])}) for one in self.static.pieces()]
+        if "offset" in self.parts:
+            found.append(Piece("offset", {"offset_cos": (), "offset_sin": ()}))
+        if "motion" in self.parts:
+            found += [Piece(name, {name: ()}) for name in ("velocity", "acceleration")]
+        return tuple(found)
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         scaled = self.static.scale_density(params, factor)

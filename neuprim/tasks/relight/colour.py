@@ -20,12 +20,15 @@ from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.compute import device
+from neuprim.core.model.densities.fewer import smaller_counts
 from neuprim.core.model.fields import ColourField, Conditions, LoweredDensity, RayNet, Shading
 from neuprim.core.model.folding import fold_cosines
 from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.settings import RenderSettings
 from neuprim.tasks.relight.directions import unit
+from neuprim.tasks.relight.fewer import fewer_units
 from neuprim.tasks.relight.visibility import light_visibility
 
 __all__ = ["FORMS", "LightNetwork"]
@@ -120,6 +123,19 @@ class LightNetwork(ColourField):
         net_x = params["net_x"].double()
         phase = params["net_phase"].double() + (net_x * shift[:, None]).sum(-1)
         return {**params, "net_x": (net_x * r[:, None, None]).to(params["net_x"]), "net_phase": phase.to(params["net_phase"])}
+
+    def reductions(self) -> dict[str, tuple[int, ...]]:
+        return {"hidden": smaller_counts(self.hidden)} if self.hidden else {}
+
+    def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[LightNetwork, dict[str, Tensor]]:
+        return LightNetwork(**{**self.settings(), "hidden": value}), fewer_units(
+            params, geometry, value, self.boost, self.form == "multiplicative"
+        )
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """Hidden units."""
+        inputs = ("net_x", "net_view", "net_light", "net_phase")
+        return tuple(Piece(f"unit {h}", {**dict.fromkeys(inputs, (h,)), "net_out": (slice(None), h)}) for h in range(self.hidden))
 
     def folded(self, params: Params) -> dict[str, Tensor]:
         return fold_cosines(params, ("net_x", "net_view", "net_light"), "net_phase", "net_out", self.boost)

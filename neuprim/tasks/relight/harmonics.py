@@ -10,9 +10,10 @@ from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.compute import device
-from neuprim.core.model.colours.sh import fewer_bands
+from neuprim.core.model.colours.sh import bands, fewer_bands
 from neuprim.core.model.fields import ColourField, Conditions, Constant
 from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.tasks.relight.directions import unit
 
@@ -47,6 +48,10 @@ class LightHarmonics(ColourField):
 
     def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[LightHarmonics, dict[str, Tensor]]:
         return LightHarmonics(**{**self.settings(), "degree": value}), fewer_bands(params, "light_sh", value)
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """Bands."""
+        return bands(self.degree, "light_sh")
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         color = params["c_dc"]

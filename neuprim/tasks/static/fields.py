@@ -11,6 +11,7 @@ from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.model.colours import sh
 from neuprim.core.model.fields import ColourField, Conditions, Constant
 from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import ParameterSpec, Params
 
 __all__ = ["SphericalHarmonics"]
@@ -51,6 +52,10 @@ class SphericalHarmonics(ColourField):
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:
         return params["sh_dc"], params.get("sh_rest")
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """Bands."""
+        return sh.bands(self.degree, "sh_rest")
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         return Constant(sh.colors(geometry.means, params["sh_dc"], params.get("sh_rest"), camera.position, self.active))

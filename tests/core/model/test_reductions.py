@@ -51,7 +51,14 @@ PAIRS = [
     (TimeDensity(6, "phase+offset+window+motion"), TimeHarmonics(2)),
     (CosineDensity(5), LightHarmonics(4)),
     (GaussianDensity(), LightNetwork(4, visibility="none")),
+    (CosineDensity(0), LightNetwork(6, form="multiplicative", visibility="none")),
 ]
+
+
+def level(field: Field, name: str) -> int:
+    """How much it has of what a reduction names; a part of time is there or not."""
+    settings = field.settings()
+    return int(settings[name]) if name in settings else int(name in settings["time"].split("+"))
 
 
 def reduced(model: Primitives) -> Iterator[tuple[str, str, int, Primitives]]:
@@ -72,19 +79,19 @@ def test_every_reduction_is_a_model_that_can_be_stored_and_drawn(density: Field,
     found = list(reduced(model))
     for kind, name, value, smaller in found:
         field = getattr(smaller, kind)
-        assert field.settings()[name] == value, (kind, name)
+        assert level(field, name) == value, (kind, name)
         again = type(field)(**field.settings())
         assert [(s.name, s.shape) for s in again.parameters()] == [(s.name, s.shape) for s in field.parameters()]
         assert smaller.parameters_per_primitive < model.parameters_per_primitive
         smaller.lower(camera(), CONDITIONS).check()
         values = getattr(model, kind).reductions()[name]
-        assert values == tuple(sorted(values, reverse=True)) and all(v < getattr(model, kind).settings()[name] for v in values)
+        assert values == tuple(sorted(values, reverse=True)) and all(v < level(getattr(model, kind), name) for v in values)
     offered = {(kind, name) for kind, name, _, _ in found}
     assert offered == {(kind, name) for kind in ("density", "colour") for name in getattr(model, kind).reductions()}
 
 
 def test_what_has_nothing_to_spare_offers_nothing() -> None:
-    assert GaussianDensity().reductions() == {} == LightNetwork(4).reductions()
+    assert GaussianDensity().reductions() == {} == LightNetwork(0).reductions()
     assert SphericalHarmonics(0).reductions() == {} == CosineDensity(0).reductions()
     with pytest.raises(NotImplementedError, match="GaussianDensity"):
         GaussianDensity().reduced({}, made(*PAIRS[3]).geometry, "neurons", 1)
@@ -202,3 +209,98 @@ def test_no_terms_in_time_leave_the_mean_over_the_sequence() -> None:
     times = torch.linspace(0, 1, 401)
     mean = torch.stack([colour.harmonics(model.of(colour), {"time": t})[0] for t in times]).mean(0)
     assert torch.allclose(field.harmonics(params, CONDITIONS)[0], mean, atol=5e-3)
+
+
+def in_time(time: str, neurons: int = 4) -> Primitives:
+    """A density that varies in time, quietly enough for its mean to mean something."""
+    return made(TimeDensity(neurons, time), TimeHarmonics(0, powers=0, waves=0), noise=0.05)
+
+
+def test_a_still_phase_is_the_mean_of_the_moving_one() -> None:
+    model = in_time("phase")
+    density = model.density
+    field, params = density.reduced(model.of(density), model.geometry, "phase", 0)
+    assert field.settings()["time"] == "none" and "W_t" not in params
+    prim, x = torch.arange(COUNT), model.params["means"] + 0.01
+    times = (torch.arange(400) + 0.5) / 400
+    mean = torch.stack([density.density(model.of(density), model.geometry, prim, x, {"time": t}) for t in times]).mean(0)
+    still = field.density(params, model.geometry, prim, x, CONDITIONS)
+    assert torch.allclose(still, mean, rtol=1e-3, atol=1e-3 * float(mean.abs().max()))
+
+
+def test_a_still_offset_is_the_mean_of_the_changing_one() -> None:
+    model = in_time("offset", 0)
+    density = model.density
+    field, params = density.reduced(model.of(density), model.geometry, "offset", 0)
+    times = (torch.arange(400) + 0.5) / 400
+    mean = torch.stack([density.lower(model.of(density), model.geometry, {"time": t}).b2 for t in times]).mean(0)
+    assert torch.allclose(field.lower(params, model.geometry, CONDITIONS).b2, mean, atol=1e-5)
+
+
+def test_without_windows_primitives_are_as_dense_as_they_are_in_the_mean() -> None:
+    model = in_time("window", 2)
+    density = model.density
+    field, params = density.reduced(model.of(density), model.geometry, "window", 0)
+    times = (torch.arange(400) + 0.5) / 400
+    for name in ("w2", "b2"):
+        lowered = [getattr(density.lower(model.of(density), model.geometry, {"time": t}), name) for t in times]
+        assert torch.allclose(params[name], torch.stack(lowered).mean(0), atol=1e-4)
+
+
+def test_without_windows_motion_goes_on_as_it_was() -> None:
+    model = in_time("window+motion", 0)
+    density = model.density
+    field, params = density.reduced(model.of(density), model.geometry, "window", 0)
+    moved = Geometry(params.pop("means"), model.geometry.log_scales, model.geometry.quats)
+    for time in (0.0, 0.3, 1.0):
+        before = density.move(model.of(density), model.geometry, {"time": torch.tensor(time)}).means
+        after = field.move(params, moved, {"time": torch.tensor(time)}).means
+        assert torch.allclose(after, before, atol=1e-5)
+
+
+@pytest.mark.parametrize("time", ["motion", "window+motion"])
+def test_without_motion_primitives_stand_in_their_mean_place(time: str) -> None:
+    model = in_time(time, 0)
+    density = model.density
+    field, params = density.reduced(model.of(density), model.geometry, "motion", 0)
+    times = (torch.arange(400) + 0.5) / 400
+    places = torch.stack([density.move(model.of(density), model.geometry, {"time": t}).means for t in times])
+    weights = torch.ones(400, COUNT)
+    if "window" in time:
+        u = (times[:, None] - model.params["window_center"][None, :, 0]) / model.params["log_window"][None, :, 0].exp()
+        weights = (1 - u * u).clamp_min(0).square()
+    alive = weights.sum(0) > 0
+    mean = (weights[..., None] * places).sum(0) / weights.sum(0).clamp_min(1e-9)[:, None]
+    assert bool(alive.any()) and torch.allclose(params["means"][alive], mean[alive], atol=1e-3)
+    assert field.settings()["time"] == time.replace("motion", "").strip("+") or field.settings()["time"] == "none"
+
+
+# ---------------------------------------------------------------- networks of light
+
+
+@pytest.mark.parametrize("form", ["additive", "multiplicative"])
+def test_fewer_units_leave_the_mean_colour_behind(form: str) -> None:
+    model = made(CosineDensity(0), LightNetwork(6, form=form, visibility="none", boost=2.0), noise=0.2)
+    model.params["c_dc"] = model.params["c_dc"].abs() + 3.0  # far from where colours are cut at zero
+    if form == "multiplicative":
+        model.params["net_out"] *= 0.3
+    colour = model.colour
+    generator = torch.Generator().manual_seed(3)
+    field, params = colour.reduced(model.of(colour), model.geometry, "hidden", 0)
+    few, fewer = colour.reduced(model.of(colour), model.geometry, "hidden", 3)
+
+    def seen(field: Field, params: dict[str, Tensor], view: Tensor, light: Tensor) -> Tensor:
+        eye = Camera(look_at(1e3 * view, torch.zeros(3), torch.tensor([0.0, 0.3, 1.0])), 20.0, 20.0, 8.0, 8.0, 16, 16)
+        form = field.lower(params, model.geometry, eye, {"light": 1e3 * light, "light_intensity": torch.tensor(1.0)})
+        return form.base + (form.Wout * form.bias.cos()[:, None]).sum(-1)
+
+    whole = mean = off = off_few = 0.0
+    for _ in range(400):
+        view, light = (torch.nn.functional.normalize(torch.randn(3, generator=generator), dim=0) for _ in range(2))
+        here = seen(colour, model.of(colour), view, light)
+        whole, mean = whole + here, mean + seen(field, params, view, light)
+        off += float((here - seen(field, params, view, light)).square().mean())
+        off_few += float((here - seen(few, fewer, view, light)).square().mean())
+    spread = float((model.params["net_out"].abs().sum(-1) * (3 if form == "multiplicative" else 1)).mean())
+    assert float((whole - mean).abs().mean()) / 400 < 0.1 * spread
+    assert off_few < off

@@ -10,10 +10,11 @@ from torch import Tensor
 from neuprim.core.compute import device
 from neuprim.core.errors import FormError
 from neuprim.core.model.colours.sh_constants import C0, C1, C2, C3
+from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import Params
 from neuprim.core.model.tensors import Shape, Sizes, tensors_fault
 
-__all__ = ["C0", "basis", "coefficient_count", "colors", "fewer_bands", "initial_dc"]
+__all__ = ["C0", "bands", "basis", "coefficient_count", "colors", "fewer_bands", "initial_dc"]
 
 
 def coefficient_count(degree: int) -> int:
@@ -107,6 +108,11 @@ def fewer_bands(params: Params, name: str, degree: int) -> dict[str, Tensor]:
 
 _DARKEST = 1e-3
 """Initial colours start at least this far above zero: at zero and below, max(0, .) passes no gradient and black stays black."""
+
+
+def bands(degree: int, name: str) -> tuple[Piece, ...]:
+    """The bands above the zeroth of coefficients (N, (degree + 1)^2 - 1, C) in the parameter ``name``."""
+    return tuple(Piece(f"band {band}", {name: (slice(band * band - 1, (band + 1) ** 2 - 1),)}) for band in range(1, degree + 1))
 
 
 def initial_dc(color: Tensor) -> Tensor:

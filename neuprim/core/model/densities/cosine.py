@@ -20,6 +20,7 @@ from neuprim.core.model.fields import Conditions, Cosine, DensityField
 from neuprim.core.model.folding import fold_cosines
 from neuprim.core.model.footprint import gaussian_support
 from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.tensors import number_fault
 
@@ -111,6 +112,10 @@ class CosineDensity(DensityField):
 
     def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[CosineDensity, dict[str, Tensor]]:
         return CosineDensity(value, self.omega0, self.edge, self.gain), fewer_neurons(params, geometry, value, self.omega0)
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """Neurons."""
+        return tuple(Piece(f"neuron {k}", {"W1": (k,), "b1": (k,), "w2": (k,)}) for k in range(self.neurons))
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         return {**params, "w2": params["w2"] * factor[:, None], "b2": params["b2"] * factor[:, None]}

@@ -17,7 +17,7 @@ from neuprim.core.model.edge import sinc
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import Params
 
-__all__ = ["fewer_neurons", "smaller_counts"]
+__all__ = ["ball_mean", "fewer_neurons", "smaller_counts"]
 
 
 def smaller_counts(neurons: int) -> tuple[int, ...]:
@@ -37,8 +37,8 @@ def fewer_neurons(params: Params, geometry: Geometry, keep: int, omega0: float) 
     rate = omega0 * ((W1 @ rotations) * semi_axes[:, None, :]).norm(dim=-1)
     advance = omega0 * params["W_t"].double() if "W_t" in params else torch.zeros_like(phase)
     phase = phase + advance / 2
-    mean = phase.cos() * _ball(rate) * sinc(advance / 2)
-    square = (1 + (2 * phase).cos() * _ball(2 * rate) * sinc(advance)) / 2
+    mean = phase.cos() * ball_mean(rate) * sinc(advance / 2)
+    square = (1 + (2 * phase).cos() * ball_mean(2 * rate) * sinc(advance)) / 2
     order = (w2.square() * (square - mean.square())).argsort(dim=1, descending=True, stable=True)
     kept, gone = order[:, :keep].sort(dim=1).values, order[:, keep:]
     fewer = {name: value.gather(1, kept).contiguous() for name, value in params.items() if name in ("b1", "w2", "W_t")}
@@ -47,8 +47,8 @@ def fewer_neurons(params: Params, geometry: Geometry, keep: int, omega0: float) 
     return {**params, **fewer}
 
 
-def _ball(r: Tensor) -> Tensor:
-    """Mean of cos(r.y) over the unit ball."""
+def ball_mean(r: Tensor) -> Tensor:
+    """Mean of cos(r.y) over y in the unit ball, of |r| >= 0."""
     small = r < 1e-2
     safe = torch.where(small, torch.ones_like(r), r)
     return torch.where(small, 1 - r * r / 10, 3 * (safe.sin() - safe * safe.cos()) / safe**3)

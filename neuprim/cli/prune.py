@@ -1,0 +1,72 @@
+"""``neuprim prune``: its arguments, and what it prints."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from neuprim.cli import arguments
+
+if TYPE_CHECKING:
+    from neuprim.runs.prune.run import Pruning
+
+__all__ = ["for_prune", "prune"]
+
+
+def for_prune(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments."""
+    parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    parser.add_argument(
+        "--tolerance", type=arguments.decibels, default=0.1, metavar="DB", help="how much worse it may get (default: 0.1dB)"
+    )
+    parser.add_argument("--seconds", type=arguments.duration, default=60.0, metavar="S", help="of fine-tuning; 0 for none (default: 60)")
+    parser.add_argument("--steps", type=arguments.whole, metavar="N", help="of fine-tuning instead, for the same model on every machine")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="the new run's directory (default: RUN_DIR-pruned)")
+    parser.add_argument("--force", action="store_true", help="replace files that exist")
+
+
+def prune(args: argparse.Namespace) -> int:
+    """Prunes, writes a run directory and prints what became of the model."""
+    from neuprim.cli.console import plain_console
+    from neuprim.cli.progress import DrawProgress
+    from neuprim.runs.prune.run import Request, prune_run
+
+    request = Request(args.run_dir, args.tolerance, args.seconds, args.steps, args.out, args.force)
+    with DrawProgress(plain_console(stderr=True)) as progress:
+        made = prune_run(request, progress.show)
+    _report(made, args.tolerance)
+    return 0
+
+
+_ROWS = (
+    ("primitives", "primitives", "{:,.0f}"),
+    ("numbers", "numbers", "{:,.0f}"),
+    ("bytes", "bytes", "{:,.0f}"),
+    ("psnr", "PSNR, held-out views", "{:.3f} dB"),
+    ("ssim", "SSIM, held-out views", "{:.4f}"),
+    ("frames_per_second", "frames/s", "{:.1f}"),
+)
+
+
+def _report(made: Pruning, tolerance: float) -> None:
+    for number, stage in enumerate(made.stages, 1):
+        less = f", {', '.join(stage.words)}" if stage.words else ""
+        what = f"cut {number}: {stage.primitives:,} primitives, {stage.numbers:,} numbers{less}"
+        loss = f"{stage.cut - made.judged[0]:+.3f} dB at once, {stage.trained - made.judged[0]:+.3f} dB after training"
+        print(f"{what}; training views {loss}; {'kept' if stage.kept else 'taken back'}")
+    if made.run_dir is None:
+        print(f"nothing can go within {tolerance:g} dB; nothing was written")
+        return
+    print(made.run_dir)
+    cells = [("", "before", "after")]
+    cells += [(name, form.format(made.before[key]), form.format(made.after[key])) for key, name, form in _ROWS]
+    widths = [max(len(row[i]) for row in cells) for i in range(3)]
+    for name, before, after in cells:
+        print(f"{name:{widths[0]}}  {before:>{widths[1]}}  {after:>{widths[2]}}".rstrip())
+    for word in made.words:
+        print(f"all primitives: {word}")
+    for name, share in made.kept.items():
+        if share < 1:
+            print(f"{name}: kept by {share:.0%} of the primitives")
+    print(f"fine-tuned for {made.steps:,} steps, {made.seconds:.0f} s in all")

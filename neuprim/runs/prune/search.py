@@ -1,0 +1,173 @@
+"""The search for what a scene does not require: cut, train a little, look, and go back where it was too much."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from neuprim.config import RunConfig
+from neuprim.core.data import Dataset
+from neuprim.core.model.less import with_less
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.task import TaskSpec
+from neuprim.core.train.sensitivity import sensitivity
+from neuprim.runs.finetune import fine_tuner
+from neuprim.runs.prune.cut import cut_to, numbers, steps_down, zeros_of
+from neuprim.runs.prune.judge import Judge
+
+__all__ = ["ROUNDS", "Search", "Stage"]
+
+ROUNDS = 5
+"""Of training, at most, each with its share of the steps, and nearly each after a cut. Every one goes down to the rates of the run's end, so that what is
+judged is as well trained as it was."""
+
+_LEAST = 600
+"""Steps of a round, at least: few of them leave a model worse than they found it."""
+
+_PATIENCE = 3.0
+"""Times the tolerance: what has lost no more after a round is trained for another one before it is taken back."""
+
+_BITE = 8.0
+"""dB that the first cut loses at once, over the tolerance: what training brings back most of."""
+
+_ENOUGH = 0.1
+"""Share of the tolerance below which no further cut is worth its steps."""
+
+_FREE = 0.02
+"""Share of the tolerance that counts as nothing."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One round.
+
+    Attributes:
+        words: what fields do with less of; primitives, numbers: that there are.
+        cut, trained: dB of the judged views after the last cut, and after the round's steps.
+        kept: whether this is within the tolerance.
+    """
+
+    words: tuple[str, ...]
+    primitives: int
+    numbers: int
+    cut: float
+    trained: float
+    kept: bool
+
+
+@dataclass(frozen=True)
+class _State:
+    """A model on the way.
+
+    Attributes:
+        words: of its fields, all that were reduced.
+        bite, cut: dB that its last cut was to lose at once, and of the judged views after it.
+        lost: dB of the judged views since the beginning; rounds: of training since the cut.
+    """
+
+    model: Primitives
+    words: tuple[str, ...] = ()
+    bite: float = 0.0
+    cut: float = 0.0
+    lost: float = 0.0
+    rounds: int = 0
+
+    def stage(self, base: float, stays: bool) -> Stage:
+        return Stage(self.words, self.model.count, numbers(self.model), self.cut, base - self.lost, stays)
+
+
+@dataclass
+class Search:
+    """One pruning.
+
+    Attributes:
+        tolerance: dB; steps: of fine-tuning in all, 0 for none; progress: called with (text, fraction 0..1).
+        base: dB of the model on the judged views, once there is one.
+        stages: what was tried, in order.
+    """
+
+    config: RunConfig
+    task: TaskSpec
+    dataset: Dataset
+    tolerance: float
+    steps: int
+    progress: Callable[[str, float], None] = lambda text, fraction: None
+    stages: list[Stage] = field(default_factory=list)
+    base: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.judge, self._looks = Judge(self.dataset, self.config.renderer), 0
+
+    def __call__(self, model: Primitives) -> tuple[Primitives, tuple[str, ...]]:
+        """The smallest model found whose judged views are at most the tolerance worse, and the words for what its fields have less of."""
+        self.base = self.judge(model)
+        best, tried = _State(model), None
+        rounds = min(max(self.steps // _LEAST, 1), ROUNDS)
+        bite = self.tolerance * (_BITE if self.steps else 1.0)
+        for number in range(rounds):
+            left = self.tolerance - max(best.lost, 0.0)
+            if left < _ENOUGH * self.tolerance or not best.model.count:
+                break
+            if tried is None:  # else what the last cut left is trained for longer
+                tried = self._cut(best, bite if self.steps else left, number / rounds)
+                if numbers(tried.model) >= numbers(best.model):
+                    break
+                bite = tried.bite
+            tried = self._trained(tried, number, rounds)
+            spent, stays = tried.lost - best.lost, tried.lost <= self.tolerance + 1e-9
+            self.stages.append(tried.stage(self.base, stays))
+            if stays:
+                bite *= min(max((left - spent) / max(spent, 0.25 * self.tolerance), 1.0 / _BITE), 2.0)
+                best, tried = tried, None
+            elif tried.rounds > 1 or tried.lost > _PATIENCE * self.tolerance:
+                bite *= min(max(0.7 * left / max(spent, 1e-9), 0.2), 0.7)
+                tried = None
+        return best.model, best.words
+
+    # ------------------------------------------------------------ one stage
+
+    def _cut(self, state: _State, bite: float, progress: float) -> _State:
+        """A model that is ``bite`` dB worse before training, and what its fields do with less of."""
+
+        def quick(m: Primitives) -> float:
+            return self.judge(m, quick=bool(self.steps))
+
+        self.progress("looking for what is worth least", progress)
+        model = state.model
+        start, size = quick(model), numbers(model)
+        by_price = self._by_price(model, quick, bite)
+        price = bite / max(1 - numbers(by_price) / size, 1e-9)
+        smaller, words, lost = model, list(state.words), 0.0
+        again = True
+        while again:
+            again = False
+            for kind, name, value in steps_down(smaller):
+                less = with_less(smaller, kind, name, value)
+                drop = start - quick(less)
+                if drop <= min(bite, price * (1 - numbers(less) / size)) or drop - lost <= _FREE * self.tolerance:
+                    smaller, lost, again = less, max(drop, lost), True
+                    words.append(f"{kind}.{name}={value}")
+                    break
+        found = by_price if smaller is model else self._by_price(smaller, quick, bite - lost)
+        return _State(found, tuple(words), bite=bite, cut=self.judge(found))
+
+    def _by_price(self, model: Primitives, quality: Callable[[Primitives], float], loss: float) -> Primitives:
+        if loss <= 0:
+            return model
+        self._looks += 1
+        effects = sensitivity(model, self.dataset, self.judge.others, self.config.renderer, seed=self._looks)
+        return cut_to(model, effects, quality, loss)
+
+    def _trained(self, state: _State, number: int, rounds: int) -> _State:
+        """The state after the round's steps."""
+        model, steps = state.model, self.steps * (number + 1) // rounds - self.steps * number // rounds
+        if steps and model.count:
+            trainer = fine_tuner(self.config, self.task, self.dataset, model, steps)
+            trainer.zeros = zeros_of(trainer.model)
+            for done in range(steps):
+                trainer.train_step()
+                if done % 20 == 0:
+                    self.progress(f"training what is left, {numbers(model):,} numbers", (number + done / steps) / rounds)
+            model = Primitives(model.density, model.colour, {name: value.detach() for name, value in trainer.model.params.items()})
+        found = self.judge(model) if steps else state.cut
+        return replace(state, model=model, lost=self.base - found, rounds=state.rounds + 1)

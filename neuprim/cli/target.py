@@ -40,7 +40,7 @@ def fit_target(config: RunConfig, target: Target, budget: float, words: list[str
         command = shlex.join(["neuprim", "run", *resuming(words, config.output_dir)])
         raise KeyboardInterrupt(f"; {config.output_dir} has the trials up to here; to go on:\n  {command}") from None
     print_record(record, console)
-    print(config.output_dir)
+    print(record.achieved["run_dir"])
     return 0
 
 
@@ -54,9 +54,9 @@ def print_record(record: Record, console: Console) -> None:
     for name, (value, doubt) in found["predicted"].items():
         text = f"predicted {promised(name, value, doubt)}; held out {found['held_out'][name]:.4g}"
         line(f"{text}; test views {found['test'][name]:.4g}, {found['test_before_storing'][name]:.4g} before storing")
-    whole, packed = Path(found["run_dir"]) / "model.safetensors", Path(found["file"])
+    whole = Path(found["run_dir"]) / "model.safetensors"
     line(
-        f"{found['primitives']:,} primitives: {packed.name} {found['packed_bytes']:,} bytes (level {found['level']}), {whole.name} {found['model_bytes']:,} bytes"
+        f"{found['primitives']:,} primitives: {found['file']} {found['packed_bytes']:,} bytes (level {found['level']}), {whole.name} {found['model_bytes']:,} bytes"
     )
     line(f"{found['seconds']:.0f} s of {record.asked['budget']:g} s used; {found['fps']:.1f} frames per second")
     for why in record.why:

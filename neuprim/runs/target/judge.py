@@ -17,6 +17,9 @@ __all__ = ["Judge"]
 ALLOWANCE = 0.1
 """dB above the target that a full run aims at: what storing the model in few bits costs."""
 
+ROOM = ALLOWANCE / 2
+"""dB above the target without which a full run leaves no room for few bits."""
+
 _FULL_FILE = 0.97
 """Of the bytes allowed, those that are planned with."""
 

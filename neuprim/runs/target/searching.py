@@ -13,7 +13,7 @@ from neuprim.config import RunConfig
 from neuprim.config.target import Target
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
-from neuprim.runs.target.judge import ALLOWANCE, Judge
+from neuprim.runs.target.judge import ALLOWANCE, ROOM, Judge
 from neuprim.runs.target.knobs import next_turn, pays
 from neuprim.runs.target.pace import linear
 from neuprim.runs.target.prediction import decibels
@@ -199,7 +199,7 @@ class Search:
         """``found``, but no nearer to a full run that missed than makes a difference, on the side that it missed on."""
         for attempt in self.record.done("full"):
             margin = self.judge.margin({name: attempt.quality(name) for name in self.judge.measures})
-            if margin < 0:
+            if margin < ROOM:
                 found = max(found, math.ceil(attempt.count * _STEP))
             elif margin > _OVER and attempt.count > 1:
                 found = min(found, math.floor(attempt.count / _STEP))
@@ -271,7 +271,7 @@ class Search:
         if not self.target.quality:
             return shortfall(self.target, attempt) is None and self.wanted() <= _MORE * attempt.count
         margin = self.judge.margin({name: attempt.quality(name) for name in self.judge.measures})
-        return 0.0 <= margin <= _OVER and shortfall(self.target, attempt) is None
+        return ROOM <= margin <= _OVER and shortfall(self.target, attempt) is None
 
     def plan(self) -> Attempt | None:
         """The next full run; None where another would not change anything, or has no time."""

@@ -25,10 +25,10 @@ from neuprim.runs.finish import finish
 from neuprim.runs.measure import draw
 from neuprim.runs.open import COMPRESSED, placed, read_metrics
 from neuprim.runs.prune.run import Request, prune_run
-from neuprim.runs.target.judge import ALLOWANCE, Judge
+from neuprim.runs.target.judge import ALLOWANCE, ROOM, Judge
 from neuprim.runs.target.prediction import decibels
 from neuprim.runs.target.record import Attempt
-from neuprim.runs.target.trying import VIEWS, Trying
+from neuprim.runs.target.trying import VIEWS, Trying, packed_bytes
 from neuprim.runs.target.words import shortfall
 from neuprim.runs.training import train
 from neuprim.runs.truths import masked, truths_of
@@ -40,6 +40,9 @@ _LEVELS = (4, 3, 2, 1)
 
 _APART = 0.3
 """dB between the test views and the views held out that are worth a line."""
+
+_TUNED = 3
+"""Times the steps of the full run that fine-tuning may have."""
 
 _PRUNED = 600
 """Steps of fine-tuning without which pruning leaves a model worse than it need be."""
@@ -129,15 +132,18 @@ def publish(trying: Trying, target: Target, judge: Judge) -> None:
 
 
 def chosen(judge: Judge) -> Attempt:
-    """Of the full runs that meet the target the smallest; if none does, the best."""
+    """Of the full runs that meet the target the smallest, of those with room for few bits before others; if none does, the best."""
     done = judge.record.done("full")
     within = [a for a in done if shortfall(judge.target, a) is None] or done
 
     def margin(a: Attempt) -> float:
         return judge.margin({name: a.quality(name) for name in judge.measures})
 
-    met = [a for a in within if judge.target.quality and margin(a) >= 0]
-    return min(met, key=lambda a: a.packed) if met else max(within, key=margin)
+    for room in (ROOM, 0.0):
+        met = [a for a in within if judge.target.quality and margin(a) >= room]
+        if met:
+            return min(met, key=lambda a: a.packed)
+    return max(within, key=margin)
 
 
 def _directory(trying: Trying, attempt: Attempt) -> Finished:
@@ -197,28 +203,28 @@ def pruned(shop: Workshop, before: Finished) -> Finished:
     trying, attempt, margin = shop.trying, shop.attempt, shop.judge.margin(before.held)
     if not shop.target.quality or margin < 0:
         return before
-    steps = int(min(trying.left / 2 / trying.pace(attempt.count), attempt.steps))
+    steps = int(min(trying.left / 2 / trying.pace(attempt.count), _TUNED * attempt.steps))
     if steps < _PRUNED:
         trying.record.why.append(f"no time to prune: {max(trying.left, 0):.0f} s are left")
         return before
     folder = before.run_dir / "pruned"
-    request = Request(before.run_dir, max(margin, ALLOWANCE), steps=steps, out=folder, overwrite=True, hold_out=trying.record.hold_out)
+    request = Request(before.run_dir, max(margin - ROOM, ROOM), steps=steps, out=folder, overwrite=True, hold_out=trying.record.hold_out)
     made = prune_run(request, lambda text, fraction: trying.events(Finishing(f"pruning: {text}")))
     if made.run_dir is None:
         trying.record.why.append("nothing could be pruned")
         return before
-    model, _ = load_model(made.run_dir / "model.safetensors", task_of(trying.config))
-    held = shop.measured(model)
-    metrics = read_metrics(made.run_dir)
-    size = int(made.after["bytes"])
-    share = f"{size / made.before['bytes']:.0%} of the bytes with {model.count:,} primitives"
-    kept = shop.judge.margin(held) >= 0 and size < made.before["bytes"]
-    trying.tell(f"pruned: {share}, held out {held['psnr']:.2f} dB, ssim {held['ssim']:.4f}; {'kept' if kept else 'not worth it'}")
+    task = task_of(trying.config)
+    model, _ = load_model(made.run_dir / "model.safetensors", task)
+    held, metrics = shop.measured(model), read_metrics(made.run_dir)
+    sizes = [packed_bytes(folder, task) for folder in (before.run_dir, made.run_dir)]
+    kept = shop.judge.margin(held) >= 0 and sizes[1] < sizes[0]
+    found = f"{model.count:,} primitives, {sizes[1] / 1e3:.1f} kB in place of {sizes[0] / 1e3:.1f}, held out {held['psnr']:.2f} dB, ssim {held['ssim']:.4f}"
+    trying.tell(f"pruned: {found}; {'kept' if kept else 'not worth it'}")
     if not kept:
         return before
     test = {name: float(metrics[name]) for name in ("psnr", "ssim")}
-    facts = {**before.facts, "pruned": {"primitives": model.count, "bytes": size, "bytes_before": int(made.before["bytes"])}}
-    return Finished(made.run_dir, held, size, test, facts)
+    facts = {**before.facts, "pruned": {"primitives": model.count, "bytes_usual": sizes[1], "bytes_usual_before": sizes[0]}}
+    return Finished(made.run_dir, held, int(made.after["bytes"]), test, facts)
 
 
 STAGES: tuple[Callable[[Workshop, Finished], Finished], ...] = (pruned, quantised)

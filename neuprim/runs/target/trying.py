@@ -13,13 +13,14 @@ from neuprim.config import RunConfig, task_of
 from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compressed import USUAL_LEVEL, bit_table
 from neuprim.core.data import Dataset
+from neuprim.core.task import TaskSpec
 from neuprim.core.train.settings import PopulationSettings
 from neuprim.runs.events import Events, Note
 from neuprim.runs.target.pace import Stopwatch, linear
 from neuprim.runs.target.record import Attempt, Record
 from neuprim.runs.trials import Trial, run_trial
 
-__all__ = ["FOLDER", "VIEWS", "Trying", "changed"]
+__all__ = ["FOLDER", "VIEWS", "Trying", "changed", "packed_bytes"]
 
 FOLDER = "target"
 """Of the run's directory, for the trainings of the search."""
@@ -140,7 +141,7 @@ class Trying:
         if attempt.pace is None:  # read back, or two steps at most
             attempt.pace = outcome.seconds / max(outcome.steps, 1)
         if attempt.purpose != "pace":
-            attempt.packed = self._packed(config)
+            attempt.packed = packed_bytes(config.output_dir, task_of(config))
         self.write()
         return attempt
 
@@ -151,16 +152,6 @@ class Trying:
 
     def _find(self, attempt: Attempt) -> Attempt | None:
         return next((a for a in self.record.attempts if _same(a, attempt)), None)
-
-    def _packed(self, config: RunConfig) -> int:
-        """Bytes of a training's model in few bits."""
-        task, file = task_of(config), config.output_dir / "packed.neuprim"
-        model, _ = load_model(config.output_dir / "model.safetensors", task)
-        words = (config.output_dir / "config.yaml").read_text(encoding="utf-8")
-        save_compressed(file, model, task.name, {}, bit_table(USUAL_LEVEL, (), model.specs), words)
-        size = file.stat().st_size
-        file.unlink()
-        return size
 
     # ------------------------------------------------------------ time
 
@@ -179,6 +170,16 @@ class Trying:
     def cost(self, primitives: int, steps: float) -> float:
         """Seconds that a trial will take."""
         return self.pace(primitives) * steps + max(self.overhead(), 0.0)
+
+
+def packed_bytes(folder: Path, task: TaskSpec) -> int:
+    """Bytes of a training's model when compressed at the usual level."""
+    file, words = folder / "packed.neuprim", (folder / "config.yaml").read_text(encoding="utf-8")
+    model, _ = load_model(folder / "model.safetensors", task)
+    save_compressed(file, model, task.name, {}, bit_table(USUAL_LEVEL, (), model.specs), words)
+    size = file.stat().st_size
+    file.unlink()
+    return size
 
 
 def _same(a: Attempt, b: Attempt) -> bool:

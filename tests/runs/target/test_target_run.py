@@ -90,10 +90,14 @@ def test_the_target_is_met_within_the_budget(met: tuple[Path, Record, Clock]) ->
 def test_a_usual_run_directory_is_left(met: tuple[Path, Record, Clock]) -> None:
     out, record, _ = met
     there = {p.name for p in out.iterdir()}
-    assert {"config.yaml", "model.safetensors", "model.neuprim", "checkpoint.safetensors", "metrics.json", "metrics.jsonl", "renders", "report.html", "target", "target.json"} <= there  # fmt: skip
+    assert {"config.yaml", "model.safetensors", "checkpoint.safetensors", "metrics.json", "metrics.jsonl", "renders", "report.html", "target", "target.json"} <= there  # fmt: skip
     assert "draft.neuprim" not in there and not list(out.rglob("packed.neuprim"))
+    assert Path(record.achieved["file"]).name == "model.neuprim" and Path(record.achieved["file"]).parent == Path(
+        record.achieved["run_dir"]
+    )
+    chosen = next(a for a in record.attempts if a.folder == record.chosen)
     again, metrics = RunConfig.from_yaml(out), read_metrics(out)
-    assert again.output_dir == out and again.model.primitives == record.achieved["primitives"] == metrics["primitives"]
+    assert again.output_dir == out and again.model.primitives == metrics["primitives"] == chosen.count
     assert again.non_default["model.primitives"][1] == metrics["primitives"]
     assert metrics["train_views"] == 8, "half of sixteen, as two of them are the fewest that are held out of"
     assert evaluate_run(out)["psnr"] == pytest.approx(metrics["psnr"], abs=1e-6)
@@ -200,3 +204,20 @@ def test_a_damaged_record_is_named(text: str, tmp_path: Path) -> None:
     (tmp_path / "target.json").write_text(text)
     with pytest.raises(DataError, match=r"target\.json: .*delete it to search anew"):
         searched(tmp_path, Target(psnr=20.0), "resume=true")
+
+
+# ---------------------------------------------------------------- finishing
+
+
+def test_what_is_left_of_the_budget_prunes(tmp_path: Path) -> None:
+    """Views held out are not trained on by the pruning either; what is pruned is taken only where it is smaller and still meets the target."""
+    record, clock = searched(tmp_path / "run", Target(psnr=19.0), "train.iterations=640", budget=1200.0)
+    said = [note for note in clock.notes if note.startswith("pruned: ")]
+    assert len(said) == 1 or "nothing could be pruned" in record.why
+    pruned = "pruned" in record.achieved
+    assert pruned == any(note.endswith("kept") for note in said)
+    assert record.achieved["held_out"]["psnr"] >= 19.0 and record.warning is None
+    file = Path(record.achieved["file"])
+    assert file.exists() and (file.parent.name == "pruned") == pruned
+    if said:
+        assert json.loads((tmp_path / "run" / "pruned" / "pruned.json").read_text())

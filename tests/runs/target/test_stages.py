@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from neuprim.config.target import Target
 from neuprim.runs.target.stages import chosen
-from tests.runs.target.test_judge import attempt, judge
+from tests.runs.target_records import attempt, judge
 
 
 def test_the_smallest_that_meets_the_target_with_room_for_few_bits_is_chosen() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+import neuprim.runs.prune.run as pruning
 from neuprim.config import RunConfig, compose
 from neuprim.config.target import Target
 from neuprim.core.errors import ConfigError, DataError
@@ -209,9 +210,18 @@ def test_a_damaged_record_is_named(text: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- finishing
 
 
-def test_what_is_left_of_the_budget_prunes(tmp_path: Path) -> None:
+def test_what_is_left_of_the_budget_prunes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Views held out are not trained on by the pruning either; what is pruned is taken only where it is smaller and still meets the target."""
+    learned: list[int] = []
+
+    class Watched(pruning.Search):
+        def __post_init__(self) -> None:
+            learned.append(len(self.dataset.train))
+            super().__post_init__()
+
+    monkeypatch.setattr(pruning, "Search", Watched)
     record, clock = searched(tmp_path / "run", Target(psnr=19.0), "train.iterations=640", budget=1200.0)
+    assert learned == [8], "of sixteen"
     said = [note for note in clock.notes if note.startswith("pruned: ")]
     assert len(said) == 1 or "nothing could be pruned" in record.why
     pruned = "pruned" in record.achieved

@@ -20,6 +20,7 @@ from neuprim.cli.export_help import export_help
 from neuprim.cli.metrics_report import print_metrics
 from neuprim.cli.operating_words import DRAWN, OPERATING, operating_words
 from neuprim.cli.prune import for_prune, prune
+from neuprim.cli.run_help import COMMON_KEYS, EXAMPLES
 from neuprim.cli.tradeoff import FORMS, for_tradeoff, of_words, tradeoff
 from neuprim.core.errors import DISK, ConfigError, NeuprimError, nearest
 from neuprim.core.notices import warnings_as_lines
@@ -30,28 +31,6 @@ if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
 
 __all__ = ["main"]
-
-COMMON_KEYS = """\
-commonest keys:
-  task=NAME scene=NAME preset=NAME     what to fit, and how (`neuprim tasks` lists them)
-  scene.path=DIR                       data of a scene that reads files
-  output_dir=DIR resume=true           where to write; continue an interrupted run
-  train.iterations=N train.max_seconds=S
-  model.primitives=N model.neurons=K model.sh_degree=D
-  train.rates.NAME=R                   learning rate of one parameter; train.rate_units.NAME=absolute|extent
-  renderer.backend=auto|NAME           `neuprim doctor` lists them
-  renderer.sort=center|entry           renderer.samples=N (rays per pixel side) renderer.threads=N
-  seed=N
-`neuprim run task=NAME scene=NAME --cfg` shows every key with its value. A value that contains , = or brackets is quoted
-twice, for the shell and for the grammar: "scene.path='a=b, c'"."""
-
-EXAMPLES = """\
-examples:
-  neuprim run task=dynamic scene=smoke_fire
-  neuprim run task=dynamic scene=vdb scene.vdb=DIR scene.frames=0:100:2
-  neuprim run task=static scene=solids
-  neuprim run task=static scene=blender scene.path=DIR preset=paper
-  neuprim run -m model.primitives=200,1000 train.max_seconds=60"""
 
 
 class Parser(argparse.ArgumentParser):
@@ -197,12 +176,22 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
 
 def _run(args: argparse.Namespace) -> int:
     from neuprim.config import compose, compose_all
+    from neuprim.config.target import target_words
 
     check = not args.cfg
-    configs = compose_all(args.overrides, check) if args.multirun else [compose(args.overrides, check)]
+    wanted, words = target_words(args.overrides)
+    if wanted is not None and args.multirun:
+        raise ConfigError(f"{wanted[0]}: a target is for one run; expected no -m beside it")
+    configs = compose_all(words, check) if args.multirun else [compose(words, check)]
     if args.cfg:
+        if wanted is not None:
+            print(f"# {wanted[0]} budget={wanted[1]:g}s; the search starts from")
         print("---\n".join(config.to_yaml() for config in configs), end="")
         return 0
+    if wanted is not None:
+        from neuprim.cli.target import fit_target
+
+        return fit_target(configs[0], *wanted, args.overrides)
     if len(configs) == 1:
         print(_fit(configs[0], args.overrides))
         return 0

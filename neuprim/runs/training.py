@@ -27,9 +27,9 @@ from neuprim.runs.curve import open_curve
 from neuprim.runs.events import Events, Note, Preparing, silent
 from neuprim.runs.fit import Fitted, compile_kernels, one_torch_thread, start, steps
 
-__all__ = ["make_ready", "save", "train"]
+__all__ = ["COMPILING", "make_ready", "save", "train"]
 
-_COMPILING = "compiling kernels, once per installation (about a minute)"
+COMPILING = "compiling kernels, once per installation (about a minute)"
 
 
 def train(
@@ -57,7 +57,7 @@ def train(
         config.output_dir.mkdir(parents=True, exist_ok=True)
         write_text(config.output_dir / "config.yaml", fitted.config.to_yaml())
         if kernels.running:
-            events(Preparing(_COMPILING))
+            events(Preparing(COMPILING))
             kernels.wait()
         return fitted, _train(fitted, events)
 
@@ -69,7 +69,7 @@ def make_ready(trainer: Trainer, events: Events = silent) -> None:
     form = variant(type(lowered.colour).__name__, lowered.density.edge)
     backend = choose(lowered, trainer.renderer, view.camera)
     if backend.compiles and not compiled(backend.name, form):
-        events(Preparing(_COMPILING))
+        events(Preparing(COMPILING))
     compile_kernels(trainer)
     if backend.compiles:
         mark_compiled(backend.name, form)

@@ -18,6 +18,7 @@ from neuprim.cli import _parsers
 from neuprim.cli.operating_words import DRAWN, operating_words
 from neuprim.cli.tradeoff import of_words
 from neuprim.config import compose, compose_all
+from neuprim.config.target import target_words
 from neuprim.core.cameras.file import read_cameras
 from neuprim.core.conditions import read_conditions, split_words
 from neuprim.core.data.check import check_dataset
@@ -192,6 +193,7 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
         rest += args.overrides
         settings = [word for word in rest if not word.startswith("-")]
         rest = [word for word in rest if word.startswith("-")]
+        _, settings = target_words(settings)
         (compose_all if args.multirun else compose)(settings, False)
     if args.command == "bench":
         rest += args.overrides

@@ -14,6 +14,7 @@ from neuprim.config import RunConfig, suspects_of
 from neuprim.core.channels import channels_of
 from neuprim.core.data import Dataset
 from neuprim.core.data.check import check_dataset
+from neuprim.core.data.held_out import held_out
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.drafts import refuse_taken
 from neuprim.core.io.files import write_json, write_text
@@ -48,6 +49,7 @@ class Request:
         seconds: of fine-tuning, about, in which as many steps are made as fit; steps: so many instead, which gives the same model again.
         out: the new run directory; None: beside the run, its name with "-pruned".
         overwrite: whether files there may be replaced.
+        hold_out: n > 1: one of n training views neither decides nor is trained on, as in :func:`~neuprim.core.data.held_out.held_out`; 0: all do.
     """
 
     run_dir: Path
@@ -56,6 +58,7 @@ class Request:
     steps: int | None = None
     out: Path | None = None
     overwrite: bool = False
+    hold_out: int = 0
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,8 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
         dataset = load_dataset(config, task, run_dir=request.run_dir)
         suspects.know(dataset)
         check_dataset(dataset, task.conditions)
+        if request.hold_out:
+            dataset = replace(dataset, train=held_out(dataset, request.hold_out).train)
         begun = time.monotonic()
         steps = request.steps if request.steps is not None else steps_in(request.seconds, config, task, dataset, model)
         search = Search(config, task, dataset, request.tolerance, steps, progress)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import platform
-import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from neuprim.config import duration
 from neuprim.core.compute import device
 from neuprim.core.compute.machine import cpu_name
 from neuprim.core.compute.threads import core_count
@@ -48,8 +48,6 @@ _ONE_POINT = 0.1
 _CHORDS = 96
 """Pixels on the longer side of the image whose chords are sampled."""
 
-_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
-
 
 def seconds_of(budget: str, said: str = "--budget ") -> float:
     """Seconds of a budget such as 90s, 5m or 1h; ``said`` stands before it in messages.
@@ -57,10 +55,7 @@ def seconds_of(budget: str, said: str = "--budget ") -> float:
     Raises:
         ConfigError: it is something else.
     """
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", budget)
-    if match is None or float(match[1]) == 0:
-        raise ConfigError(f"{said}{budget}: expected a time such as 90s, 5m or 1h")
-    return float(match[1]) * _UNITS[match[2]]
+    return duration.seconds_of(budget, f"{said}{budget}")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,29 @@
+"""What ``neuprim run --help`` says beside its arguments."""
+
+from __future__ import annotations
+
+__all__ = ["COMMON_KEYS", "EXAMPLES"]
+
+COMMON_KEYS = """\
+commonest keys:
+  task=NAME scene=NAME preset=NAME     what to fit, and how (`neuprim tasks` lists them)
+  scene.path=DIR                       data of a scene that reads files
+  output_dir=DIR resume=true           where to write; continue an interrupted run
+  train.iterations=N train.max_seconds=S
+  model.primitives=N model.neurons=K model.sh_degree=D
+  train.rates.NAME=R                   learning rate of one parameter; train.rate_units.NAME=absolute|extent
+  renderer.backend=auto|NAME           `neuprim doctor` lists them
+  renderer.sort=center|entry           renderer.samples=N (rays per pixel side) renderer.threads=N
+  seed=N
+  target.psnr=DB budget=10m            the smallest model that has it, searched and trained in that time; also target.ssim=S,
+                                       with target.megabytes=M and target.fps=F as limits, or these alone: the best within them
+`neuprim run task=NAME scene=NAME --cfg` shows every key with its value. A value that contains , = or brackets is quoted
+twice, for the shell and for the grammar: "scene.path='a=b, c'"."""
+
+EXAMPLES = """\
+examples:
+  neuprim run task=dynamic scene=smoke_fire
+  neuprim run task=dynamic scene=vdb scene.vdb=DIR scene.frames=0:100:2
+  neuprim run task=static scene=solids
+  neuprim run task=static scene=blender scene.path=DIR preset=paper
+  neuprim run -m model.primitives=200,1000 train.max_seconds=60"""

@@ -1,0 +1,189 @@
+"""One training of the search: its configuration, its folder, its outcome in the record, and its line for the user."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from neuprim.config import RunConfig, task_of
+from neuprim.core.checkpoint import load_model, save_compressed
+from neuprim.core.compressed import USUAL_LEVEL, bit_table
+from neuprim.core.data import Dataset
+from neuprim.core.task import TaskSpec
+from neuprim.core.train.settings import PopulationSettings
+from neuprim.runs.events import Events, Note
+from neuprim.runs.target.pace import Stopwatch, linear
+from neuprim.runs.target.record import Attempt, Record
+from neuprim.runs.trials import Trial, run_trial
+
+__all__ = ["FOLDER", "VIEWS", "Trying", "changed", "packed_bytes"]
+
+FOLDER = "target"
+"""Of the run's directory, for the trainings of the search."""
+
+VIEWS = 16
+"""Views held out that are measured, at most."""
+
+_EVERY = 5
+"""Steps between two interventions, at least: fewer tell nothing about who is used."""
+
+_PSNR_MAX = 200.0  # dB; equal images have an infinite one, which JSON does not
+
+
+def changed(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
+    """A configuration with other settings, by dotted names below ``model`` and ``train``, and with its record of what is not a default."""
+    groups: dict[str, dict[str, Any]] = {}
+    different = dict(config.non_default)
+    for key, value in values.items():
+        group, _, name = key.partition(".")
+        groups.setdefault(group, {})[name] = value
+        for own, was, now in _leaves(key, getattr(getattr(config, group), name), value):
+            default = different.pop(own, (was, was))[0]
+            if now != default:
+                different[own] = (default, now)
+    made = {group: replace(getattr(config, group), **settings) for group, settings in groups.items()}
+    return replace(config, **made, non_default=different)
+
+
+def _leaves(key: str, before: Any, after: Any) -> list[tuple[str, Any, Any]]:
+    """(dotted name, value before, value after) of a setting, or of every setting of a group."""
+    if not dataclasses.is_dataclass(before):
+        return [(key, before, after)]
+    return [(f"{key}.{f.name}", getattr(before, f.name), getattr(after, f.name)) for f in dataclasses.fields(before)]
+
+
+@dataclass
+class Trying:
+    """Trains what is asked for, unless the record has it.
+
+    Attributes:
+        config: what the search starts from.
+        dataset: its scene, whole.
+        clock: seconds, monotonic.
+    """
+
+    config: RunConfig
+    dataset: Dataset
+    record: Record
+    events: Events
+    clock: Callable[[], float] = time.monotonic
+    begun: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.begun = self.clock() - self.record.spent
+
+    @property
+    def folder(self) -> Path:
+        return self.config.output_dir
+
+    @property
+    def spent(self) -> float:
+        """Seconds of the budget that are used."""
+        return self.clock() - self.begun
+
+    @property
+    def left(self) -> float:
+        return self.record.asked["budget"] - self.spent
+
+    def write(self) -> None:
+        self.record.spent = self.spent
+        self.record.write(self.folder)
+
+    def tell(self, text: str) -> None:
+        self.events(Note(text))
+
+    def config_of(self, attempt: Attempt) -> RunConfig:
+        """The configuration of a training, in its folder."""
+        values = {
+            **attempt.words,
+            "model.primitives": attempt.primitives,
+            "train.iterations": attempt.steps,
+            "train.max_seconds": attempt.max_seconds,
+            "train.population": self._population(attempt.steps),
+        }
+        made = changed(self.config, values)
+        return replace(made, output_dir=self.folder / FOLDER / attempt.folder, resume=attempt.purpose == "full")
+
+    def _population(self, steps: int) -> PopulationSettings:
+        """With as many interventions as in a run of whole length: with fewer, short runs are half a decibel worse than they need be."""
+        whole, settings = self.config.train.iterations, self.config.train.population
+        if whole is None or steps >= whole:
+            return settings
+        return replace(settings, every=max(round(settings.every * steps / whole), min(_EVERY, settings.every)))
+
+    def run(self, attempt: Attempt) -> Attempt:
+        """The attempt, done; the one of the record where it has an equal one.
+
+        KeyboardInterrupt leaves it unfinished in the record; it goes on from its checkpoint.
+        """
+        known = self._find(attempt)
+        attempt = known or attempt
+        if attempt.outcome is not None:
+            return attempt
+        if known is None:
+            self.record.attempts.append(attempt)
+        self.write()
+        watch, start = Stopwatch(self.clock, self.events), self.clock()
+        config = self.config_of(attempt)
+        try:
+            outcome = run_trial(Trial(config, self.record.hold_out, VIEWS), self.dataset, watch)
+        finally:
+            self.begun += watch.compiling
+            attempt.seconds += self.clock() - start - watch.compiling
+            attempt.pace = watch.pace or attempt.pace
+            self.write()
+        found = {k: v for k, v in dataclasses.asdict(outcome).items() if k != "curve"}
+        attempt.outcome = {**found, "psnr": min(outcome.psnr, _PSNR_MAX)}
+        if attempt.pace is None:  # read back, or two steps at most
+            attempt.pace = outcome.seconds / max(outcome.steps, 1)
+        if attempt.purpose != "pace":
+            attempt.packed = packed_bytes(config.output_dir, task_of(config))
+        self.write()
+        return attempt
+
+    def known(self, attempt: Attempt) -> bool:
+        """Whether an equal attempt is done already."""
+        found = self._find(attempt)
+        return found is not None and found.outcome is not None
+
+    def _find(self, attempt: Attempt) -> Attempt | None:
+        return next((a for a in self.record.attempts if _same(a, attempt)), None)
+
+    # ------------------------------------------------------------ time
+
+    def pace(self, primitives: float) -> float:
+        """Seconds of a step with so many primitives. The pace of trials counts by the primitives they had, the last of equal ones alone."""
+        known = {a.count: a.pace for a in self.record.done("pace", "size", "longer", "full") if a.pace is not None}
+        if len(known) > 1:  # a few steps of a young model are the poorest guess
+            known = {a.count: a.pace for a in self.record.done("size", "longer", "full") if a.pace is not None} or known
+        return linear(list(known.items()), primitives)
+
+    def overhead(self) -> float:
+        """Seconds of a trial beside its steps: starting points, measuring."""
+        done = self.record.done("size", "longer") or self.record.done("pace")
+        return max((a.seconds - (a.pace or 0.0) * a.steps for a in done[-3:]), default=0.0)
+
+    def cost(self, primitives: int, steps: float) -> float:
+        """Seconds that a trial will take."""
+        return self.pace(primitives) * steps + max(self.overhead(), 0.0)
+
+
+def packed_bytes(folder: Path, task: TaskSpec) -> int:
+    """Bytes of a training's model when compressed at the usual level."""
+    file, words = folder / "packed.neuprim", (folder / "config.yaml").read_text(encoding="utf-8")
+    model, _ = load_model(folder / "model.safetensors", task)
+    save_compressed(file, model, task.name, {}, bit_table(USUAL_LEVEL, (), model.specs), words)
+    size = file.stat().st_size
+    file.unlink()
+    return size
+
+
+def _same(a: Attempt, b: Attempt) -> bool:
+    def alike(x: Attempt) -> tuple[Any, ...]:
+        return x.words, x.primitives, x.steps, x.purpose == "full", x.max_seconds
+
+    return alike(a) == alike(b)

@@ -21,8 +21,8 @@ from neuprim.core.errors import CheckpointError, nearest
 from neuprim.core.io.files import atomic_path
 from neuprim.core.model.fields import ColourField, DensityField, pieces_by_name
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.zeros import split_off, whole
 from neuprim.core.task import TaskSpec
-from neuprim.core.zeros import split_off, whole
 
 __all__ = ["FORMAT", "load_model", "read", "read_header", "save_compressed", "save_model", "stored_config", "write"]
 
@@ -100,7 +100,7 @@ def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any
     """Write what rendering needs. ``extra`` (JSON-able) joins the header: background, colour space, data source.
 
     Args:
-        without_zeros: whether pieces that are zero are left out (:mod:`neuprim.core.zeros`), as in models that were pruned.
+        without_zeros: whether pieces that are zero are left out (:mod:`neuprim.core.model.zeros`), as in models that were pruned.
     """
     pieces = pieces_by_name(model.density, model.colour) if without_zeros else {}
     tensors, apart = split_off(model.params, model.specs, pieces)

@@ -1,7 +1,7 @@
 """Parts of a primitive's fields that it may do without: a band of its colour, a neuron of its density, a wave in time.
 
 A piece names numbers that mean nothing once they are zero. Pruning decides for every primitive which pieces it keeps; files leave out what is
-zero (:mod:`neuprim.core.zeros`), and compressed files have next to nothing to say about it.
+zero (:mod:`neuprim.core.model.zeros`), and compressed files have next to nothing to say about it.
 """
 
 from __future__ import annotations

@@ -15,15 +15,15 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import Field, pieces_by_name
 from neuprim.core.model.pieces import alive, numbers_of, without, worth
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.zeros import split_off, whole
 from neuprim.core.task import TaskSpec
-from neuprim.core.zeros import split_off, whole
 from neuprim.plugins.registry import load_task
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.relight.harmonics import LightHarmonics
 from neuprim.tasks.static.fields import SphericalHarmonics
-from tests.core.model.test_reductions import CONDITIONS, COUNT, camera, made
+from tests.core.model.shaken import CONDITIONS, COUNT, camera, made
 
 PAIRS = [
     (CosineDensity(3, edge=2, gain=True), SphericalHarmonics(3)),

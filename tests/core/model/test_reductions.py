@@ -14,37 +14,14 @@ from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity, cosine_de
 from neuprim.core.model.densities.fewer import fewer_neurons, smaller_counts
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Field
-from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry
+from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.schema import InitContext
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.relight.harmonics import LightHarmonics
 from neuprim.tasks.static.fields import SphericalHarmonics
-
-COUNT = 40
-CONDITIONS = {"time": torch.tensor(0.3), "light": torch.tensor([2.0, 1.0, 3.0]), "light_intensity": torch.tensor(1.0)}
-
-
-def camera() -> Camera:
-    view = look_at(torch.tensor([0.0, -3.0, 0.5]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
-    return Camera(view, 20.0, 20.0, 8.0, 8.0, 16, 16)
-
-
-def made(density: Field, colour: Field, noise: float = 0.3, seed: int = 1) -> Primitives:
-    """A model of both fields with every number moved, so that nothing is at a start value that hides a mistake."""
-    generator = torch.Generator().manual_seed(seed)
-    means = torch.rand((COUNT, 3), generator=generator) - 0.5
-    context = InitContext(means, torch.full((COUNT,), 0.3), torch.rand((COUNT, 3), generator=generator), generator)
-    specs = [*GEOMETRY_SPECS, *density.parameters(), *colour.parameters()]
-    moved = {s.name: s.init(context).float() for s in specs}
-    return Primitives(
-        density,  # type: ignore[arg-type]
-        colour,  # type: ignore[arg-type]
-        {name: value + noise * torch.randn(value.shape, generator=generator) for name, value in moved.items()},
-    )
-
+from tests.core.model.shaken import CONDITIONS, COUNT, camera, made
 
 PAIRS = [
     (CosineDensity(8, edge=2, gain=True), SphericalHarmonics(3)),

@@ -15,7 +15,7 @@ from neuprim.core.render import RenderSettings, render
 from neuprim.core.train.sensitivity import sensitivity
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests.core import tiny
-from tests.core.model.test_reductions import made
+from tests.core.model.shaken import made
 
 SETTINGS = RenderSettings(threads=1, alpha_min=0.0, transmittance_min=0.0)
 

@@ -1,0 +1,192 @@
+"""What a scene requires: models of the presets, pruned, in few bits, and both.
+
+    python benchmarks/smaller.py [--chair DIR] [--fire DIR] [--scenes chair fire lit_solids smoke_fire] [--seeds 3] [--jobs 2] [--docs] [--print]
+
+Every model is its preset's own (`quick`, the preset's number of views). Then, as `neuprim prune` and `neuprim compress` do it:
+
+    trained as long   the whole model, fine-tuned for the steps that pruning has: what they bring without pruning
+    pruned            `neuprim prune --tolerance 0.1dB --steps 4000`
+    level L           `neuprim compress --level L --steps 1000` of the whole and of the pruned model
+
+PSNR and SSIM are means over all held-out views, which decide nothing; bytes are those of the files, of a whole model its numbers in float32.
+Rows go to benchmarks/results/smaller.json as they come, and only what is missing is run; runs stay in outputs/smaller. --docs puts the table
+between the markers of docs/tradeoffs.md; --print runs nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from shared.tables import ROOT, Table, between_markers, spread
+
+from neuprim.config import compose, task_of
+from neuprim.core.channels import channels_of
+from neuprim.core.compute.machine import cpu_name
+from neuprim.core.data import Dataset
+from neuprim.core.model.primitives import Primitives
+from neuprim.runs.compress import compress_run
+from neuprim.runs.finetune import fine_tuner
+from neuprim.runs.measure import measure
+from neuprim.runs.open import load_dataset, load_run, read_metrics
+from neuprim.runs.prune.run import Request, prune_run
+from neuprim.runs.run import run
+
+RESULTS = Path(__file__).parent / "results" / "smaller.json"
+RUNS = ROOT / "outputs" / "smaller"
+SCENES = {
+    "chair": ("task=static", "scene=blender"),
+    "fire": ("task=dynamic", "scene=vdb", "scene.size=64"),
+    "lit_solids": ("task=relight", "scene=lit_solids", "scene.size=128"),
+    "smoke_fire": ("task=dynamic", "scene=smoke_fire", "scene.size=64"),
+}
+PRUNED, FEW_BITS, TOLERANCE = 4000, 1000, 0.1
+LEVELS = (2, 3, 4)
+SHOWN = {"chair": "chair, 200×200", "fire": "real fire, 64×64", "lit_solids": "lit_solids, 128×128", "smoke_fire": "smoke_fire, 64×64"}
+
+
+def words(scene: str, data: Path | None, seed: int) -> list[str]:
+    where = [] if data is None else [f"scene.{'vdb' if scene == 'fire' else 'path'}='{data.resolve()}'"]
+    return [*SCENES[scene], *where, f"seed={seed}", "renderer.threads=1", "train.eval_every=0", f"output_dir='{RUNS / f'{scene}-{seed}'}'"]
+
+
+def scene_of(scene: str, data: Path | None, seed: int, known: list[str], send: Any) -> None:
+    """All rows of one run, each handed to ``send`` as it comes."""
+    torch.set_num_threads(1)
+    folder = RUNS / f"{scene}-{seed}"
+
+    def tell(what: str, size: int, psnr: float, ssim: float, begun: float, **more: Any) -> None:
+        row = {
+            "scene": scene,
+            "seed": seed,
+            "what": what,
+            "bytes": size,
+            "psnr": psnr,
+            "ssim": ssim,
+            "cpu_seconds": time.process_time() - begun,
+        }
+        send({**row, **more})
+
+    if not (folder / "metrics.json").exists():
+        run(compose(words(scene, data, seed), check_output=False))
+    begun, metrics = time.process_time(), read_metrics(folder)
+    if "as trained" not in known:
+        whole = 4 * metrics["parameters"]
+        tell("as trained", whole, metrics["psnr"], metrics["ssim"], begun, primitives=metrics["primitives"], steps=metrics["iterations"])
+    small = folder.with_name(f"{folder.name}-pruned")
+    if "pruned" not in known or not (small / "metrics.json").exists():
+        begun = time.process_time()
+        made = prune_run(Request(folder, TOLERANCE, steps=PRUNED, out=small, overwrite=True))
+        after = made.after
+        tell(
+            "pruned",
+            int(after["bytes"]),
+            after["psnr"],
+            after["ssim"],
+            begun,
+            primitives=after["primitives"],
+            numbers=after["numbers"],
+            reduced=list(made.words),
+            kept=made.kept,
+        )
+        if made.run_dir is None:
+            small = folder
+    for level in LEVELS:
+        for where, name in ((folder, f"level {level}"), (small, f"pruned, level {level}")):
+            if name not in known:
+                begun = time.process_time()
+                stored = compress_run(where, level, out=where / f"level{level}.neuprim", overwrite=True, steps=FEW_BITS)
+                (psnr, ssim) = (stored.measured[key][1] for key in ("psnr", "ssim"))
+                tell(name, stored.after, psnr, ssim, begun)
+    if "trained as long" not in known:
+        begun = time.process_time()
+        config, task, model, _ = load_run(folder)
+        dataset = load_dataset(config, task, run_dir=folder)
+        trainer = fine_tuner(config, task, dataset, model, PRUNED)
+        for _ in range(PRUNED):
+            trainer.train_step()
+        psnr, ssim = quality(config, dataset, trainer.model)
+        tell("trained as long", 4 * model.count * model.parameters_per_primitive, psnr, ssim, begun)
+
+
+def quality(config: Any, dataset: Dataset, model: Primitives) -> tuple[float, float]:
+    views = measure(model, task_of(config), dataset, config.renderer, channels_of(task_of(config), dataset))
+    return float(np.mean([v.psnr for v in views])), float(np.mean([v.ssim for v in views]))
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    made = Table("model", "bytes", "times smaller", "PSNR", "against as trained", "SSIM")
+    order = ["as trained", "trained as long", "pruned", *(f"{p}level {level}" for p in ("", "pruned, ") for level in LEVELS)]
+    for scene in SCENES:
+        mine = [r for r in rows if r["scene"] == scene]
+        base = {r["seed"]: r for r in mine if r["what"] == "as trained"}
+        for what in order:
+            own = [r for r in mine if r["what"] == what]
+            if not own:
+                continue
+            first = base[own[0]["seed"]]
+            named = f"**{SHOWN[scene]}**, {first['primitives']:,} primitives, {first['steps']:,} views" if what == "as trained" else what
+            made.row(
+                named,
+                f"{np.mean([r['bytes'] for r in own]):,.0f}",
+                "" if what in ("as trained", "trained as long") else spread([base[r["seed"]]["bytes"] / r["bytes"] for r in own], 2),
+                f"{spread([r['psnr'] for r in own], 2)} dB",
+                "" if what == "as trained" else f"{np.mean([r['psnr'] - base[r['seed']]['psnr'] for r in own]):+.3f} dB",
+                spread([r["ssim"] for r in own], 4),
+            )
+    seeds = {scene: len({r["seed"] for r in rows if r["scene"] == scene}) for scene in SCENES}
+    said = ", ".join(f"{scene} {count}" for scene, count in seeds.items() if count)
+    return (
+        f"{made}\n\nSeeds: {said}; mean ± half the spread. Pruned with a tolerance of {TOLERANCE} dB on training views and {PRUNED:,} steps of fine-tuning; "
+        f"{FEW_BITS:,} steps for few bits; {cpu_name()}, one thread."
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=list(SCENES))
+    parser.add_argument("--chair", type=Path, help="a NeRF-synthetic folder")
+    parser.add_argument("--fire", type=Path, help="a folder of EmberGen's .vdb files")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
+    parser.add_argument("--print", action="store_true", help="train nothing")
+    parser.add_argument("--docs", action="store_true", help="write the table into docs/tradeoffs.md")
+    args = parser.parse_args()
+    rows: list[dict[str, Any]] = json.loads(RESULTS.read_text())["rows"] if RESULTS.exists() else []
+    data = {"chair": args.chair, "fire": args.fire}
+    if not args.print:
+        context = multiprocessing.get_context("spawn")
+        queue = context.Manager().Queue()
+        with ProcessPoolExecutor(args.jobs, context) as pool:
+            asked = [(scene, seed) for seed in range(args.seeds) for scene in args.scenes if scene not in data or data[scene] is not None]
+            waiting = set()
+            for scene, seed in asked:
+                known = [r["what"] for r in rows if (r["scene"], r["seed"]) == (scene, seed)]
+                waiting.add(pool.submit(scene_of, scene, data.get(scene), seed, known, queue.put))
+            while waiting or not queue.empty():
+                while not queue.empty():
+                    rows.append(queue.get())
+                    RESULTS.write_text(
+                        json.dumps({"cpu": cpu_name(), "rows": sorted(rows, key=lambda r: (r["scene"], r["seed"], r["what"]))}, indent=1)
+                        + "\n"
+                    )
+                    print({k: v for k, v in rows[-1].items() if k != "kept"}, flush=True)
+                done = {future for future in waiting if future.done()}
+                for future in done:
+                    future.result()
+                waiting -= done
+                time.sleep(1.0)
+    text = table(rows)
+    if args.docs:
+        between_markers(ROOT / "docs" / "tradeoffs.md", "smaller", text)
+
+
+if __name__ == "__main__":
+    main()

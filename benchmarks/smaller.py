@@ -1,5 +1,6 @@
 """What a scene requires: models of the presets, pruned, in few bits, and both.
 
+    python benchmarks/smaller.py --orders RUN_DIR
     python benchmarks/smaller.py [--chair DIR] [--fire DIR] [--scenes chair fire lit_solids smoke_fire] [--seeds 3] [--jobs 2] [--docs] [--print]
 
 Every model is its preset's own (`quick`, the preset's number of views). Then, as `neuprim prune` and `neuprim compress` do it:
@@ -10,7 +11,8 @@ Every model is its preset's own (`quick`, the preset's number of views). Then, a
 
 PSNR and SSIM are means over all held-out views, which decide nothing; bytes are those of the files, of a whole model its numbers in float32.
 Rows go to benchmarks/results/smaller.json as they come, and only what is missing is run; runs stay in outputs/smaller. --docs puts the table
-between the markers of docs/tradeoffs.md; --print runs nothing.
+between the markers of docs/tradeoffs.md; --print runs nothing. --orders RUN_DIR prints what the held-back training views of a run lose without the 5 % of its primitives
+that are worth least, by several ways to say so.
 """
 
 from __future__ import annotations
@@ -32,10 +34,13 @@ from neuprim.core.channels import channels_of
 from neuprim.core.compute.machine import cpu_name
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import render
+from neuprim.core.train.sensitivity import sensitivity
 from neuprim.runs.compress import compress_run
 from neuprim.runs.finetune import fine_tuner
 from neuprim.runs.measure import measure
 from neuprim.runs.open import load_dataset, load_run, read_metrics
+from neuprim.runs.prune.judge import Judge
 from neuprim.runs.prune.run import Request, prune_run
 from neuprim.runs.run import run
 
@@ -121,6 +126,34 @@ def quality(config: Any, dataset: Dataset, model: Primitives) -> tuple[float, fl
     return float(np.mean([v.psnr for v in views])), float(np.mean([v.ssim for v in views]))
 
 
+def orders(folder: Path, share: float = 0.05) -> None:
+    """What a run's judged training views lose without a share of its primitives, least first, by three measures of what they are worth."""
+    torch.set_num_threads(1)
+    config, task, model, _ = load_run(folder)
+    dataset = load_dataset(config, task, run_dir=folder)
+    judge = Judge(dataset, config.renderer)
+    weights = torch.stack([weight_in(model, dataset, view, config.renderer) for view in judge.others])
+    squares = sensitivity(model, dataset, judge.others, config.renderer).whole
+    made = Table("order", f"without the first {share:.0%}")
+    for name, worth in (
+        ("sum of squared weights", squares),
+        ("sum of weights", weights.sum(0)),
+        ("largest weight in a view", weights.amax(0)),
+    ):
+        kept = worth.argsort(stable=True)[int(share * model.count) :].sort().values
+        made.row(name, f"{judge(Primitives(model.density, model.colour, model.rows(kept))) - judge(model):+.3f} dB")
+
+
+def weight_in(model: Primitives, dataset: Dataset, index: int, settings: Any) -> torch.Tensor:
+    """(N,) sums of weights in a training view."""
+    view = dataset.train.view(index)
+    params = {name: value.detach().requires_grad_() for name, value in model.params.items()}
+    output = render(Primitives(model.density, model.colour, params), view.camera, view.conditions, settings, dataset.background)
+    tally = output.watch(torch.ones(output.rgb.shape[:2]))
+    output.rgb.sum().backward()
+    return tally.of_all(model.count)[0]
+
+
 def table(rows: list[dict[str, Any]]) -> str:
     made = Table("model", "bytes", "times smaller", "PSNR", "against as trained", "SSIM")
     order = ["as trained", "trained as long", "pruned", *(f"{p}level {level}" for p in ("", "pruned, ") for level in LEVELS)]
@@ -158,7 +191,11 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
     parser.add_argument("--print", action="store_true", help="train nothing")
     parser.add_argument("--docs", action="store_true", help="write the table into docs/tradeoffs.md")
+    parser.add_argument("--orders", type=Path, metavar="RUN_DIR", help="only this, of a finished run")
     args = parser.parse_args()
+    if args.orders is not None:
+        orders(args.orders)
+        return
     rows: list[dict[str, Any]] = json.loads(RESULTS.read_text())["rows"] if RESULTS.exists() else []
     data = {"chair": args.chair, "fire": args.fire}
     if not args.print:

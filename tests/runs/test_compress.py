@@ -210,3 +210,28 @@ def test_a_file_in_place_of_a_run_directory_says_what_to_do(small: Path, capsys:
 def test_the_header_is_the_run_s(small: Path, whole: Path) -> None:
     assert checkpoint.read_header(small / "model.neuprim", "model") == checkpoint.read_header(whole / "model.safetensors", "model")
     assert json.loads(json.dumps(load_run(small)[3])) == load_run(whole)[3]
+
+
+# ---------------------------------------------------------------- training for few bits
+
+
+def test_the_command_trains_for_few_bits(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = [tmp_path / name for name in ("plain", "trained")]
+    assert main(["compress", str(whole), "--level", "5", "--steps", "0", "--out", str(out[0])]) == 0
+    assert "steps of training" not in capsys.readouterr().out
+    assert main(["compress", str(whole), "--level", "5", "--steps", "60", "--out", str(out[1])]) == 0
+    text = capsys.readouterr().out
+    assert "with 60 steps of training" in text
+    measured = [compress_run(whole, level=5, steps=steps, out=tmp_path / f"m{steps}").measured["psnr"][1] for steps in (0, 60)]
+    assert measured[1] > measured[0]
+    assert (tmp_path / "m60").read_bytes() == out[1].read_bytes()  # steps, not seconds: the same file
+
+
+def test_without_data_nothing_is_trained_and_it_is_said(whole: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(whole, copy)
+    config = (copy / "config.yaml").read_text()
+    (copy / "config.yaml").write_text(re.sub(r"(?m)^(\s+path: ).*$", r"\1/nowhere", config))
+    made = compress_run(copy, steps=40)
+    assert made.steps == 0 and any("it was not trained for few bits" in note for note in made.notes)
+    assert compress_run(copy, steps=0, overwrite=True).notes[-1].startswith("what this costs was not measured, as")

@@ -4,7 +4,7 @@ An image is J delta different when numbers change by delta, to first order. For 
 is the sum of squares |J delta|^2 (Hutchinson 1990, for the trace), and z . J is what a backward pass gives. So views are enough to know every
 piece's squared effect at once. A whole primitive's part in a pixel is its weight w = alpha T times how much its colour differs from what is
 behind it; its sum of w^2 comes the same way out of the frame's tally. Squares matter: primitives of equal summed weight differ much in it, and
-on a trained chair those with the least w^2 cost a fifth of what those with the least w cost.
+on a trained chair those with the least w^2 cost a third of what those with the least w cost (docs/tradeoffs.md).
 """
 
 from __future__ import annotations

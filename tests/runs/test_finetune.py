@@ -1,0 +1,109 @@
+"""The end of a run once more: rates, what stays as it is, and training for few bits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from neuprim.core.compressed import bit_table, folded, rounded, schemes
+from neuprim.core.data import Dataset
+from neuprim.core.model.primitives import Primitives
+from neuprim.runs.few_bits import train_for
+from neuprim.runs.finetune import COOL, START, fine_tuner, steps_in
+from neuprim.runs.open import load_dataset, load_run
+from neuprim.runs.prune.judge import Judge
+from tests.core import tiny
+from tests.short_runs import fit, words
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    return fit(words(tiny.write_blender(folder / "two"), folder / "run", 300, "renderer.threads=1"))
+
+
+@pytest.fixture(scope="module")
+def dataset(run_dir: Path) -> Dataset:
+    config, task, _, _ = load_run(run_dir)
+    return load_dataset(config, task, run_dir=run_dir)
+
+
+def test_rates_begin_above_those_of_the_run_s_end_and_fall_to_next_to_nothing(run_dir: Path, dataset: Dataset) -> None:
+    config, task, model, _ = load_run(run_dir)
+    trainer = fine_tuner(config, task, dataset, model, 40)
+    spec = next(s for s in model.specs if s.name == "b2")
+    usual = config.train.rates.get("b2", spec.lr) * config.train.final_rate
+    assert trainer.rates()["b2"] == pytest.approx(START * usual, rel=1e-6)
+    means = config.train.rates["means"] * config.train.final_rate * dataset.extent
+    assert trainer.rates()["means"] == pytest.approx(START * means, rel=1e-6)
+    for _ in range(40):
+        trainer.train_step()
+    assert trainer.finished and trainer.rates()["b2"] == pytest.approx(COOL * START * usual, rel=1e-6)
+
+
+def test_the_model_itself_stays_as_it_is_and_no_primitive_is_born_or_moved(run_dir: Path, dataset: Dataset) -> None:
+    config, task, model, _ = load_run(run_dir)
+    before = {name: value.clone() for name, value in model.params.items()}
+    eager = replace(config, train=replace(config.train, population=replace(config.train.population, every=1, start=0.0, stop=1.0)))
+    trainer = fine_tuner(eager, task, dataset, model, 30)
+    changes = [trainer.train_step().change for _ in range(30)]
+    assert set(changes) == {None} and trainer.model.count == model.count
+    assert all(torch.equal(model.params[name], value) for name, value in before.items())
+    assert not torch.equal(trainer.model.params["means"], before["means"])
+
+
+def test_what_is_to_stay_zero_does_and_nothing_else(run_dir: Path, dataset: Dataset) -> None:
+    config, task, model, _ = load_run(run_dir)
+    zero = torch.zeros_like(model.params["sh_rest"], dtype=torch.bool)
+    zero[::2, 3:] = True
+    pruned = Primitives(model.density, model.colour, {**model.params, "sh_rest": model.params["sh_rest"].masked_fill(zero, 0.0)})
+    trainer = fine_tuner(config, task, dataset, pruned, 20)
+    trainer.zeros = {"sh_rest": zero}
+    for _ in range(20):
+        trainer.train_step()
+    after = trainer.model.params["sh_rest"].detach()
+    assert bool((after[zero] == 0).all()) and not torch.equal(after[~zero], pruned.params["sh_rest"][~zero])
+    tensors, header = trainer.state()
+    again = fine_tuner(config, task, dataset, pruned, 20)
+    again.load_state(tensors, header, "state")
+    assert torch.equal(again.zeros["sh_rest"], zero)
+
+
+def test_seconds_are_steps_at_the_model_s_pace(run_dir: Path, dataset: Dataset) -> None:
+    config, task, model, _ = load_run(run_dir)
+    assert steps_in(0.0, config, task, dataset, model) == 0
+    assert steps_in(1e-9, config, task, dataset, model) == 1
+    assert steps_in(100.0, config, task, dataset, model) > 100
+
+
+# ---------------------------------------------------------------- few bits
+
+
+def test_training_for_few_bits_wins_back_what_they_cost(run_dir: Path, dataset: Dataset) -> None:
+    config, task, model, _ = load_run(run_dir)
+    table = bit_table(5, [], model.specs)
+    judge = Judge(dataset, config.renderer)
+
+    def read_back(one: Primitives, made: dict) -> float:  # type: ignore[type-arg]
+        return judge(Primitives(one.density, one.colour, {n: v.detach() for n, v in rounded(one.params, made).items()}))
+
+    plain = folded(model)
+    at_once = read_back(plain, schemes(plain, table))
+    trained, made, steps, said = train_for(config, task, dataset, model, table, 0.0, 150, lambda text, fraction: None)
+    assert steps == 150 and said == []
+    assert read_back(trained, made) > at_once + 0.2
+    again, _, _, _ = train_for(config, task, dataset, model, table, 0.0, 150, lambda text, fraction: None)
+    assert all(torch.equal(again.params[name], value) for name, value in trained.params.items())
+
+
+def test_where_training_brings_nothing_the_model_is_stored_as_it_is(
+    run_dir: Path, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, task, model, _ = load_run(run_dir)
+    monkeypatch.setattr("neuprim.runs.finetune.START", 3e4)  # rates that spoil everything
+    stored, _, steps, said = train_for(config, task, dataset, model, bit_table(1, [], model.specs), 0.0, 20, lambda text, fraction: None)
+    assert steps == 20 and len(said) == 1 and "brought nothing" in said[0]
+    assert all(torch.equal(stored.params[name], value) for name, value in folded(model).params.items())

@@ -30,6 +30,7 @@ from neuprim.conformance.forms import (
     check_lowered_forms,
     check_opaque_twin,
 )
+from neuprim.conformance.less import check_pieces, check_reductions
 from neuprim.conformance.parameters import (
     check_fields,
     check_files,
@@ -84,6 +85,8 @@ CHECKS: dict[str, Callable[[Subject], None]] = {
         check_learning,
         check_save_load,
         check_folded,
+        check_reductions,
+        check_pieces,
         check_resume,
         check_conditions,
         check_missing_conditions,

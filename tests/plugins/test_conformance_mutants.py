@@ -20,6 +20,7 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Conditions, ConditionSpec, Constant, Cosine, Field
 from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.task import SceneSpec, Supervision, TaskSpec
 from neuprim.core.train.losses import photometric
@@ -40,12 +41,38 @@ def using(density: type[CosineDensity] | type[GaussianDensity] = CosineDensity, 
     return replace(TASK, build=build, fields=fields, **more)
 
 
+def unlisted(density: type[CosineDensity]) -> TaskSpec:
+    """The same, whose fields do not list the usual density."""
+    task = using(density)
+    return replace(task, fields={name: field for name, field in (task.fields or {}).items() if name != "CosineDensity"})
+
+
 # ---------------------------------------------------------------- densities that break one promise each
 
 
 class ForgetsNeurons(CosineDensity):
     def settings(self) -> dict[str, Any]:
         return {"neurons": 3}
+
+
+def less_of(values: tuple[Any, ...], make: Any = None) -> type[CosineDensity]:
+    class Less(CosineDensity):
+        def reductions(self) -> dict[str, tuple[int, ...]]:
+            return {"neurons": values} if self.neurons else {}
+
+        def reduced(self, params: Params, geometry: Geometry, name: str, value: int) -> Any:
+            field, fewer = super().reduced(params, geometry, name, value)
+            return (Less(field.neurons), fewer) if make is None else make(field, fewer)
+
+    return Less
+
+
+def in_pieces(*pieces: Piece) -> type[CosineDensity]:
+    class Pieces(CosineDensity):
+        def pieces(self) -> tuple[Piece, ...]:
+            return pieces
+
+    return Pieces
 
 
 class SwallowsSettings(CosineDensity):
@@ -403,6 +430,22 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("learning", "mean loss over the training views", using(loss=uphill)),
     ("save_load", "after loading: found a change", using(colour=Progresses)),
     ("save_load", "SwallowsSettings(no_such_setting=1), as a model file has it", using(SwallowsSettings)),
+    ("reductions", "Less.reductions()['neurons']: found ()", using(less_of(()))),
+    ("reductions", "whole numbers from 0", using(less_of((1, 0.5)))),
+    ("reductions", "found (0, 1); expected the largest first", using(less_of((0, 1)))),
+    (
+        "reductions",
+        "Less.reduced('neurons', 1): found tensors or a field",
+        using(less_of((1,), lambda f, p: (f, {**p, "w2": p["w2"][:, :0]}))),
+    ),
+    ("reductions", "found CosineDensity; expected a field that TaskSpec.fields lists", unlisted(less_of((1,), lambda f, p: (f, p)))),
+    ("reductions", "image: found", using(less_of((1,), lambda f, p: (f, {**p, "b2": p["b2"] * math.nan})))),
+    ("pieces", "names that are there once", using(in_pieces(Piece("a", {"w2": (0,)}), Piece("a", {"w2": (1,)})))),
+    ("pieces", "w3: found no such parameter", using(in_pieces(Piece("a", {"w3": (0,)})))),
+    ("pieces", "found a place (7,) that it does not have", using(in_pieces(Piece("a", {"w2": (7,)})))),
+    ("pieces", "found an empty place", using(in_pieces(Piece("a", {"w2": (slice(1, 1),)})))),
+    ("pieces", "found numbers of another piece", using(in_pieces(Piece("a", {"w2": (0,)}), Piece("b", {"w2": (slice(None),)})))),
+    ("pieces", "found no numbers", using(in_pieces(Piece("a", {})))),
     ("folded", "after folding: found a change of", using(FoldsAway)),
     ("folded", "b1 after folding twice: found other values", using(FoldsOnAndOn)),
     ("resume", "8 steps against 4 + resume + 4", using(Remembers)),

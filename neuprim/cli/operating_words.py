@@ -17,7 +17,7 @@ KEY=VALUE words draw the run otherwise than it says itself:
   resolution=0.5             drawn at half the width and height, and enlarged
   density.NAME=N colour.NAME=N
                              less of something, e.g. colour.degree=1 (bands of spherical harmonics) density.neurons=4
-  store.GROUP=float16        means, shape, density, colour or all as 16-bit floats hold them
+  store.GROUP=float16|uint8  means, shape, density, colour or all as 16-bit floats, or 8-bit codes, hold them
 `neuprim tradeoff RUN_DIR` measures what they cost and gain."""
 
 

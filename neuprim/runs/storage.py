@@ -6,6 +6,7 @@ values are rounded to what the format brings back, and its bytes are counted.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from neuprim.core.checkpoint import read_header
 from neuprim.core.compressed import is_compressed
+from neuprim.core.compressed.columns import fit_columns
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.model.primitives import Primitives
@@ -37,12 +39,27 @@ class Format:
     bytes: Callable[[Tensor], int]
 
 
+_BITS = 8
+
+
+def _codes(value: Tensor) -> Tensor:
+    """(N, ...) as even steps between the ends of every column bring it back, as compressed files do."""
+    flat = value.detach().cpu().reshape(len(value), math.prod(value.shape[1:]))
+    columns = fit_columns(flat, [_BITS] * flat.shape[1])
+    return columns.values(columns.codes(flat)).reshape(value.shape).to(value)
+
+
+def _code_bytes(value: Tensor) -> int:
+    return value.numel() + 8 * math.prod(value.shape[1:])  # two ends for a column
+
+
 FULL = "float32"
 """What model files hold."""
 
 FORMATS: Mapping[str, Format] = {
     FULL: Format("32-bit floats, as model files hold them", lambda value: value, lambda value: 4 * value.numel()),
     "float16": Format("16-bit floats, 11 bits of precision", lambda value: value.half().float(), lambda value: 2 * value.numel()),
+    "uint8": Format("8-bit codes, even steps between the ends of each column", _codes, _code_bytes),
 }
 
 

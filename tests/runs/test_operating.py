@@ -54,7 +54,7 @@ POINTS = st.builds(
     st.dictionaries(st.just(("colour", "degree")), st.integers(0, 2)).flatmap(
         lambda found: st.dictionaries(st.just(("density", "neurons")), st.sampled_from((3, 2, 1, 0))).map(lambda more: {**found, **more})
     ),
-    st.dictionaries(st.sampled_from(storage.GROUPS), st.just("float16")),
+    st.dictionaries(st.sampled_from(storage.GROUPS), st.sampled_from(["float16", "uint8"])),
 )
 
 
@@ -132,6 +132,17 @@ def test_bytes_are_those_of_a_file_that_holds_it_so(model: Primitives, run_dir: 
     less = evaluate_run(run_dir, words=["colour.degree=1", "density.neurons=2"])
     assert less["model_bytes"] == path.stat().st_size - stored_bytes(model, {}) + stored_bytes(reduced, smaller.stored)
     assert less["parameters"] == reduced.count * reduced.parameters_per_primitive
+
+
+def test_eight_bits_are_even_steps_between_the_ends_of_each_column(model: Primitives) -> None:
+    point = read_point(["store.colour=uint8"], RenderSettings(), model)
+    before, after = (m.params["sh_dc"] for m in (model, point.applied(model)))
+    steps = (before.amax(0) - before.amin(0)) / 255
+    assert 0 < float(((after - before).abs() / steps).max()) <= 3.1  # ends may leave out a few numbers
+    assert len(after[:, 0].unique()) <= 256
+    numbers = sum(model.params[name].numel() for name in ("sh_dc", "sh_rest"))
+    columns = sum(model.params[name][0].numel() for name in ("sh_dc", "sh_rest"))
+    assert stored_bytes(model, point.stored) == stored_bytes(model, {}) - 3 * numbers + 8 * columns
 
 
 def test_another_row_is_another_format(model: Primitives, monkeypatch: pytest.MonkeyPatch) -> None:

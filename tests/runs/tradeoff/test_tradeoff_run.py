@@ -65,7 +65,7 @@ def test_every_step_of_every_knob_is_measured(measured: tuple[Path, Record]) -> 
     _, _, model, _ = load_run(run_dir)
     found = [point.knob for point in record.points]
     assert record.reference.words == () and found[0] == "reference"
-    assert found.count("alpha_min") == 7 and found.count("resolution") == 3 and found.count("store") == 5
+    assert found.count("alpha_min") == 7 and found.count("resolution") == 3 and found.count("store") == 10
     assert found.count("colour.degree") == 3 and found.count("density.neurons") == 4 and "combined" in found
     assert len({point.words for point in record.points}) == len(record.points)
     for point in record.points:

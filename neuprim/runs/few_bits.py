@@ -38,7 +38,8 @@ def train_for(
         if steps is None:
             steps = steps_in(seconds, config, task, dataset, model)
         whole = folded(model)
-        made, judge = schemes(whole, table), Judge(dataset, config.renderer)
+        inside = config.train.supervision != "images" and dataset.points is not None
+        made, judge = schemes(whole, table), Judge(dataset, config.renderer, inside)
         before = judge(_read_back(whole, made))
         trainer = fine_tuner(config, task, dataset, whole, steps)
         trainer.zeros = zeros_of(trainer.model)

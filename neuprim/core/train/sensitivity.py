@@ -15,25 +15,29 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neuprim.core.data import Dataset
+from neuprim.core.compute import device
+from neuprim.core.data import Dataset, PointSamples
 from neuprim.core.model.fields import pieces_by_name
 from neuprim.core.model.pieces import worth
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
+from neuprim.core.volumes.points import values_at
 
-__all__ = ["Sensitivity", "sensitivity"]
+__all__ = ["Sensitivity", "inner_sensitivity", "sensitivity"]
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Mean squared effects over the pixels and channels of some views.
+    """Mean squared effects over the pixels and channels of some views, or over points.
 
     Attributes:
-        whole: (N,) of each primitive, for a difference of colour of 1 from what is behind it.
+        whole: (N,) of each primitive being gone; in views, for a difference of colour of 1 from what is behind it.
+        seen: (N,) in how many of the views, or frames, a primitive was; of those in none nothing is known.
         pieces: name -> (N,) of each primitive's piece being zero.
     """
 
     whole: Tensor
+    seen: Tensor
     pieces: dict[str, Tensor]
 
 
@@ -46,7 +50,7 @@ def sensitivity(model: Primitives, dataset: Dataset, views: Sequence[int], setti
     """
     generator = torch.Generator().manual_seed(seed)
     pieces = pieces_by_name(model.density, model.colour)
-    whole = torch.zeros(model.count)
+    whole, there = torch.zeros(model.count), torch.zeros(model.count, dtype=torch.int64)
     found = {name: torch.zeros(model.count) for name in pieces}
     background, numbers = dataset.background.float(), 0
     for index in views:
@@ -58,9 +62,38 @@ def sensitivity(model: Primitives, dataset: Dataset, views: Sequence[int], setti
         tally = output.watch(signs[..., 0])
         (output.rgb * signs).sum().backward()
         gradients = {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()}
-        _, signed = tally.of_all(model.count)
+        weight, signed = tally.of_all(model.count)
+        there += (weight > 0).cpu()
         whole += signed.cpu().square() * output.rgb.shape[-1]
         for name, piece in pieces.items():
             found[name] += worth(piece, params, gradients).square().cpu()
         numbers += output.rgb.numel()
-    return Sensitivity(whole / numbers, {name: value / numbers for name, value in found.items()})
+    return Sensitivity(whole / numbers, there, {name: value / numbers for name, value in found.items()})
+
+
+def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: int = 0, threads: int = 0) -> Sensitivity:
+    """Effects on the extinction at points, in units of its typical size: what images do not show of a volume that is known inside.
+
+    Args:
+        draws: points of some frames.
+        seed, threads: of the random signs; of the backward pass, 0 for all cores.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    pieces = pieces_by_name(model.density, model.colour)
+    whole, there = torch.zeros(model.count), torch.zeros(model.count, dtype=torch.int64)
+    found = {name: torch.zeros(model.count) for name in pieces}
+    for samples in draws:
+        params = {name: value.detach().requires_grad_() for name, value in model.params.items()}
+        values = values_at(Primitives(model.density, model.colour, params), samples.conditions, samples.points, False, threads)
+        signs = (2 * torch.randint(0, 2, (len(samples.points),), generator=generator) - 1).float()
+        signs = device.from_host(signs / samples.sigma_scale / len(signs) ** 0.5, values.sigma.device)
+        shares = values.watch(signs)
+        (values.sigma * signs).sum().backward()
+        rows = torch.arange(model.count) if values.rows is None else values.rows.cpu()
+        whole[rows] += shares.error_weight.cpu().square()
+        there[rows] += (shares.weight > 0).cpu()
+        gradients = {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()}
+        for name, piece in pieces.items():
+            found[name] += worth(piece, params, gradients).square().cpu()
+    count = max(len(draws), 1)
+    return Sensitivity(whole / count, there, {name: value / count for name, value in found.items()})

@@ -12,11 +12,12 @@ from neuprim.core.model.less import with_less
 from neuprim.core.model.pieces import Piece, alive, numbers_of, without
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.sensitivity import Sensitivity
+from neuprim.runs.prune.judge import Judge
 
-__all__ = ["cut_to", "numbers", "steps_down", "zeros_of"]
+__all__ = ["cut_to", "numbers", "priced", "steps_down", "zeros_of"]
 
 _CONTRAST = 0.05
-"""Mean square of a primitive's difference of colour from what is behind it, to begin with; :func:`cut_to` measures it."""
+"""Mean square of a primitive's difference of colour from what is behind it, to begin with; :func:`priced` measures it."""
 
 _PROBE = 0.02
 """Share of the primitives whose removal tells the contrast."""
@@ -53,25 +54,35 @@ def steps_down(model: Primitives) -> list[tuple[str, str, int]]:
     return sorted(words, key=lambda word: with_less(model, *word).parameters_per_primitive)
 
 
-def cut_to(model: Primitives, effects: Sensitivity, quality: Callable[[Primitives], float], loss: float) -> Primitives:
+def cut_to(model: Primitives, prices: Sensitivity, quality: Callable[[Primitives], float], loss: float) -> Primitives:
     """The model without whatever is worth less than some price per number, the price being what loses ``loss`` dB now.
 
     Args:
-        effects: of this model.
+        prices: of this model, see :func:`priced`.
         quality: dB of a model on a few views.
     """
     start = quality(model)
-    contrast = _contrast(model, effects, quality, start)
-    low, high = 0.0, _dearest(model, effects, contrast)
-    best = _at(model, effects, contrast, 0.0)
+    low, high = 0.0, _dearest(model, prices)
+    best = _at(model, prices, 0.0)
     for _ in range(_HALVINGS):
         price = (max(low, high * 1e-9) * high) ** 0.5
-        tried = _at(model, effects, contrast, price)
+        tried = _at(model, prices, price)
         if tried.count and start - quality(tried) <= loss:
             best, low = tried, price
         else:
             high = price
     return best
+
+
+def priced(model: Primitives, views: Sensitivity, inside: Sensitivity | None, judge: Judge) -> Sensitivity:
+    """Mean squared changes of the views without each primitive and piece, for the differences of colour that there are; what changes inside
+    counts as much as it is of the error inside, beside that of the views."""
+    whole = views.whole * _contrast(model, views, lambda m: judge.images(m, quick=True))
+    if inside is None:
+        return Sensitivity(whole, views.seen, views.pieces)
+    scale = 10 ** ((judge.inside(model) - judge.images(model)) / 10)  # the mean square of the views over that inside
+    pieces = {name: value + scale * inside.pieces[name] for name, value in views.pieces.items()}
+    return Sensitivity(whole + scale * inside.whole, views.seen + inside.seen, pieces)
 
 
 def _share(model: Primitives) -> tuple[Tensor, dict[str, Tensor], dict[str, int]]:
@@ -85,29 +96,30 @@ def _share(model: Primitives) -> tuple[Tensor, dict[str, Tensor], dict[str, int]
     return own, there, sizes
 
 
-def _at(model: Primitives, effects: Sensitivity, contrast: float, price: float) -> Primitives:
+def _at(model: Primitives, prices: Sensitivity, price: float) -> Primitives:
     own, there, sizes = _share(model)
-    kept = (effects.whole * contrast / own >= price).nonzero()[:, 0]
+    known = prices.seen > 0
+    kept = (~known | (prices.whole / own >= price)).nonzero()[:, 0]
     pieces = _pieces(model)
-    gone = {name: (pieces[name], (effects.pieces[name] / max(sizes[name], 1) < price) & there[name]) for name in pieces}
+    gone = {name: (pieces[name], (prices.pieces[name] / max(sizes[name], 1) < price) & there[name] & known) for name in pieces}
     rows = Primitives(model.density, model.colour, without(gone, model.params)).rows(kept.to(model.device))
     return Primitives(model.density, model.colour, rows)
 
 
-def _dearest(model: Primitives, effects: Sensitivity, contrast: float) -> float:
+def _dearest(model: Primitives, prices: Sensitivity) -> float:
     own, _, sizes = _share(model)
-    dear = [effects.whole * contrast / own, *(effects.pieces[name] / max(size, 1) for name, size in sizes.items())]
-    return max(1e-30, *(float(prices.max()) for prices in dear if len(prices)))
+    dear = [prices.whole / own, *(prices.pieces[name] / max(size, 1) for name, size in sizes.items())]
+    return max(1e-30, *(float(each.max()) for each in dear if len(each)))
 
 
-def _contrast(model: Primitives, effects: Sensitivity, quality: Callable[[Primitives], float], start: float) -> float:
+def _contrast(model: Primitives, effects: Sensitivity, quality: Callable[[Primitives], float]) -> float:
     """Mean squared difference of colour, from what removing the least primitives costs."""
     count = max(int(_PROBE * model.count), 1)
-    order = effects.whole.argsort(stable=True)
+    order = effects.whole.where(effects.seen > 0, torch.inf).argsort(stable=True)
     kept = order[count:].sort().values
     if not len(kept):
         return _CONTRAST
-    found = quality(Primitives(model.density, model.colour, model.rows(kept.to(model.device))))
+    start, found = quality(model), quality(Primitives(model.density, model.colour, model.rows(kept.to(model.device))))
     more = 10 ** (-found / 10) - 10 ** (-start / 10)
     expected = float(effects.whole[order[:count]].sum())
     return min(max(more / expected, 1e-4), 1.0) if expected > 0 and more > 0 else _CONTRAST

@@ -10,9 +10,9 @@ from neuprim.core.data import Dataset
 from neuprim.core.model.less import with_less
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
-from neuprim.core.train.sensitivity import sensitivity
+from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
 from neuprim.runs.finetune import fine_tuner
-from neuprim.runs.prune.cut import cut_to, numbers, steps_down, zeros_of
+from neuprim.runs.prune.cut import cut_to, numbers, priced, steps_down, zeros_of
 from neuprim.runs.prune.judge import Judge
 
 __all__ = ["ROUNDS", "Search", "Stage"]
@@ -96,7 +96,8 @@ class Search:
     base: float = 0.0
 
     def __post_init__(self) -> None:
-        self.judge, self._looks = Judge(self.dataset, self.config.renderer), 0
+        inside = self.config.train.supervision != "images" and self.dataset.points is not None
+        self.judge, self._looks = Judge(self.dataset, self.config.renderer, inside), 0
 
     def __call__(self, model: Primitives) -> tuple[Primitives, tuple[str, ...]]:
         """The smallest model found whose judged views are at most the tolerance worse, and the words for what its fields have less of."""
@@ -156,8 +157,10 @@ class Search:
         if loss <= 0:
             return model
         self._looks += 1
-        effects = sensitivity(model, self.dataset, self.judge.others, self.config.renderer, seed=self._looks)
-        return cut_to(model, effects, quality, loss)
+        settings, draws = self.config.renderer, self.judge.draws
+        views = sensitivity(model, self.dataset, self.judge.others, settings, seed=self._looks)
+        inside = inner_sensitivity(model, draws, seed=self._looks, threads=settings.threads) if draws else None
+        return cut_to(model, priced(model, views, inside, self.judge), quality, loss)
 
     def _trained(self, state: _State, number: int, rounds: int) -> _State:
         """The state after the round's steps."""

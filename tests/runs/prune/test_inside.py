@@ -79,7 +79,7 @@ def test_what_is_lost_inside_counts_as_what_is_lost_in_images() -> None:
     assert abs(judge.images(less) - judge.images(off)) < 0.01  # no image shows them
     assert judge(less) < start - 3.0
     assert judge(less) == pytest.approx(start + judge.inside(less) - judge.inside(off))
-    worse = Primitives(model.density, model.colour, {**off.params, "sh_dc": off.params["sh_dc"] + 1.0})
+    worse = Primitives(model.density, model.colour, {**off.params, "sh_dc": off.params["sh_dc"] - 1.0})
     assert judge(worse) == pytest.approx(judge.images(worse))  # inside nothing changed
 
 

@@ -25,6 +25,12 @@ def misplaced(tests: Path, package: Path) -> list[str]:
     return sorted(f.as_posix() for f in found if (package / f.parent / f.stem.removeprefix("test_") / "__init__.py").exists())
 
 
+def test_no_two_files_of_tests_have_one_name() -> None:
+    """Folders of tests are no packages, so that the second of a name could not be collected."""
+    names = [f.name for f in TESTS.rglob("test_*.py") if not any("-" in part for part in f.relative_to(TESTS).parts)]
+    assert sorted(name for name in set(names) if names.count(name) > 1) == []
+
+
 def test_every_folder_of_tests_is_one_of_the_package() -> None:
     assert folders(TESTS, PACKAGE) == []
     assert all((TESTS / name).is_dir() and not (PACKAGE / name).exists() for name in OTHERS)

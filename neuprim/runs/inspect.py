@@ -31,7 +31,7 @@ from neuprim.plugins.inspect.page import write_page
 from neuprim.plugins.inspect.window import Window, panels_of
 from neuprim.plugins.registry import INSPECTORS, PluginError, load_inspector
 from neuprim.runs.events import Events, Note, silent
-from neuprim.runs.kept import kept_pieces, kept_words
+from neuprim.runs.kept import PRUNED, kept_pieces, kept_words
 from neuprim.runs.open import open_run
 
 __all__ = ["OUTPUTS", "Request", "inspect_run"]
@@ -193,8 +193,9 @@ class _Film:
         low, high = ([round(x, 4) for x in corner] for corner in np.asarray(box).tolist())
         on = f"{' x '.join(map(str, self.shape))} points from {low} to {high} scene units"
         events(Note(f"extinction of {self.model.count} primitives on {on}, in 1/scene unit, each primitive clamped at 0 from below"))
-        for line in kept_words(kept_pieces(self.model)):
-            events(Note(line))
+        if (request.run_dir / PRUNED).exists():
+            for line in kept_words(kept_pieces(self.model)):
+                events(Note(line))
 
     def __len__(self) -> int:
         return len(self.pairs)

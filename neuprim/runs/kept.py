@@ -6,7 +6,10 @@ from neuprim.core.model.fields import pieces_by_name
 from neuprim.core.model.pieces import alive
 from neuprim.core.model.primitives import Primitives
 
-__all__ = ["kept_pieces", "kept_words"]
+__all__ = ["PRUNED", "kept_pieces", "kept_words"]
+
+PRUNED = "pruned.json"
+"""Of the directory of a pruned model: how it came to be."""
 
 
 def kept_pieces(model: Primitives) -> dict[str, float]:

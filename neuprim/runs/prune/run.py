@@ -24,17 +24,14 @@ from neuprim.core.train.trainer import Trainer
 from neuprim.runs.finetune import steps_in
 from neuprim.runs.finish import finish
 from neuprim.runs.fit import Fitted, make_loss, one_torch_thread, settings_for
-from neuprim.runs.kept import kept_pieces
+from neuprim.runs.kept import PRUNED, kept_pieces
 from neuprim.runs.measure import draw, measure
 from neuprim.runs.open import LOGS, load_dataset, load_run, model_file, placed, read_metrics
 from neuprim.runs.prune.cut import numbers, zeros_of
 from neuprim.runs.prune.search import Search, Stage
 from neuprim.runs.training import save
 
-__all__ = ["FILE", "Pruning", "Request", "prune_run"]
-
-FILE = "pruned.json"
-"""Of the directory of what is left: how it came to be."""
+__all__ = ["Pruning", "Request", "prune_run"]
 
 _TURNS = 12
 """Frames that tell how fast a model is drawn."""
@@ -128,7 +125,7 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
         metrics = read_metrics(final)
         after = _facts(small, final / "model.safetensors", (metrics["psnr"], metrics["ssim"]), paces[1])
     made = Pruning(final, before, after, words, kept_pieces(small), judged, tuple(search.stages), steps, seconds)
-    write_json(final / FILE, _record(request, made))
+    write_json(final / PRUNED, _record(request, made))
     return made
 
 
@@ -194,7 +191,7 @@ def _written(
 
 
 def _record(request: Request, made: Pruning) -> dict[str, Any]:
-    """The content of :data:`FILE`."""
+    """The content of :data:`~neuprim.runs.kept.PRUNED`."""
     return {
         "format": 1,
         "pruned_from": str(request.run_dir),

@@ -18,16 +18,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from shared.tables import Table, spread
 
 from neuprim.config import RunConfig
-from neuprim.core.channels import channels_of
 from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compressed import LEVELS, bit_table
 from neuprim.core.compute.machine import cpu_name
 from neuprim.core.model.primitives import Primitives
-from neuprim.runs.measure import measure
+from neuprim.runs.measure import quality
 from neuprim.runs.open import load_dataset, load_run
 
 RESULTS = Path(__file__).parent / "results" / "compress.json"
@@ -44,8 +42,7 @@ class Run:
 
     def measured(self, model: Primitives) -> dict[str, float]:
         """PSNR and SSIM, means over the held-out views."""
-        views = measure(model, self.task, self.dataset, self.config.renderer, channels_of(self.task, self.dataset))
-        return {name: float(np.mean([getattr(v, name) for v in views])) for name in ("psnr", "ssim")}
+        return dict(zip(("psnr", "ssim"), quality(model, self.task, self.dataset, self.config.renderer), strict=True))
 
     def compressed(self, level: int, words: Sequence[str], alone: str | None = None) -> dict[str, Any]:
         """What becomes of it at a level, under words NAME=BITS."""

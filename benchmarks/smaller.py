@@ -29,8 +29,7 @@ import numpy as np
 import torch
 from shared.tables import ROOT, Table, between_markers, spread
 
-from neuprim.config import compose, task_of
-from neuprim.core.channels import channels_of
+from neuprim.config import compose
 from neuprim.core.compute.machine import cpu_name
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
@@ -38,7 +37,7 @@ from neuprim.core.render import render
 from neuprim.core.train.sensitivity import sensitivity
 from neuprim.runs.compress import compress_run
 from neuprim.runs.finetune import fine_tuner
-from neuprim.runs.measure import measure
+from neuprim.runs.measure import quality
 from neuprim.runs.open import load_dataset, load_run, read_metrics
 from neuprim.runs.prune.judge import Judge
 from neuprim.runs.prune.run import Request, prune_run
@@ -117,13 +116,8 @@ def scene_of(scene: str, data: Path | None, seed: int, known: list[str], send: A
         trainer = fine_tuner(config, task, dataset, model, PRUNED)
         for _ in range(PRUNED):
             trainer.train_step()
-        psnr, ssim = quality(config, dataset, trainer.model)
+        psnr, ssim = quality(trainer.model, task, dataset, config.renderer)
         tell("trained as long", 4 * model.count * model.parameters_per_primitive, psnr, ssim, begun)
-
-
-def quality(config: Any, dataset: Dataset, model: Primitives) -> tuple[float, float]:
-    views = measure(model, task_of(config), dataset, config.renderer, channels_of(task_of(config), dataset))
-    return float(np.mean([v.psnr for v in views])), float(np.mean([v.ssim for v in views]))
 
 
 def orders(folder: Path, share: float = 0.05) -> None:

@@ -7,10 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from neuprim.config import RunConfig, suspects_of
-from neuprim.core.channels import channels_of
 from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compressed import USUAL_LEVEL, bit_table
 from neuprim.core.data import Dataset
@@ -20,8 +17,8 @@ from neuprim.core.io.drafts import refuse_taken
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.runs.few_bits import train_for
-from neuprim.runs.measure import measure
-from neuprim.runs.open import COMPRESSED, LOGS, load_dataset, load_run, placed
+from neuprim.runs.measure import quality
+from neuprim.runs.open import COMPRESSED, LOGS, load_dataset, load_run
 
 __all__ = ["Compression", "StoredParameter", "compress_run"]
 
@@ -136,8 +133,5 @@ def _costs(
         suspects.know(dataset)
         for i, (text, tried) in enumerate((("before", model), ("after", again))):
             progress(f"measuring {text}", i / 2)
-            views = measure(
-                placed(tried, config.renderer, dataset.test.view(0)), task, dataset, config.renderer, channels_of(task, dataset)
-            )
-            found.append({"psnr": float(np.mean([v.psnr for v in views])), "ssim": float(np.mean([v.ssim for v in views]))})
-    return {name: (found[0][name], found[1][name]) for name in found[0]}
+            found.append(quality(tried, task, dataset, config.renderer))
+    return {name: (found[0][i], found[1][i]) for i, name in enumerate(("psnr", "ssim"))}

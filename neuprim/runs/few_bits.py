@@ -14,7 +14,7 @@ from neuprim.core.task import TaskSpec
 from neuprim.runs.finetune import fine_tuner, steps_in
 from neuprim.runs.fit import one_torch_thread
 from neuprim.runs.prune.cut import zeros_of
-from neuprim.runs.prune.judge import Judge
+from neuprim.runs.prune.judge import judge_of
 
 __all__ = ["train_for"]
 
@@ -38,8 +38,7 @@ def train_for(
         if steps is None:
             steps = steps_in(seconds, config, task, dataset, model)
         whole = folded(model)
-        inside = config.train.supervision != "images" and dataset.points is not None
-        made, judge = schemes(whole, table), Judge(dataset, config.renderer, inside)
+        made, judge = schemes(whole, table), judge_of(config, dataset)
         before = judge(_read_back(whole, made))
         trainer = fine_tuner(config, task, dataset, whole, steps)
         trainer.zeros = zeros_of(trainer.model)

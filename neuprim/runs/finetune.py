@@ -19,12 +19,11 @@ BEGIN = 0.8
 
 START, COOL = 3.0, 0.02
 """The rates at the first step over those at the end of the run, and those at the last step over these at the first: with next to none at the end, numbers
-settle, which is worth 0.15 dB of a trained chair by itself and decides where numbers are rounded."""
-
+settle, which is worth something by itself (row "trained as long" of docs/tradeoffs.md) and decides where numbers are rounded."""
 
 VOXELS_EVERY = 4
-"""Steps between two looks at voxels, at most, where a run learned from them. In 400 steps of a fire with looks in every sixteenth, as in a whole run, the
-extinction's error rose from 0.146 to 0.235 in its first frame, which few looks meet; with these to 0.18, and others fell."""
+"""Steps between two looks at voxels, at most, where a run learned from them: in a few hundred steps with looks as rare as in a whole run some frames are
+hardly met, and their extinction drifts for the sake of the images."""
 
 _WARM, _PACED = 5, 20
 """Steps before the pace is taken, and those that it is taken of."""

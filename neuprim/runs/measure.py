@@ -39,7 +39,7 @@ from neuprim.runs.operating import read_point
 from neuprim.runs.storage import file_bytes
 from neuprim.version import __version__
 
-__all__ = ["ViewMetrics", "draw", "draw_sum", "evaluate_run", "measure", "summary"]
+__all__ = ["ViewMetrics", "draw", "draw_sum", "evaluate_run", "measure", "quality", "summary"]
 
 
 @dataclass(frozen=True)
@@ -129,6 +129,12 @@ def measure(
         if seen is not None:
             seen(i, view, rendered, truth)
     return result
+
+
+def quality(model: Primitives, task: TaskSpec, dataset: Dataset, settings: RenderSettings) -> tuple[float, float]:
+    """Mean PSNR and SSIM of the held-out views, as ``metrics.json`` has them, drawn where such views are best drawn."""
+    views = measure(placed(model, settings, dataset.test.view(0)), task, dataset, settings, channels_of(task, dataset))
+    return float(np.mean([v.psnr for v in views])), float(np.mean([v.ssim for v in views]))
 
 
 def _more(

@@ -19,7 +19,7 @@ import numpy as np
 from neuprim.config import RunConfig, made_now, suspects_of, task_of
 from neuprim.core.data import Dataset
 from neuprim.core.errors import DataError
-from neuprim.core.io.files import write_json
+from neuprim.core.io.files import read_json, write_json
 from neuprim.core.metrics import from_json, psnr, ssim, to_json
 from neuprim.runs.curve import read_curve
 from neuprim.runs.events import Events, Finishing, Note, silent
@@ -204,12 +204,9 @@ def _whole(folder: Path) -> bool:
 
 
 def _read(file: Path) -> dict[str, Any] | None:
-    try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    data = read_json(file, "the record of a trial", "delete its folder to train anew")
+    if data is None:
         return None
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{file}: not the record of a trial ({error}); delete its folder to train anew") from error
     if not isinstance(data, dict) or not isinstance(data.get("asked"), dict) or "outcome" not in data or "views" not in data:
         raise DataError(f"{file}: not the record of a trial; delete its folder to train anew")
     if data.get("format") != FORMAT:

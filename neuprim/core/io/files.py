@@ -12,10 +12,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuprim.core.errors import DataError
+
 if TYPE_CHECKING:
     import numpy as np
 
-__all__ = ["atomic_path", "cache_directory", "publish_folder", "write_json", "write_npy", "write_text"]
+__all__ = ["atomic_path", "cache_directory", "publish_folder", "read_json", "write_json", "write_npy", "write_text"]
 
 
 def cache_directory() -> Path:
@@ -84,6 +86,26 @@ def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def read_json(path: Path, what: str, instead: str) -> Any:
+    """What a JSON file of ours holds; None where there is no file.
+
+    Args:
+        what, instead: for the message: what the file turned out not to be, and what the user can do.
+
+    Raises:
+        DataError: it cannot be read, or is no JSON.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: not {what} ({error}); {instead}") from error
+    if data is None:
+        raise DataError(f"{path}: not {what} (it holds null); {instead}")
+    return data
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -62,11 +62,12 @@ def cut_to(model: Primitives, prices: Sensitivity, quality: Callable[[Primitives
         quality: dB of a model on a few views.
     """
     start = quality(model)
-    low, high = 0.0, _dearest(model, prices)
-    best = _at(model, prices, 0.0)
+    share = _share(model)
+    low, high = 0.0, _dearest(prices, share)
+    best = _at(model, prices, share, 0.0)
     for _ in range(_HALVINGS):
         price = (max(low, high * 1e-9) * high) ** 0.5
-        tried = _at(model, prices, price)
+        tried = _at(model, prices, share, price)
         if tried.count and start - quality(tried) <= loss:
             best, low = tried, price
         else:
@@ -85,7 +86,10 @@ def priced(model: Primitives, views: Sensitivity, inside: Sensitivity | None, ju
     return Sensitivity(whole + scale * inside.whole, views.seen + inside.seen, pieces)
 
 
-def _share(model: Primitives) -> tuple[Tensor, dict[str, Tensor], dict[str, int]]:
+_Share = tuple[Tensor, dict[str, Tensor], dict[str, int]]
+
+
+def _share(model: Primitives) -> _Share:
     """(N,) numbers of each primitive that are not zero, and for each piece who has it and how many numbers it is."""
     pieces = _pieces(model)
     there = {name: alive(piece, model.params).cpu() for name, piece in pieces.items()}
@@ -96,8 +100,8 @@ def _share(model: Primitives) -> tuple[Tensor, dict[str, Tensor], dict[str, int]
     return own, there, sizes
 
 
-def _at(model: Primitives, prices: Sensitivity, price: float) -> Primitives:
-    own, there, sizes = _share(model)
+def _at(model: Primitives, prices: Sensitivity, share: _Share, price: float) -> Primitives:
+    own, there, sizes = share
     known = prices.seen > 0
     kept = (~known | (prices.whole / own >= price)).nonzero()[:, 0]
     pieces = _pieces(model)
@@ -106,8 +110,8 @@ def _at(model: Primitives, prices: Sensitivity, price: float) -> Primitives:
     return Primitives(model.density, model.colour, rows)
 
 
-def _dearest(model: Primitives, prices: Sensitivity) -> float:
-    own, _, sizes = _share(model)
+def _dearest(prices: Sensitivity, share: _Share) -> float:
+    own, _, sizes = share
     dear = [prices.whole / own, *(prices.pieces[name] / max(size, 1) for name, size in sizes.items())]
     return max(1e-30, *(float(each.max()) for each in dear if len(each)))
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import torch
 
+from neuprim.config import RunConfig
 from neuprim.core.data import Dataset, PointSamples, PointSupervision
 from neuprim.core.metrics import psnr
 from neuprim.core.model.primitives import Primitives
@@ -14,7 +15,7 @@ from neuprim.core.render import RenderSettings
 from neuprim.core.volumes.points import values_at
 from neuprim.runs.measure import draw
 
-__all__ = ["Judge"]
+__all__ = ["Judge", "judge_of"]
 
 _JUDGED, _QUICK = 24, 8
 """Views that decide, and how many of them a search in between looks at."""
@@ -31,6 +32,11 @@ _FRAMES, _QUICK_FRAMES, _POINTS = 64, 8, 4096
 
 _DRAWS = 6
 """Draws for each such frame: each is of any frame, and most frames are to be there once."""
+
+
+def judge_of(config: RunConfig, dataset: Dataset) -> Judge:
+    """What judges a run's model: points inside, too, where it learned from them."""
+    return Judge(dataset, config.renderer, config.train.supervision != "images" and dataset.points is not None)
 
 
 class Judge:

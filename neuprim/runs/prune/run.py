@@ -25,7 +25,7 @@ from neuprim.runs.finetune import steps_in
 from neuprim.runs.finish import finish
 from neuprim.runs.fit import Fitted, make_loss, one_torch_thread, settings_for
 from neuprim.runs.kept import PRUNED, kept_pieces
-from neuprim.runs.measure import draw, measure
+from neuprim.runs.measure import draw, quality
 from neuprim.runs.open import LOGS, load_dataset, load_run, model_file, placed, read_metrics
 from neuprim.runs.prune.cut import numbers, zeros_of
 from neuprim.runs.prune.search import Search, Stage
@@ -115,11 +115,13 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
         seconds = time.monotonic() - begun
         judged = (search.base, search.judge(small))
         if numbers(small) >= numbers(model):
-            there = _facts(model, model_file(request.run_dir), _quality(config, task, dataset, model), _paces(config, dataset, (model,))[0])
+            there = _facts(
+                model, model_file(request.run_dir), quality(model, task, dataset, config.renderer), _paces(config, dataset, (model,))[0]
+            )
             return Pruning(None, there, there, (), kept_pieces(model), judged, tuple(search.stages), steps, seconds)
         progress("measuring held-out views", 1.0)
         paces = _paces(config, dataset, (model, small))
-        before = _facts(model, model_file(request.run_dir), _quality(config, task, dataset, model), paces[0])
+        before = _facts(model, model_file(request.run_dir), quality(model, task, dataset, config.renderer), paces[0])
         progress("pictures and report", 1.0)
         _written(final, config, task, dataset, small, words, header, steps, seconds)
         metrics = read_metrics(final)
@@ -130,12 +132,6 @@ def prune_run(request: Request, progress: Callable[[str, float], None] = lambda 
 
 
 # ---------------------------------------------------------------- parts
-
-
-def _quality(config: RunConfig, task: TaskSpec, dataset: Dataset, model: Primitives) -> tuple[float, float]:
-    """Mean PSNR and SSIM of the held-out views."""
-    views = measure(placed(model, config.renderer, dataset.test.view(0)), task, dataset, config.renderer, channels_of(task, dataset))
-    return float(np.mean([v.psnr for v in views])), float(np.mean([v.ssim for v in views]))
 
 
 def _paces(config: RunConfig, dataset: Dataset, models: Sequence[Primitives]) -> list[float]:
@@ -152,9 +148,9 @@ def _paces(config: RunConfig, dataset: Dataset, models: Sequence[Primitives]) ->
     return [1.0 / max(float(np.median(own)), 1e-9) for own in seconds]
 
 
-def _facts(model: Primitives, file: Path, quality: tuple[float, float], pace: float) -> dict[str, float]:
+def _facts(model: Primitives, file: Path, found: tuple[float, float], pace: float) -> dict[str, float]:
     facts = {"primitives": model.count, "numbers": numbers(model), "bytes": file.stat().st_size}
-    return {**facts, "psnr": quality[0], "ssim": quality[1], "frames_per_second": pace}
+    return {**facts, "psnr": found[0], "ssim": found[1], "frames_per_second": pace}
 
 
 def _written(

@@ -13,7 +13,7 @@ from neuprim.core.task import TaskSpec
 from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
 from neuprim.runs.finetune import fine_tuner
 from neuprim.runs.prune.cut import cut_to, numbers, priced, steps_down, zeros_of
-from neuprim.runs.prune.judge import Judge
+from neuprim.runs.prune.judge import judge_of
 
 __all__ = ["ROUNDS", "Search", "Stage"]
 
@@ -96,8 +96,7 @@ class Search:
     base: float = 0.0
 
     def __post_init__(self) -> None:
-        inside = self.config.train.supervision != "images" and self.dataset.points is not None
-        self.judge, self._looks = Judge(self.dataset, self.config.renderer, inside), 0
+        self.judge, self._looks = judge_of(self.config, self.dataset), 0
 
     def __call__(self, model: Primitives) -> tuple[Primitives, tuple[str, ...]]:
         """The smallest model found whose judged views are at most the tolerance worse, and the words for what its fields have less of."""
@@ -167,11 +166,11 @@ class Search:
         model, steps = state.model, self.steps * (number + 1) // rounds - self.steps * number // rounds
         if steps and model.count:
             trainer = fine_tuner(self.config, self.task, self.dataset, model, steps)
-            trainer.zeros = zeros_of(trainer.model)
+            trainer.zeros, left = zeros_of(trainer.model), numbers(model)
             for done in range(steps):
                 trainer.train_step()
                 if done % 20 == 0:
-                    self.progress(f"training what is left, {numbers(model):,} numbers", (number + done / steps) / rounds)
+                    self.progress(f"training what is left, {left:,} numbers", (number + done / steps) / rounds)
             model = Primitives(model.density, model.colour, {name: value.detach() for name, value in trainer.model.params.items()})
         found = self.judge(model) if steps else state.cut
         return replace(state, model=model, lost=self.base - found, rounds=state.rounds + 1)

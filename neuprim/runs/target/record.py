@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.files import write_json
+from neuprim.core.io.files import read_json, write_json
 
 __all__ = ["FILE", "Attempt", "Purpose", "Record", "Turn", "read_record"]
 
@@ -137,12 +136,9 @@ def read_record(folder: Path) -> Record | None:
         DataError: the file is not one.
     """
     file = folder / FILE
-    try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    data = read_json(file, "the record of a target run", "delete it to search anew")
+    if data is None:
         return None
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{file}: not the record of a target run ({error}); delete it to search anew") from error
     try:
         if data["format"] != FORMAT:
             raise DataError(f"{file}: format {data['format']!r}; this neuprim reads {FORMAT}; delete it to search anew")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import shlex
 import statistics
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +13,7 @@ from types import MappingProxyType
 from typing import Any, Self
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.files import write_json, write_text
+from neuprim.core.io.files import read_json, write_json, write_text
 from neuprim.core.metrics import from_json, to_json
 from neuprim.runs.tradeoff.knobs import LeftOut
 
@@ -168,12 +167,9 @@ def read_record(path: Path, kind: type[Measured] = Measured) -> Record | None:
     Raises:
         DataError: the file is not one.
     """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    data = read_json(path, "a record of `neuprim tradeoff`", "delete it to measure anew")
+    if data is None:
         return None
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: not a record of `neuprim tradeoff` ({error}); delete it to measure anew") from error
     try:
         if data["format"] != FORMAT:
             raise DataError(f"{path}: format {data['format']!r}; this neuprim reads {FORMAT}; delete it to measure anew")

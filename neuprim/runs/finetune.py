@@ -44,6 +44,7 @@ def fine_tuner(config: RunConfig, task: TaskSpec, dataset: Dataset, model: Primi
         usual,
         iterations=whole,
         final_rate=final,
+        cooldown=0.0,
         rates={spec.name: scale * usual.rates.get(spec.name, spec.lr) for spec in copy.specs},
         max_seconds=None,
         coarse=1,

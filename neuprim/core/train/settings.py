@@ -110,6 +110,7 @@ class TrainSettings:
         exposure_rate: learning rate of a gain per training view and channel, for photographs that are not exposed alike, per step in
             which a view is seen; 0 for none. Held-out views are drawn with the training views' mean gain.
         final_rate: the rates decay exponentially to this fraction of themselves at the end of the budget; 1 is constant.
+        cooldown: the last share of the budget, over which the rates also fall linearly to next to nothing, so that numbers settle; 0 for none.
         adam_beta2: decay of Adam's second moment per step, in [0, 1).
         warmup_steps: steps over which the rates rise linearly from zero.
         supervision: what is learned from: "images", "voxels" (points of the files that the images were made of, where the data set has
@@ -137,6 +138,7 @@ class TrainSettings:
     rates: dict[str, NotNegative] = field(default_factory=dict)
     rate_units: dict[str, RateUnit] = field(default_factory=dict)
     final_rate: Annotated[float, Range(above=0, at_most=1)] = 0.05
+    cooldown: Share = 0.0
     adam_beta2: Annotated[float, Range(at_least=0, below=1)] = 0.999
     warmup_steps: Annotated[int, Range(at_least=0)] = 0
     supervision: Literal["auto", "images", "voxels", "both"] = "images"

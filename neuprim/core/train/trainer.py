@@ -37,7 +37,10 @@ from neuprim.core.train.points import PointStep, point_step
 from neuprim.core.train.population import Change, make_population
 from neuprim.core.train.settings import TrainSettings
 
-__all__ = ["StepReport", "Trainer"]
+__all__ = ["COLD", "StepReport", "Trainer"]
+
+COLD = 0.02
+"""What a cool-down leaves of a rate."""
 
 
 @dataclass(frozen=True)
@@ -135,9 +138,11 @@ class Trainer:
         return self.progress >= 1.0
 
     def rates(self) -> dict[str, float]:
-        """Learning rate of every parameter now: warm-up, then exponential decay to ``final_rate`` at the end of the budget."""
+        """Learning rate of every parameter now: warm-up, exponential decay to ``final_rate`` at the end of the budget, cool-down."""
         s = self.settings
         factor = s.final_rate**self.progress
+        if self.progress > 1 - s.cooldown:
+            factor *= max((1 - self.progress) / s.cooldown, COLD)
         if self.step < s.warmup_steps:
             factor *= (self.step + 1) / s.warmup_steps
         unit = {"absolute": 1.0, "extent": self.dataset.extent}

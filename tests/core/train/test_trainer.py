@@ -22,7 +22,7 @@ from neuprim.core.task import Supervision
 from neuprim.core.train.initial import initial_model
 from neuprim.core.train.population.fixed import Fixed
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
-from neuprim.core.train.trainer import StepReport, Trainer
+from neuprim.core.train.trainer import COLD, StepReport, Trainer
 from neuprim.runs.measure import draw
 from tests.core import tiny
 
@@ -125,6 +125,25 @@ def test_rates(plain: Dataset) -> None:
     assert trainer.rates()["W1"] == pytest.approx(specs["W1"].lr * 0.1)
     trainer.step = 100
     assert trainer.rates()["b2"] == pytest.approx(0.5 * 0.01)
+
+
+def test_a_cool_down_is_a_line_from_the_usual_rate_to_next_to_nothing(plain: Dataset) -> None:
+    usual, cooled = (tiny.trainer(plain, 1000, final_rate=0.1, cooldown=share) for share in (0.0, 0.2))
+
+    def share_left(step: int) -> float:
+        usual.step = cooled.step = step
+        shares = {name: cooled.rates()[name] / rate for name, rate in usual.rates().items()}
+        assert len({round(x, 12) for x in shares.values()}) == 1, "all rates alike"
+        return shares["means"]
+
+    assert [share_left(step) for step in (0, 400, 800, 900, 950)] == pytest.approx([1, 1, 1, 0.5, 0.25])
+    assert [share_left(step) for step in (999, 1000)] == pytest.approx([COLD, COLD]), "never nothing: a step must move something"
+
+
+def test_without_a_cool_down_rates_end_where_they_decay_to(plain: Dataset) -> None:
+    trainer = tiny.trainer(plain, 100, final_rate=0.5, rates={"b2": 0.5})
+    trainer.step = 100
+    assert trainer.rates()["b2"] == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize("count", [1, 3])

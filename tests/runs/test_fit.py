@@ -30,14 +30,14 @@ def trained(scene: Path, tmp_path: Path, *more: str) -> tuple[int, int, list[str
 
 def test_a_share_of_the_primitives_is_there_at_first_and_all_at_the_end(scene: Path, tmp_path: Path) -> None:
     assert trained(scene, tmp_path, "train.population.grow_from=0.5", "train.population.every=10") == (20, 40, [])
-    assert trained(scene, tmp_path) == (40, 40, [])
+    assert trained(scene, tmp_path, "train.population.grow_from=1") == (40, 40, [])
 
 
 def test_a_count_that_is_not_reached_is_said(scene: Path, tmp_path: Path) -> None:
-    first, last, notes = trained(scene, tmp_path, "train.population.grow_from=0.25", "train.population.every=30")
-    assert (first, last) == (10, 20), "one intervention, and a primitive splits once"
+    first, last, notes = trained(scene, tmp_path, "train.population.grow_from=0.2", "train.population.every=30")
+    assert (first, last) == (8, 32), "two interventions, and a primitive splits once in each"
     assert notes == [
-        "20 primitives of model.primitives=40: too few interventions, or places with an error, to split for the others; see train.population.every"
+        "32 primitives of model.primitives=40: too few interventions, or places with an error, to split for the others; see train.population.every"
     ]
 
 

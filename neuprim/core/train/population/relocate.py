@@ -19,13 +19,17 @@ _GROWTH = 0.25
 """Share of the primitives that is born at once: a split costs quality that training has to win back. It is more where the count would else not be reached."""
 
 
+_PARTS = 3
+"""Of the time between ``start`` and ``stop``, at least, between which primitives are born while some are missing."""
+
+
 class Relocate(Population):
     """Primitives with the least total weight move to where weight x error is largest, and as many are born there as are still missing.
 
     The busiest primitive splits in two by the exact rule, one child in its own row and one in the idle row. A split costs more than it
     brings once the idle ones are used up (children cover each other and not all of their parent): ``idle`` says who may move. Where there are
     fewer primitives than ``grow_to``, further ones split without an idle row, a quarter of all at a time, or as many as the interventions that are
-    left need to reach it.
+    left need to reach it; budgets that are over before that have their interventions sooner.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:
@@ -35,6 +39,13 @@ class Relocate(Population):
         self._left = math.inf
 
     def due(self, step: int, progress: float) -> bool:
+        s = self.settings
+        share = (s.stop - s.start) / _PARTS
+        if self.weight is not None and len(self.weight) < (s.grow_to or 0) and 0 < share * step < s.every * progress:
+            # a budget so short that ``every`` would leave it without its primitives, or with all of them born at once
+            now, before = ((p - s.start) // share for p in (progress, progress * (step - 1) / step))
+            self._left = max(_PARTS - 1 - now, 0.0)
+            return before < now and 0 < now and before < _PARTS - 1
         due = super().due(step, progress)
         if due:
             further = (self.settings.stop - progress) / progress * step / self.settings.every if progress > 0 else math.inf
@@ -66,7 +77,7 @@ class Relocate(Population):
         idle = idle[~busy[idle]][:budget]
         if self.settings.idle is not None:
             idle = idle[weight[idle] < self.settings.idle * weight.mean()]
-        moves = min(len(idle), budget)
+        moves = min(len(idle), budget, max(count - births, 0))  # who moves does not split
         idle = idle[:moves]
         moved = torch.zeros_like(busy)
         moved[idle] = True

@@ -180,6 +180,30 @@ def test_relocation_reaches_its_count_however_few_interventions_there_are(grow_f
     assert counts[0] <= 1 + COUNT * grow_from ** (-1 / 3), "no more at once than is needed"
 
 
+@pytest.mark.parametrize(("steps", "most"), [(5, 2), (40, 2), (500, 2)])
+def test_relocation_reaches_its_count_in_budgets_that_are_over_before_the_first_intervention(steps: int, most: int) -> None:
+    m, target = model(), 2 * COUNT
+    population, counts, when = Relocate(PopulationSettings(start=0.02, stop=0.35, every=200, grow_to=target)), [], []
+    for step in range(1, steps + 1):
+        population.observe(m, stats(torch.ones(m.count), torch.rand(m.count) + 0.1))
+        if population.due(step, step / steps):
+            change = population.intervene(m, 1.0)
+            assert change is not None
+            m = Primitives(m.density, m.colour, change.params)
+            counts.append(m.count)
+            when.append(step)
+    assert counts[-1] == target and 1 <= len(counts) <= most
+    assert when[-1] <= 0.35 * steps + 1, "early enough to learn"
+
+
+def test_relocation_keeps_its_interval_where_that_is_soon_enough_or_nobody_is_missing() -> None:
+    for steps, grow_to in ((5000, 2 * COUNT), (500, COUNT)):
+        m, population = model(), Relocate(PopulationSettings(start=0.02, stop=0.35, every=100, grow_to=grow_to))
+        population.observe(m, stats(torch.ones(m.count), torch.rand(m.count) + 0.1))
+        found = [step for step in range(1, steps + 1) if population.due(step, step / steps)]
+        assert found == list(range(100, int(0.35 * steps - 1e-9) + 1, 100))
+
+
 def test_relocation_sums_over_views_and_starts_anew() -> None:
     m = model()
     population = Relocate(PopulationSettings(fraction=0.05))

@@ -63,6 +63,7 @@ class _State:
         words: of its fields, all that were reduced.
         bite, cut: dB that its last cut was to lose at once, and of the judged views after it.
         lost: dB of the judged views since the beginning; rounds: of training since the cut.
+        alone: whether the cut was of whole fields' parts alone.
     """
 
     model: Primitives
@@ -71,6 +72,7 @@ class _State:
     cut: float = 0.0
     lost: float = 0.0
     rounds: int = 0
+    alone: bool = False
 
     def stage(self, base: float, stays: bool) -> Stage:
         return Stage(self.words, self.model.count, numbers(self.model), self.cut, base - self.lost, stays)
@@ -102,6 +104,7 @@ class Search:
         """The smallest model found whose judged views are at most the tolerance worse, and the words for what its fields have less of."""
         self.base = self.judge(model)
         best, tried = _State(model), None
+        apart: tuple[str, ...] = ()
         rounds = min(max(self.steps // _LEAST, 1), ROUNDS)
         bite = self.tolerance * (1.0 + (_BITE - 1.0) * min(self.steps / rounds / _LEAST, 1.0))
         for number in range(rounds):
@@ -109,7 +112,10 @@ class Search:
             if left < _ENOUGH * self.tolerance or not best.model.count:
                 break
             if tried is None:  # else what the last cut left is trained for longer
-                tried = self._cut(best, bite if self.steps else left, number / rounds)
+                if apart:  # what failed together with others is tried by itself
+                    tried, apart = self._without(best, apart, bite), ()
+                else:
+                    tried = self._cut(best, bite if self.steps else left, number / rounds)
                 if numbers(tried.model) >= numbers(best.model):
                     break
                 bite = tried.bite
@@ -120,7 +126,8 @@ class Search:
                 bite *= min(max((left - spent) / max(spent, 0.25 * self.tolerance), 1.0 / _BITE), 2.0)
                 best, tried = tried, None
             elif tried.rounds > 1 or tried.lost > _PATIENCE * self.tolerance:
-                bite *= min(max(0.7 * left / max(spent, 1e-9), 0.2), 0.7)
+                apart = () if tried.alone else tried.words[len(best.words) :]
+                bite *= 1.0 if tried.alone else min(max(0.7 * left / max(spent, 1e-9), 0.2), 0.7)
                 tried = None
         last = {word.partition("=")[0]: word for word in best.words}  # degree 0 after degree 2 is degree 0
         return best.model, tuple(last.values())
@@ -151,6 +158,15 @@ class Search:
                     break
         found = by_price if smaller is model else self._by_price(smaller, quick, bite - lost)
         return _State(found, tuple(words), bite=bite, cut=self.judge(found))
+
+    def _without(self, state: _State, words: tuple[str, ...], bite: float) -> _State:
+        """A model whose fields do with less as the words say, and nothing else."""
+        model = state.model
+        for word in words:
+            place, _, value = word.partition("=")
+            kind, _, name = place.partition(".")
+            model = with_less(model, kind, name, int(value))
+        return _State(model, (*state.words, *words), bite=bite, cut=self.judge(model), alone=True)
 
     def _by_price(self, model: Primitives, quality: Callable[[Primitives], float], loss: float) -> Primitives:
         if loss <= 0:

@@ -43,6 +43,18 @@ def test_user_wins_over_preset_over_defaults(toy: Path) -> None:
     assert c.non_default == {"preset": ("quick", "long"), "train.iterations": (700, 8)}
 
 
+def test_another_strategy_starts_with_all_primitives_unless_growth_is_typed() -> None:
+    def grow_from(*words: str) -> float:
+        return compose(["task=static", *words]).train.population.grow_from
+
+    assert grow_from() == 0.5
+    for word in ("train.population.strategy=fixed", "train.population={strategy: fixed}", "train.population.strategy=gradient"):
+        assert grow_from(word) == 1.0
+    assert grow_from("train.population.strategy=relocate") == 0.5
+    with pytest.raises(ConfigError, match=r"grow_from=0\.5: fixed does not grow that way"):
+        grow_from("train.population.strategy=fixed", "train.population.grow_from=0.5")
+
+
 def test_free_dictionaries_need_no_plus(toy: Path) -> None:
     c = toys("train.rates.w2=1e-3", "+train.rates.b2=2", "model.init.mode=paper", "model.init.deep={a:[1,2]}", "task.options.gain=3")
     assert c.train.rates == {"means": 1e-3, "w2": 1e-3, "b2": 2.0}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from neuprim.config import RunConfig
@@ -85,7 +85,8 @@ class Paces:
 
     def _ready(self, config: RunConfig) -> tuple[Trainer, float, tuple[Any, ...]]:
         begun = time.perf_counter()
-        trainer = start(config, dataset=self._dataset).trainer
+        population = replace(config.train.population, grow_from=1.0)  # by the middle all have been born
+        trainer = start(replace(config, train=replace(config.train, population=population)), dataset=self._dataset).trainer
         started = time.perf_counter()
         make_ready(trainer)
         self.compiling += time.perf_counter() - started

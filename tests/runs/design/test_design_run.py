@@ -114,7 +114,7 @@ def test_the_words_of_a_point_train_it(measured: tuple[Path, Record]) -> None:
 def test_quality_is_against_the_truth_and_against_the_exact_image(measured: tuple[Path, Record]) -> None:
     for model in models(measured[1]):
         assert (
-            5 < model.quality["psnr"] < 60 < model.quality["psnr_exact"]
+            5 < model.quality["psnr"] < 50 < model.quality["psnr_exact"]  # what alpha_min = 1/255 leaves out is below -48 dB
             and 0 < model.quality["ssim"] <= 1 <= model.quality["ssim_exact"] + 1e-3
         )
     assert measured[1].facts["exact"]["float64"] is True

@@ -11,7 +11,7 @@ from typing import Any
 
 from neuprim.core.errors import ConfigError
 
-__all__ = ["Assignment", "assigned", "expand_sweep", "parse", "resuming", "sweep_names", "swept_keys"]
+__all__ = ["Assignment", "assigned", "expand_sweep", "parse", "resuming", "sweep_names", "swept_keys", "word"]
 
 NOT_SWEPT = ("output_dir", "resume")
 MAX_RUNS = 10_000
@@ -87,6 +87,13 @@ def assigned(key: str, value: str) -> str:
     except ConfigError:
         pass
     return f"{key}='" + re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + ("\\'" if m[2] else ""), value) + "'"
+
+
+def word(key: str, value: Any) -> str:
+    """``key=value`` as the grammar of words reads it back."""
+    if isinstance(value, str):
+        return assigned(key, value)
+    return f"{key}={str(value).lower() if isinstance(value, bool) else repr(value)}"
 
 
 def resuming(overrides: Sequence[str], directory: Path) -> list[str]:

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from neuprim.config import RunConfig
-from neuprim.config.overrides import parse
+from neuprim.config.overrides import parse, word
 from neuprim.core.errors import ConfigError
-from neuprim.runs.design.variants import LENGTH, Variant, merged, word
+from neuprim.runs.design.variants import LENGTH, Variant, merged
 
 __all__ = ["Plan", "planned"]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from neuprim.config import RunConfig, compose
-from neuprim.config.overrides import assigned, parse
+from neuprim.config.overrides import assigned, parse, word
 from neuprim.core.data import Dataset
 from neuprim.core.errors import NeuprimError
 from neuprim.runs.design.combine import combinations
@@ -20,7 +20,7 @@ from neuprim.runs.design.plan import Plan, planned
 from neuprim.runs.design.record import Model
 from neuprim.runs.design.request import DesignRequest, Progress, Tell
 from neuprim.runs.design.side_by_side import SideBySide
-from neuprim.runs.design.variants import CENTRE, COMBINED, Variant, merged, word
+from neuprim.runs.design.variants import CENTRE, COMBINED, Variant, merged
 from neuprim.runs.events import Event, Note, Preparing, Step
 from neuprim.runs.tradeoff.knobs import LeftOut
 from neuprim.runs.tradeoff.record import Record

@@ -9,13 +9,13 @@ from itertools import zip_longest
 from typing import Any
 
 from neuprim.config import RunConfig
-from neuprim.config.overrides import assigned, parse
+from neuprim.config.overrides import parse, word
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.task import TaskSpec
 from neuprim.core.uses import build_settings
 from neuprim.plugins.trading import traded
 
-__all__ = ["CENTRE", "COMBINED", "LENGTH", "Variant", "check_knobs", "in_turn", "merged", "singles", "word"]
+__all__ = ["CENTRE", "COMBINED", "LENGTH", "Variant", "check_knobs", "in_turn", "merged", "singles"]
 
 CENTRE, COMBINED = "centre", "combined"
 """In place of a knob's name: of the variant that turns none, and of those that turn several."""
@@ -55,13 +55,6 @@ class Variant:
         """A file-name-safe name; two variants of one set have different ones unless their words are longer than any that knobs make."""
         text = re.sub(r"[^A-Za-z0-9._+-]+", "-", "_".join(self.name.split(" "))).strip("._-")
         return text[:_NAME]
-
-
-def word(key: str, value: Any) -> str:
-    """``key=value`` as the grammar of words reads it back."""
-    if isinstance(value, str):
-        return assigned(key, value)
-    return f"{key}={str(value).lower() if isinstance(value, bool) else repr(value)}"
 
 
 def merged(words: Sequence[str], over: Sequence[str]) -> list[str]:

@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 
 from neuprim.config import compose, task_of
-from neuprim.config.overrides import parse
+from neuprim.config.overrides import parse, word
 from neuprim.core.errors import ConfigError
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import TaskFault
-from neuprim.runs.design.variants import CENTRE, LENGTH, Variant, check_knobs, in_turn, merged, singles, word
+from neuprim.runs.design.variants import CENTRE, LENGTH, Variant, check_knobs, in_turn, merged, singles
 
 
 def offered(*words: str) -> dict[str, list[Variant]]:

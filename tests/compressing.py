@@ -10,7 +10,8 @@ from torch import Tensor
 from neuprim.core.compressed import BitTable, Schemes, file_order, folded, schemes
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
-from neuprim.core.model.fields import ColourField, DensityField
+from neuprim.core.model.fields import ColourField, DensityField, pieces_by_name
+from neuprim.core.model.pieces import Piece, without
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.task import TaskSpec
@@ -62,6 +63,17 @@ def example(name: str, count: int = 40) -> tuple[TaskSpec, Primitives]:
     """A task, and a model with its fields."""
     task, make = FIELDS[name]
     return load_task(task), random_model(*make(), count=count)
+
+
+def goners(model: Primitives) -> dict[str, tuple[Piece, Tensor]]:
+    """Of every piece of a model, every k-th primitive, with another k for each."""
+    pieces = pieces_by_name(model.density, model.colour)
+    return {name: (piece, torch.arange(model.count) % (2 + i % 3) == 0) for i, (name, piece) in enumerate(pieces.items())}
+
+
+def without_pieces(model: Primitives) -> Primitives:
+    """The model as pruning leaves it: :func:`goners` are zero."""
+    return Primitives(model.density, model.colour, without(goners(model), model.params))
 
 
 def gaussians(count: int = 30) -> Primitives:

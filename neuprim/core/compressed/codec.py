@@ -14,7 +14,7 @@ from neuprim.core.compressed.bits import BitTable
 from neuprim.core.compressed.columns import MOST_BITS, Columns, fit_columns, keep_zero, spread_error
 from neuprim.core.compressed.order import morton
 from neuprim.core.compressed.rotations import Rotations
-from neuprim.core.compressed.sections import COLUMNS, POSITIONS, ROTATIONS, Section, pack
+from neuprim.core.compressed.sections import COLUMNS, POSITIONS, ROTATIONS, Section, pack, pack_rows, pack_sparse
 from neuprim.core.errors import CheckpointError, FormError
 from neuprim.core.model.checks import method
 from neuprim.core.model.fields import pieces_by_name
@@ -37,6 +37,9 @@ class Stored:
 
 _SPIKY = 12.0
 """Columns whose error is more times the usual one than this get twice the bits: a few of their numbers lie far from all others."""
+
+_WORTH_A_MASK = 0.02
+"""Share of the primitives without a piece from which on a bit for each says so."""
 
 _FINE = 50.0
 """Steps of a position in the median of the primitives' longest semi-axes, at least."""
@@ -115,13 +118,40 @@ def file_order(model: Primitives, made: Schemes) -> Tensor:
 def encode(model: Primitives, made: Schemes) -> list[Section]:
     """The sections of a folded model, in the order of the file."""
     order = file_order(model, made)
-    sections = []
+    codes = {spec.name: made[spec.name].codes(model.params[spec.name].reshape(model.count, spec.size)[order]) for spec in model.specs}
+    masks, whose = _masks(model, made, codes)
+    sections = [pack_rows(masks)] if masks else []
     for spec in model.specs:
-        scheme = made[spec.name]
+        scheme, own = made[spec.name], codes[spec.name].numpy()
+        if spec.name in whose:
+            assert isinstance(scheme, Columns)
+            sections.append(pack_sparse(spec.name, spec.shape, scheme, own, whose[spec.name], masks))
+            continue
         coding = ROTATIONS if isinstance(scheme, Rotations) else POSITIONS if spec.name == "means" else COLUMNS
-        rows = model.params[spec.name].reshape(model.count, spec.size)[order]
-        sections.append(pack(spec.name, spec.shape, scheme, scheme.codes(rows).numpy(), coding))
+        sections.append(pack(spec.name, spec.shape, scheme, own, coding))
     return sections
+
+
+def _masks(model: Primitives, made: Schemes, codes: Mapping[str, Tensor]) -> tuple[list[np.ndarray], dict[str, list[int]]]:
+    """Who has which piece, of pieces that come back as zeros for some primitives, and of their parameters the number of each column's mask.
+
+    One bit then says what would else be the most frequent code of every column of the piece.
+    """
+    shapes = {spec.name: spec.shape for spec in model.specs}
+    zero = {n: (s.values(codes[n]) == 0).reshape(model.count, *shapes[n]) for n, s in made.items() if isinstance(s, Columns) and n != "means"}
+    masks: list[np.ndarray] = []
+    whose: dict[str, Tensor] = {}
+    for piece in pieces_by_name(model.density, model.colour).values():
+        if not model.count or not set(piece.places) <= zero.keys():
+            continue
+        parts = [zero[name][(slice(None), *place)].reshape(model.count, -1).all(1) for name, place in piece.places.items()]
+        without = torch.stack(parts).all(0)
+        if float(without.double().mean()) < _WORTH_A_MASK:
+            continue
+        masks.append((~without).numpy())
+        for name, place in piece.places.items():
+            whose.setdefault(name, torch.zeros(shapes[name], dtype=torch.int64))[place] = len(masks)
+    return masks, {name: of.flatten().tolist() for name, of in whose.items()}
 
 
 def rounded(params: Mapping[str, Tensor], made: Schemes) -> dict[str, Tensor]:

@@ -15,11 +15,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
 import zstandard
 from torch import Tensor
 
 from neuprim.core.compressed.packing import packed_planes
-from neuprim.core.compressed.sections import CODINGS, MOST_TEXT, POSITIONS, ROTATIONS, TEXT, Damaged, Section, plane_count, unpack
+from neuprim.core.compressed.sections import (
+    CODINGS,
+    MOST_TEXT,
+    POSITIONS,
+    ROTATIONS,
+    ROWS,
+    ROWS_NAME,
+    TEXT,
+    Damaged,
+    Section,
+    content_size,
+    unpack,
+    unpack_rows,
+)
 from neuprim.core.errors import CheckpointError
 from neuprim.core.io.files import atomic_path
 
@@ -38,6 +52,7 @@ _MOST_PLANES = 3  # of a column's codes
 _START = struct.Struct("<IIQIII")  # version, sections, primitives, bytes of header and table, their check sum
 _SIZES = struct.Struct("<QQI")
 _MOST_HEADER, _MOST_TABLE = 2**22, 2**20  # bytes
+_MOST_MASKS = 2**16 - 1
 _MOST_SECTIONS, _MOST_DIMENSIONS, _MOST_COLUMNS, _MOST_PRIMITIVES = 4096, 4, 2**20, 2**31
 
 
@@ -144,6 +159,7 @@ def read_compressed(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], str 
     with _opened(path) as file:
         head = _head(path, file)
         tensors: dict[str, Tensor] = {}
+        masks: list[np.ndarray] = []
         config: str | None = None
         for entry in head.entries:
             section = entry.section
@@ -152,13 +168,15 @@ def read_compressed(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], str 
                 if zlib.crc32(data) != entry.checksum:
                     raise Damaged(f"its check sum is {zlib.crc32(data):08x}; expected {entry.checksum:08x}")
                 section = replace(section, head=data[: section.head_size])
-                if section.coding != TEXT and entry.content != (wanted := head.count * plane_count(section)):
+                if section.coding != TEXT and entry.content != (wanted := content_size(section, head.count, masks)):
                     raise Damaged(f"its planes have {entry.content} bytes; expected {wanted}")
                 content = _content(data[section.head_size :], entry)
                 if section.coding == TEXT:
                     config = content.decode("utf-8")
+                elif section.coding == ROWS:
+                    masks = unpack_rows(section, content, head.count)
                 else:
-                    tensors[section.name] = unpack(section, content, head.count)
+                    tensors[section.name] = unpack(section, content, head.count, masks)
             except (Damaged, UnicodeDecodeError) as error:
                 raise CheckpointError(f"{path}: section {section.name!r} is damaged: {error}") from error
     return head.header, tensors, config
@@ -258,6 +276,10 @@ def _named(name: str, coding: int, shape: tuple[int, ...]) -> Section:
         raise Damaged(f"section {name!r} of {CODINGS[coding]} has shape {shape}; expected {wanted}")
     if (coding == TEXT) != (name == CONFIG):
         raise Damaged(f"section {name!r} has coding {CODINGS[coding]}; the one text is {CONFIG!r}")
+    if (coding == ROWS) != (name == ROWS_NAME) or (coding == ROWS and not (len(shape) == 1 and 0 < shape[0] <= _MOST_MASKS)):
+        raise Damaged(
+            f"section {name!r} of {CODINGS[coding]} has shape {shape}; the one of rows is {ROWS_NAME!r}, of 1 to {_MOST_MASKS} masks"
+        )
     if max(shape, default=0) > _MOST_COLUMNS or section.columns > _MOST_COLUMNS:
         raise Damaged(f"section {name!r} has shape {shape}; expected at most {_MOST_COLUMNS} numbers")
     return section

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import math
 import os
@@ -27,19 +28,21 @@ from neuprim.core import checkpoint
 from neuprim.core.compressed import CONFIG, LEVELS, Section, is_compressed, write_compressed
 from neuprim.core.compressed.packing import packed_planes
 from neuprim.core.errors import CheckpointError
+from neuprim.core.model.pieces import alive
 from neuprim.core.model.primitives import Primitives
 from neuprim.tasks.static import TASK
-from tests.compressing import FIELDS, example
+from tests.compressing import FIELDS, example, goners, without_pieces
 from tests.systems import posix
 
 CONFIG_TEXT = "task: static\nnote: naïve\n"
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """A file of a static model."""
-    path = tmp_path_factory.mktemp("whole") / "m.neuprim"
-    checkpoint.save_compressed(path, example("static", 50)[1], "static", {"note": "naïve"}, LEVELS[3], CONFIG_TEXT)
+@pytest.fixture(scope="module", params=["whole", "pruned"])
+def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A file of a static model, and of one of which every other primitive does without something."""
+    path, model = tmp_path_factory.mktemp("whole") / "m.neuprim", example("static", 50)[1]
+    model = model if request.param == "whole" else without_pieces(model)
+    checkpoint.save_compressed(path, model, "static", {"note": "naïve"}, LEVELS[3], CONFIG_TEXT)
     return path.read_bytes()
 
 
@@ -81,21 +84,29 @@ def read_by_the_book(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]
     assert version == 1 and crc == zlib.crc32(data[8:32] + data[36 : body + table_size])
     header, at, text = json.loads(data[36:body]), body + table_size, ""
     found: dict[str, np.ndarray] = {}
+    masks: list[list[int]] = []
     for row in table_rows(data[body:at], sections):
         part, at = data[at : at + row["size"]], at + row["size"]
         assert zlib.crc32(part) == row["crc"]
         columns = math.prod(row["shape"])
-        split = {0: 0, 1: 9 * columns, 2: 27, 3: 1}[row["coding"]]
+        split = {0: 0, 1: 9 * columns, 2: 27, 3: 1, 4: 0, 5: 11 * columns}[row["coding"]]
         head, packed = part[:split], part[split:]
         content = zstandard.ZstdDecompressor().decompress(packed) if row["packing"] else packed
         assert len(content) == row["planes"]
         if row["coding"] == 0:
             text = content.decode()
             continue
-        planes = iter(np.frombuffer(content, np.uint8).reshape(-1, count).astype(object))
+        if row["coding"] == 4:
+            width = -(-count // 8)
+            for k in range(columns):
+                mask = content[k * width : (k + 1) * width]
+                masks.append([n for n in range(count) if mask[n // 8] >> n % 8 & 1])
+            continue
+        stream = io.BytesIO(content)
 
-        def codes(bits: int, planes: Any = planes) -> np.ndarray:
-            return sum(next(planes) * 256**i for i in range(-(-bits // 8)))  # type: ignore[return-value]
+        def codes(bits: int, rows: int = count, stream: io.BytesIO = stream) -> np.ndarray:
+            planes = [np.frombuffer(stream.read(rows), np.uint8).astype(object) for _ in range(-(-bits // 8))]
+            return sum(plane * 256**i for i, plane in enumerate(planes))  # type: ignore[return-value]
 
         if row["coding"] == 3:
             h = 2 ** (head[0] - 1) - 1
@@ -108,16 +119,18 @@ def read_by_the_book(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]
                 values[n] = q
         else:
             records = [struct.unpack_from("<Bff", head, 9 * i) for i in range(columns)]
+            whose = struct.unpack_from(f"<{columns}H", head, 9 * columns) if row["coding"] == 5 else [0] * columns
+            own = [masks[k - 1] if k else list(range(count)) for k in whose]
             if row["coding"] == 2:
                 b = records[0][0]
                 keys = np.cumsum(codes(3 * b))
                 cells = [np.array([sum(int(key) >> (3 * i + axis) & 1 and 1 << i for i in range(b)) for key in keys]) for axis in range(3)]
             else:
-                cells = [codes(b) for b, _, _ in records]
+                cells = [codes(b, len(rows)) for (b, _, _), rows in zip(records, own, strict=True)]
             values = np.zeros((count, columns))
             for j, (b, low, high) in enumerate(records):
                 m = 2**b - 1
-                values[:, j] = [(low * (m - int(c)) + high * int(c)) / m for c in cells[j]]
+                values[own[j], j] = [(low * (m - int(c)) + high * int(c)) / m for c in cells[j]]
         found[row["name"]] = values.astype(np.float32).reshape(count, *row["shape"])
     assert at == len(data)
     return header, found, text
@@ -136,6 +149,19 @@ def test_the_documentation_is_all_that_a_reader_needs(tmp_path: Path, name: str,
         assert found[key].tobytes() == value.numpy().tobytes(), key
 
 
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_pruned_model_is_read_by_the_book_as_well(tmp_path: Path, name: str) -> None:
+    task, model = example(name, 25)
+    pruned = without_pieces(model)
+    checkpoint.save_compressed(tmp_path / "m", pruned, task.name, {}, LEVELS[3], CONFIG_TEXT)
+    _, found, _ = read_by_the_book((tmp_path / "m").read_bytes())
+    again, _ = checkpoint.load_model(tmp_path / "m", task)
+    for key, value in again.params.items():
+        assert np.array_equal(found[key], value.numpy()), key
+    for piece, gone in goners(model).values():
+        assert int((~alive(piece, again.params)).sum()) == int(gone.sum())
+
+
 def by_hand(**changes: Any) -> bytes:
     """A model of two primitives without neurons, written from the page: see the comments."""
     # means: 2 bits; codes (0, 1, 2) and (3, 3, 3): key 0 has bit 1 (y) and bit 5 (z, second), 34; key 1 all six, 63; steps 34, 29
@@ -152,6 +178,7 @@ def by_hand(**changes: Any) -> bytes:
         "sh_dc": (1, (3,), constant * 3, bytes(6)),
         **changes.pop("sections", {}),
     }
+    sections = {**changes.pop("first", {}), **sections}
     header = {
         "format": 1, "kind": "model", "task": "static", "primitives": 2,
         "density": {"class": "CosineDensity", "settings": {"neurons": 0}},
@@ -222,6 +249,24 @@ def test_every_flipped_bit_is_noticed(tmp_path: Path, whole: bytes) -> None:
         refused(path)
 
 
+def sparse(whose: int, codes: bytes) -> tuple[int, tuple[int, ...], bytes, bytes]:
+    """A section of one sparse column: 8 bits from 0 to 255."""
+    return 5, (1,), struct.pack("<BffH", 8, 0.0, 255.0, whose), codes
+
+
+def test_sparse_columns_by_hand(tmp_path: Path) -> None:
+    """The second of two primitives has a number, then both, then neither."""
+    rows = {"rows|": (4, (3,), b"", bytes([0b10, 0b11, 0b00]))}
+    for whose, codes, wanted in (
+        (1, b"\x07", [0.0, 7.0]),
+        (2, b"\x05\x06", [5.0, 6.0]),
+        (3, b"", [0.0, 0.0]),
+        (0, b"\x01\x02", [1.0, 2.0]),
+    ):
+        (tmp_path / "m").write_bytes(by_hand(first=rows, sections={"b2": sparse(whose, codes)}))
+        assert checkpoint.load_model(tmp_path / "m", TASK)[0].params["b2"].flatten().tolist() == wanted
+
+
 def resummed(data: bytearray) -> bytes:
     """With the check sums that somebody malicious would write, as far as sizes still make sense."""
     try:
@@ -284,7 +329,26 @@ DAMAGE: dict[str, tuple[Callable[[], bytes], tuple[str, ...]]] = {
     "twice": (lambda: by_hand(b1={"label": b"W1"}), ("section 'W1' is there twice",)),
     "name": (lambda: by_hand(b2={"label": b"\xff\xfe"}), ("row 6",)),
     "missing": (lambda: by_hand(b2={"label": b"b3"}), ("b3",)),
-    "coding": (lambda: by_hand(sections={"b2": (4, (1,), RECORD, b"ab")}), ("section 'b2' has coding 4",)),
+    "coding": (lambda: by_hand(sections={"b2": (6, (1,), RECORD, b"ab")}), ("section 'b2' has coding 6",)),
+    "rows of another name": (lambda: by_hand(sections={"b2": (4, (1,), b"", b"a")}), ("section 'b2' of rows", "'rows|'")),
+    "rows of another coding": (lambda: by_hand(first={"rows|": (1, (1,), RECORD, b"ab")}), ("section 'rows|' of columns",)),
+    "rows without a mask": (lambda: by_hand(first={"rows|": (4, (0,), b"", b"")}), ("section 'rows|' of rows has shape (0,)",)),
+    "rows of two dimensions": (lambda: by_hand(first={"rows|": (4, (1, 1), b"", b"a")}), ("section 'rows|' of rows has shape (1, 1)",)),
+    "rows too long": (lambda: by_hand(first={"rows|": (4, (1,), b"", b"ab")}), ("section 'rows|' is damaged: its planes have 2 bytes; expected 1",)),
+    "rows beyond": (lambda: by_hand(first={"rows|": (4, (1,), b"", b"\x07")}), ("bits beyond those of 2 primitives",)),
+    "no rows": (lambda: by_hand(sections={"b2": sparse(1, b"a")}), ("section 'b2' is damaged: a column of the primitives of mask 1; expected at most 0",)),
+    "rows that come later": (
+        lambda: by_hand(sections={"b2": sparse(1, b"a"), "rows|": (4, (1,), b"", b"\x01")}),
+        ("mask 1; expected at most 0",),
+    ),
+    "another mask": (
+        lambda: by_hand(first={"rows|": (4, (1,), b"", b"\x01")}, sections={"b2": sparse(2, b"a")}),
+        ("mask 2; expected at most 1",),
+    ),
+    "more than the mask has": (
+        lambda: by_hand(first={"rows|": (4, (1,), b"", b"\x01")}, sections={"b2": sparse(1, b"ab")}),
+        ("section 'b2' is damaged: its planes have 2 bytes; expected 1",),
+    ),
     "packing": (lambda: by_hand(b2={"packing": 2}), ("section 'b2' has packing 2",)),
     "text": (lambda: by_hand(sections={"b2": (0, (), b"", b"ab")}), ("section 'b2' has coding text",)),
     "config": (lambda: by_hand(sections={CONFIG: (1, (), RECORD, b"ab")}), ("section 'config.yaml' has coding columns",)),

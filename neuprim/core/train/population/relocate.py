@@ -37,15 +37,17 @@ class Relocate(Population):
         self.weight: Tensor | None = None
         self.error: Tensor | None = None
         self._left = math.inf
+        self._part = 0
 
     def due(self, step: int, progress: float) -> bool:
         s = self.settings
         share = (s.stop - s.start) / _PARTS
         if self.weight is not None and len(self.weight) < (s.grow_to or 0) and 0 < share * step < s.every * progress:
             # a budget so short that ``every`` would leave it without its primitives, or with all of them born at once
-            now, before = ((p - s.start) // share for p in (progress, progress * (step - 1) / step))
-            self._left = max(_PARTS - 1 - now, 0.0)
-            return before < now and 0 < now and before < _PARTS - 1
+            part = int((progress - s.start) // share)
+            due, self._part = self._part < min(part, _PARTS - 1), max(part, self._part)
+            self._left = max(_PARTS - 1 - part, 0)
+            return due
         due = super().due(step, progress)
         if due:
             further = (self.settings.stop - progress) / progress * step / self.settings.every if progress > 0 else math.inf
@@ -101,8 +103,10 @@ class Relocate(Population):
         return Change(params, origin, fresh, ", ".join(said))
 
     def state(self) -> dict[str, Tensor]:
-        return {} if self.weight is None or self.error is None else {"weight": self.weight, "error": self.error}
+        found = {} if self.weight is None or self.error is None else {"weight": self.weight, "error": self.error}
+        return found | ({"part": torch.tensor(self._part)} if self._part else {})
 
     def load_state(self, state: dict[str, Tensor]) -> None:
+        self._part = int(state["part"]) if "part" in state else 0
         self.weight = state["weight"].clone() if "weight" in state else None
         self.error = state["error"].clone() if "error" in state else None

@@ -3,7 +3,7 @@
     python benchmarks/expressivity.py [--scenes solids chair fire smoke_fire lit_solids] [--chair DIR] [--fire DIR]
         [--parts forms slope gaussian] [--sizes 100 400 2000] [--seeds 3] [--docs] [--print]
 
-Each run is its task's preset `quick`, cut to a number of steps. A size is the bytes of so many of the paper's primitives; every form gets as many primitives
+Each run is its task's preset `quick`, cut to a number of steps, with all primitives from the start and rates without a cool-down. A size is the bytes of so many of the paper's primitives; every form gets as many primitives
 as these bytes hold. Parts:
 
     forms     every form at every size, for as many steps as fit into the seconds that the paper's form takes for its own: the forms take turns
@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from shared.forms import PAPER, SCENES, Form
+from shared.forms import AS_RECORDED, PAPER, SCENES, Form
 from shared.tables import README, between_markers, spread
 from shared.trials import Trial, begin, paces_of, run_all
 
@@ -88,7 +88,7 @@ def reduced(scene: str) -> tuple[str, ...]:
 
 def words_of(form: str, scene: str, args: argparse.Namespace, count: int) -> tuple[str, ...]:
     own = SCENES[scene]
-    return (*own.all_words(vars(args), scene), *Form.named(form).words, f"model.primitives={count}")
+    return (*own.all_words(vars(args), scene), *AS_RECORDED, *Form.named(form).words, f"model.primitives={count}")
 
 
 def measure_paces(scene: str, size: int, forms: Sequence[str], args: argparse.Namespace) -> dict[str, float]:
@@ -187,7 +187,7 @@ def forms_table(found: dict[str, Any]) -> str:
         )
     seeds = sorted({len(runs) for runs in groups.values()})
     lines.append(
-        f"\nPreset `quick`, {' to '.join(str(n) for n in dict.fromkeys((seeds[0], seeds[-1])))} seed(s), mean ± half the spread; *bytes of* so many of the paper's primitives; steps: as many as fit into "
+        f"\nPreset `quick` with all primitives from the start and without a cool-down, {' to '.join(str(n) for n in dict.fromkeys((seeds[0], seeds[-1])))} seed(s), mean ± half the spread; *bytes of* so many of the paper's primitives; steps: as many as fit into "
         "the seconds of the paper's form, at paces measured in turns over whole runs; *error of σ*: relative L2 over the files' voxels, early / middle / late; *last doubling*: what the second half of the budget brought, first seed. PSNR is of "
         f"the whole image (solids, chair at 200×200 on white), inside the mask (fire, smoke_fire), clamped linear (lit_solids). {found['cpu']}, one thread."
     )

@@ -2,14 +2,14 @@
 
     python benchmarks/population.py [--scenes chair smoke_fire fire] [--chair DIR] [--fire DIR] [--steps 2500] [--seeds 3] [--docs] [--print]
 
-Each is its task's preset `quick` with another population; all end with the same number of primitives, and each trains for as long as the
+Each is its task's preset `quick` with another population and no cool-down of the rates; all end with the same number of primitives, and each trains for as long as the
 preset takes for --steps, at paces measured in turns over whole runs of one thread. Variants:
 
     fixed       nobody moves
-    always      `relocate`: the least used move, however much they do; what static's `quick` does
+    always      `relocate`: the least used move, however much they do
     idle        `relocate` of the idle alone (weight below 0.05 of the mean); what dynamic's `quick` does
     weight      as `idle`, but split are those drawn at random in proportion to their weight in the images, as in MCMC (Kheradmand et al. 2024)
-    grown       half of the primitives at first, the others are born where the error is largest; then as `idle`
+    grown       half of the primitives at first, the others are born where the error is largest; then as `idle`; static's `quick` does so
 
 Results on the test views go to benchmarks/results/population.json after every run, and only what is missing is run; --docs puts the table between the
 markers of docs/budgets.md.
@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from shared.forms import SCENES
+from shared.forms import AS_RECORDED, SCENES
 from shared.tables import ROOT, Table, between_markers, spread
 from shared.trials import Trial, begin, paces_of, recorded
 from torch import Tensor
@@ -71,7 +71,7 @@ class ByWeight(Relocate):
 
 
 def words_of(args: argparse.Namespace, scene: str, variant: str) -> tuple[str, ...]:
-    return (*SCENES[scene].all_words(vars(args), scene), *VARIANTS[variant])
+    return (*SCENES[scene].all_words(vars(args), scene), *AS_RECORDED, *VARIANTS[variant])
 
 
 def run(args: argparse.Namespace) -> None:

@@ -15,7 +15,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from shared.forms import SCENES, Form
+from shared.forms import AS_RECORDED, SCENES, Form
 from shared.tables import ROOT, between_markers
 from shared.trials import Trial, recorded, run_all
 
@@ -62,7 +62,7 @@ def main() -> None:
                     scene = SCENES[name]
                     count = Form.named(text).equal_bytes(args.primitives, scene.task, args.set)
                     words = (
-                        *scene.all_words(vars(args), name), *scene.tuning, *Form.named(text).words, f"model.primitives={count}", *rate_words(rates), *args.set
+                        *scene.all_words(vars(args), name), *AS_RECORDED, *scene.tuning, *Form.named(text).words, f"model.primitives={count}", *rate_words(rates), *args.set
                     )  # fmt: skip
                     title = "-".join([name, text, rates, str(count), str(args.iterations), str(seed), *sorted(args.set)])
                     facts = (

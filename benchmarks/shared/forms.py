@@ -11,7 +11,7 @@ from neuprim.config import compose, task_of
 from neuprim.core.uses import build_settings
 from neuprim.runs.open import load_dataset
 
-__all__ = ["PAPER", "SCENES", "Form", "Scene", "parameters"]
+__all__ = ["AS_RECORDED", "PAPER", "SCENES", "Form", "Scene", "parameters"]
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,10 @@ class Scene:
         own = (f"{self.folder}='{folders[name].resolve()}'",) if self.folder else ()
         return (f"task={self.task}", *self.words, *own)
 
+
+AS_RECORDED = ("train.population.grow_from=1", "train.cooldown=0")
+"""How all presets trained when forms and populations were compared: all primitives there from the start, rates without a cool-down. What is added to
+those records must train alike."""
 
 _FIRE = ("scene=vdb", "scene.frames='1:40'", "scene.look=embergen_fire", "scene.size=96")
 SCENES = {

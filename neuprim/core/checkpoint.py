@@ -24,7 +24,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.zeros import split_off, whole
 from neuprim.core.task import TaskSpec
 
-__all__ = ["FORMAT", "load_model", "read", "read_header", "save_compressed", "save_model", "stored_config", "write"]
+__all__ = ["FORMAT", "extra_of", "load_model", "read", "read_header", "save_compressed", "save_model", "stored_config", "write"]
 
 FORMAT = 1
 _KEY = "neuprim"
@@ -152,6 +152,11 @@ def _model_header(model: Primitives, task: str, extra: Mapping[str, Any]) -> dic
         for kind, field in (("density", model.density), ("colour", model.colour))
     }
     return {"task": task, "primitives": model.count, **fields, **extra}
+
+
+def extra_of(header: Mapping[str, Any]) -> dict[str, Any]:
+    """Of a model's header, what :func:`save_model` was given beside the model itself."""
+    return {key: value for key, value in header.items() if key not in ("format", "kind", "task", "primitives", "density", "colour")}
 
 
 def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:

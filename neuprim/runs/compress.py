@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from neuprim.config import RunConfig, suspects_of
-from neuprim.core.checkpoint import load_model, save_compressed
+from neuprim.core.checkpoint import extra_of, load_model, save_compressed
 from neuprim.core.compressed import USUAL_LEVEL, bit_table
 from neuprim.core.data import Dataset
 from neuprim.core.data.check import check_dataset
@@ -88,7 +88,7 @@ def compress_run(
     config, task, model, header = load_run(run_dir)
     config = replace(config, output_dir=run_dir)
     table = bit_table(level, bits, model.specs)
-    extra = {k: v for k, v in header.items() if k not in ("format", "kind", "task", "primitives", "density", "colour")}
+    extra = extra_of(header)
     notes = ["its primitives are in another order than the run's"]
     dataset: Dataset | None = None
     try:

@@ -95,6 +95,7 @@ class Record:
         stage: how many of the search's stages are over.
         length: steps of a trial; 0 until it is known how fast the machine is.
         spent: seconds of the budget that are used.
+        before: full runs that were there when this was asked, made for another target.
         chosen: folder of the full run that was chosen.
         achieved: what the result has: measures on the test views and on the views held out, bytes, frames per second.
         out_of_reach: the line that says so, where the trials alone do.
@@ -107,6 +108,7 @@ class Record:
     stage: int = 0
     length: int = 0
     spent: float = 0.0
+    before: int = 0
     attempts: list[Attempt] = field(default_factory=list)
     turns: list[Turn] = field(default_factory=list)
     chosen: str | None = None
@@ -149,6 +151,7 @@ def read_record(folder: Path) -> Record | None:
 
 
 def _record(data: Mapping[str, Any]) -> Record:
+    data = {"before": 0, **data}  # records of the first versions did not say
     own = {f.name: data[f.name] for f in dataclasses.fields(Record)}
     own["attempts"] = [Attempt(**entry) for entry in data["attempts"]]
     own["turns"] = [Turn(**entry) for entry in data["turns"]]

@@ -102,6 +102,7 @@ def _kept(config: RunConfig, asked: dict[str, float]) -> Record:
         )
     if before.asked != asked:
         before.asked, before.spent, before.chosen, before.achieved = asked, 0.0, None, {}
+        before.before = len(before.done("full"))
         before.attempts = [a for a in before.attempts if a.outcome is not None]
         before.why, before.out_of_reach, before.warning, before.turns, before.stage = [], None, None, [], 0
     return before

@@ -249,7 +249,7 @@ class Search:
 
     def full_runs(self) -> None:
         """One full run, and others of a better size while the target is missed, or met with more than it needs, and time is left."""
-        for _ in range(_MOST_FULL):
+        for _ in range(_MOST_FULL - (len(self.record.done("full")) - self.record.before)):
             done = self.record.done("full")
             unfinished = [a for a in self.record.attempts if a.purpose == "full" and a.outcome is None]
             if unfinished:

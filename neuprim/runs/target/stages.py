@@ -13,7 +13,7 @@ import torch
 
 from neuprim.config import suspects_of, task_of
 from neuprim.config.target import Target
-from neuprim.core.checkpoint import load_model, save_compressed
+from neuprim.core.checkpoint import extra_of, load_model, save_compressed
 from neuprim.core.compressed import LEVELS, bit_table
 from neuprim.core.data.held_out import held_out
 from neuprim.core.io.files import atomic_path, write_text
@@ -172,7 +172,7 @@ def quantised(shop: Workshop, before: Finished) -> Finished:
     """The model in the fewest bits with which it still meets the target; where it does not anyway, those that cost next to nothing. With a limit of
     bytes alone, in the most bits that it allows."""
     task = task_of(shop.trying.config)
-    model, _ = load_model(before.run_dir / "model.safetensors", task)
+    model, header = load_model(before.run_dir / "model.safetensors", task)
     draft = before.run_dir / "draft.neuprim"
     target, judge = shop.target, shop.judge
     levels = _LEVELS if target.quality or target.megabytes is None else sorted(LEVELS)
@@ -181,7 +181,7 @@ def quantised(shop: Workshop, before: Finished) -> Finished:
     for level in levels:
         shop.trying.events(Finishing(f"storing in few bits, level {level}"))
         words = (before.run_dir / "config.yaml").read_text(encoding="utf-8")
-        save_compressed(draft, model, task.name, {}, bit_table(level, (), model.specs), words)
+        save_compressed(draft, model, task.name, extra_of(header), bit_table(level, (), model.specs), words)
         picked, held = level, shop.measured(load_model(draft, task)[0])
         if target.quality:
             enough = judge.margin(held) >= least

@@ -141,7 +141,7 @@ class Trainer:
         """Learning rate of every parameter now: warm-up, exponential decay to ``final_rate`` at the end of the budget, cool-down."""
         s = self.settings
         factor = s.final_rate**self.progress
-        if self.progress > 1 - s.cooldown:
+        if s.cooldown and self.progress > 1 - s.cooldown:
             factor *= max((1 - self.progress) / s.cooldown, COLD)
         if self.step < s.warmup_steps:
             factor *= (self.step + 1) / s.warmup_steps

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from neuprim.config import check_groups, check_scene, presets, task_choices
+from neuprim.config.effort import LEVELS, levels_of
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.plugins.registry import EXPORTERS, INSPECTORS, LOSSES, SCENES, Group, PluginReport, list_tasks, survey
 
@@ -72,6 +73,9 @@ def _task(spec: TaskSpec, added: list[PluginReport[SceneExtension]]) -> list[str
     width = max(len(name) for name, _ in rows)
     found = [("scenes", f"{name:{width}}  {text}") for name, text in rows]
     found.append(("presets", ", ".join(name + " (default)" * (name == default.preset) for name in presets(spec))))
+    levels = levels_of(spec, presets(spec))
+    if levels is not None:
+        found.append(("effort", f"{LEVELS[0]} (fast) to {LEVELS[-1]} (good), of preset {levels[LEVELS[0]].preset}"))
     if spec.conditions:
         found.append(("conditions", ", ".join(f"{c.name} [{c.unit}]" for c in spec.conditions)))
     found += [("options", line) for line in _options(spec)]

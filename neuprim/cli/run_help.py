@@ -7,6 +7,7 @@ __all__ = ["COMMON_KEYS", "EXAMPLES"]
 COMMON_KEYS = """\
 commonest keys:
   task=NAME scene=NAME preset=NAME     what to fit, and how (`neuprim tasks` lists them)
+  effort=N                             1 (fast) to 9 (good): how many primitives and views, where the task has measured it
   scene.path=DIR                       data of a scene that reads files
   output_dir=DIR resume=true           where to write; continue an interrupted run
   train.iterations=N train.max_seconds=S

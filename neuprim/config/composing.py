@@ -1,6 +1,6 @@
 """From the words after ``neuprim run`` to a :class:`RunConfig`.
 
-Values win in this order: what the user typed, the preset, the defaults of the settings dataclasses. Hydra finds and composes
+Values win in this order: what the user typed, the level of effort, the preset, the defaults of the settings dataclasses. Hydra finds and composes
 the YAML files (its ``compose``, so nothing changes directory or writes files); the settings dataclasses say which keys exist.
 """
 
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuprim.config.declared import check_names, check_preset, check_typed, complete_options, options_of, unused
+from neuprim.config.effort import EFFORT, Level, chosen_level
 from neuprim.config.groups import check_groups, check_scene, presets, task_choices
 from neuprim.config.outputs import output_directory
 from neuprim.config.overrides import Assignment, expand_sweep, parse, sweep_names, swept_keys
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 __all__ = ["compose", "compose_all", "preset_settings"]
 
 DEFAULT_TASK = "static"
-CHOICES = ("task", "scene", "preset")
+CHOICES = ("task", "scene", "preset", EFFORT)
 PRESET_KEYS = ("model", "train", "renderer")
 PATHS = "_paths_"
 """Key of a scene's YAML that lists which of its settings are paths: ``~`` is expanded and they are made absolute."""
@@ -78,7 +79,8 @@ def _composed(
     task_info, spec = TASKS.loaded(task_word)
     check_groups(spec)
     own = task_choices(spec)
-    preset = chosen["preset"] or own.preset
+    level = chosen_level(spec, chosen[EFFORT], chosen["preset"], presets(spec))
+    preset = chosen["preset"] or (own.preset if level is None else level.preset)
     scene_word = chosen["scene"] or own.scene
     found = find_scene(spec, scene_word)
     scene_name, package = found.spec.name, found.config_package
@@ -87,9 +89,10 @@ def _composed(
         raise ConfigError(f"preset={preset}: task {spec.name!r} has no such preset{nearest(preset, presets(spec))}")
 
     base, declared_paths = _base(spec, scene_name, preset, own.options, files, package)
-    for assignment in values:
+    below = () if level is None else level.settings
+    for assignment in (*below, *values):
         _check_key(assignment, base, scene_name)
-    plain, full = _merge(base, values)
+    plain, full = _merge(base, values, below)
     settings = _settings(full)
     loss = None if settings.train.loss is None else LOSSES.loaded(settings.train.loss)
     declared = None if loss is None else loss[1]
@@ -158,7 +161,7 @@ def _choice(assignments: Sequence[Assignment], key: str) -> str | None:
     if not given or given[-1].value is None:
         return None
     value = given[-1].value
-    if not isinstance(value, (str, int)) or isinstance(value, bool) or not str(value):
+    if not isinstance(value, (str, int, float)) or isinstance(value, bool) or not str(value):
         raise ConfigError(f"{given[-1].text}: expected the name of a {key}")
     return str(value)
 
@@ -227,26 +230,28 @@ def _base(spec: TaskSpec, scene: str, preset: str, options: dict[str, Any], file
     return base, declared
 
 
-def preset_settings(spec: TaskSpec, preset: str, scene: str) -> RunSettings:
-    """Settings of a preset and a scene of a task, with nothing typed; the task need not be registered.
+def preset_settings(spec: TaskSpec, preset: str, scene: str, level: Level | None = None) -> RunSettings:
+    """Settings of a preset, or of a level of effort over it, and a scene of a task, with nothing typed; the task need not be registered.
 
     Raises:
         ConfigError: its files lack something, do not compose, or hold an impossible value.
     """
     check_groups(spec)
     base, _ = _base(spec, scene, preset, {}, {}, spec.config_package)
-    return _settings(_merge(base, [])[0])
+    return _settings(_merge(base, [], () if level is None else level.settings)[1])
 
 
-def _merge(base: Mapping[str, Any], values: Sequence[Assignment]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The resolved configuration without and with the user's values."""
+def _merge(
+    base: Mapping[str, Any], values: Sequence[Assignment], below: Sequence[Assignment] = ()
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The resolved configuration without and with the user's values; ``below`` stand under them, and are not said by the user."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
     tree = OmegaConf.create(copy.deepcopy(dict(base)))
     if _another_form(base, values):
         OmegaConf.update(tree, "model.density", {}, merge=False)
-    for a in values:
+    for a in (*below, *values):
         try:
             OmegaConf.update(tree, a.key, a.value, merge=True, force_add=True)
         except (OmegaConfBaseException, ValueError, TypeError, AssertionError) as error:
@@ -254,12 +259,15 @@ def _merge(base: Mapping[str, Any], values: Sequence[Assignment]) -> tuple[dict[
     seconds = _said(values, "max_seconds")
     if seconds and seconds[-1] is not None and not _said(values, "iterations"):
         OmegaConf.update(tree, "train.iterations", None)  # a budget in seconds is used up, however fast the machine
+    strategy = _said(values, "strategy", "train.population")
+    if strategy and strategy[-1] != base["train"]["population"]["strategy"] and not _said(values, "grow_from", "train.population"):
+        OmegaConf.update(tree, "train.population.grow_from", 1.0)  # the preset's is for populations that grow that way
     return _plain(OmegaConf.create(dict(base))), _plain(tree)
 
 
-def _said(values: Sequence[Assignment], name: str) -> list[Any]:
-    """What the user's words say of ``train.name``, in their order."""
-    whole = [{name: a.value} if a.key == f"train.{name}" else a.value if a.key == "train" else {} for a in values]
+def _said(values: Sequence[Assignment], name: str, group: str = "train") -> list[Any]:
+    """What the user's words say of a setting of a group, in their order."""
+    whole = [{name: a.value} if a.key == f"{group}.{name}" else a.value if a.key == group else {} for a in values]
     return [given[name] for given in whole if isinstance(given, Mapping) and name in given]
 
 

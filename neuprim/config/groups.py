@@ -17,7 +17,7 @@ from neuprim.core.errors import ConfigError, nearest
 if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
 
-__all__ = ["TaskChoices", "check_groups", "check_scene", "presets", "task_choices"]
+__all__ = ["TaskChoices", "check_groups", "check_scene", "package_root", "presets", "read_yaml", "task_choices"]
 
 DEFAULT_PRESET = "quick"
 
@@ -42,17 +42,8 @@ def task_choices(spec: TaskSpec) -> TaskChoices:
         ConfigError: it is not YAML, has a key other than ``scene``, ``preset`` and ``options``, or sets an option that the task does
             not declare.
     """
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-    from yaml import YAMLError
-
     file = f"task/{spec.name}.yaml"
-    try:
-        node = OmegaConf.to_container(OmegaConf.create((_root(spec) / file).read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, OmegaConfBaseException, YAMLError) as error:
-        raise ConfigError(f"task {spec.name!r}: {file} cannot be read ({' '.join(str(error).split())})") from error
-    if not isinstance(node, dict):
-        raise ConfigError(f"task {spec.name!r}: {file}: expected a mapping")
+    node = read_yaml(package_root(spec) / file, f"task {spec.name!r}: {file}")
     known = ("scene", "preset", "options")
     for key in node:
         if key not in known:
@@ -70,6 +61,25 @@ def task_choices(spec: TaskSpec) -> TaskChoices:
         raise ConfigError(f"task {spec.name!r}: {file}: {error}") from error
 
 
+def read_yaml(file: Traversable, who: str) -> dict[Any, Any]:
+    """A plain mapping of a task's package.
+
+    Raises:
+        ConfigError: there is no such file, or it is none; the message begins with ``who``.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
+
+    try:
+        node = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
+    except (OSError, UnicodeDecodeError, OmegaConfBaseException, YAMLError) as error:
+        raise ConfigError(f"{who} cannot be read ({' '.join(str(error).split())})") from error
+    if not isinstance(node, dict):
+        raise ConfigError(f"{who}: expected a mapping")
+    return node
+
+
 def presets(spec: TaskSpec) -> list[str]:
     """Names of a task's presets."""
     return _names(spec, "preset")
@@ -77,7 +87,7 @@ def presets(spec: TaskSpec) -> list[str]:
 
 def check_groups(spec: TaskSpec) -> None:
     """Raises ConfigError when the configuration package cannot be used or lacks a file that a run would need."""
-    root = _root(spec)
+    root = package_root(spec)
     if not (root / "task" / f"{spec.name}.yaml").is_file():
         raise ConfigError(f"task {spec.name!r}: {spec.config_package} has no task/{spec.name}.yaml")
     if not spec.scenes:
@@ -97,7 +107,8 @@ def check_scene(spec: TaskSpec, scene: str, package: str) -> None:
         raise ConfigError(f"{who}: {package} has no scene/{spec.name}/{scene}.yaml")
 
 
-def _root(spec: TaskSpec) -> Traversable:
+def package_root(spec: TaskSpec) -> Traversable:
+    """Where a task's YAML files lie. Raises ConfigError when its package cannot be opened."""
     return _package(spec.config_package, f"task {spec.name!r}")
 
 
@@ -113,7 +124,7 @@ def _package(name: str, who: str) -> Traversable:
 
 
 def _names(spec: TaskSpec, group: str) -> list[str]:
-    folder = _root(spec) / group / spec.name
+    folder = package_root(spec) / group / spec.name
     if not folder.is_dir():
         return []
     return sorted(entry.name[: -len(".yaml")] for entry in folder.iterdir() if entry.name.endswith(".yaml"))

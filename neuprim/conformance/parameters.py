@@ -11,6 +11,7 @@ import torch
 
 from neuprim.config import check_groups, preset_settings, presets, task_choices
 from neuprim.config.declared import complete_options
+from neuprim.config.effort import Level, levels_of
 from neuprim.conformance.subject import Subject
 from neuprim.core.checked import checked
 from neuprim.core.errors import ConfigError
@@ -35,21 +36,22 @@ def check_members(t: Subject) -> None:
 
 
 def check_files(t: Subject) -> None:
-    """Every scene and preset has a YAML file that composes, and rates and their units only for parameters that exist, so that no choice is a dead end."""
+    """Every scene, preset and level of effort has settings that compose, and rates and their units only for parameters that exist, so that no choice is a dead end."""
     check_groups(t.task)
     choice = task_choices(t.task)
     known = t.task.parameter_names() | {s.name for s in GEOMETRY_SPECS}
-    for preset in presets(t.task):
-        settings = preset_settings(t.task, preset, choice.scene)
+    levels = levels_of(t.task, presets(t.task)) or {}
+    chosen: list[tuple[str, str, Level | None]] = [(f"preset {preset}", preset, None) for preset in presets(t.task)]
+    chosen += [(f"effort {number}", level.preset, level) for number, level in levels.items()]
+    for where, preset, level in chosen:
+        settings = preset_settings(t.task, preset, choice.scene, level)
         for group, given in (("rates", settings.train.rates), ("rate_units", settings.train.rate_units)):
             for name in given:
-                t.require(
-                    name in known, f"preset {preset}: train.{group}.{name}", "no such parameter", f"one of {', '.join(sorted(known))}"
-                )
+                t.require(name in known, f"{where}: train.{group}.{name}", "no such parameter", f"one of {', '.join(sorted(known))}")
         try:
             t.task.check(build_settings(t.task, settings.model, choice.options))
         except ConfigError as error:
-            t.require(False, f"preset {preset}", f"model settings that TaskSpec.check refuses ({error})", "settings that it accepts")
+            t.require(False, where, f"model settings that TaskSpec.check refuses ({error})", "settings that it accepts")
     for scene in t.task.scenes:
         preset_settings(t.task, choice.preset, scene.name)
 

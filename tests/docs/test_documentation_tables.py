@@ -97,10 +97,10 @@ def test_a_benchmark_rewrites_its_tables_without_measuring(
             assert (table in written) == ("-baselines" not in table and "-environment" not in table), table[:40]
 
 
-def test_the_readme_is_a_page_with_one_large_picture_and_one_of_curves() -> None:
+def test_the_readme_is_a_page_with_one_large_picture_and_two_of_curves() -> None:
     assert len(README.read_text(encoding="utf-8").splitlines()) <= 120
-    picture, curves = [target for target in links(README) if target.endswith(".png")]
-    assert curves == "docs/pictures/budgets.png"
+    picture, *curves = [target for target in links(README) if target.endswith(".png")]
+    assert curves == ["docs/pictures/budgets.png", "docs/pictures/effort.png"]
     with Image.open(ROOT / picture) as image:
         assert image.width >= 3 * 256 and image.height >= 2 * 256
     assert "generated data" in prose(README).lower()
@@ -109,6 +109,19 @@ def test_the_readme_is_a_page_with_one_large_picture_and_one_of_curves() -> None
 def test_the_table_of_voxels_is_that_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
     recorded = json.loads((RESULTS / "voxels.json").read_text(encoding="utf-8"))
     assert between("docs/dynamic.md", "voxels") == benchmark("voxels").table(recorded)
+
+
+def test_the_levels_of_effort_are_those_that_were_measured(benchmark: Callable[[str], ModuleType]) -> None:
+    """Both the tables and the files that a run reads."""
+    script = benchmark("effort")
+    found = {scene: script.recorded(script.file_of(scene)) for scene in script.NAMES if script.file_of(scene).exists()}
+    tables = [f"**{script.TITLES[scene]}**\n\n{script.table(rows, scene)}" for scene, rows in found.items()]
+    assert len(tables) >= 2 and between("docs/tradeoffs.md", "effort") == "\n\n".join(tables)
+    for scene, rows in found.items():
+        task = script.SCENES[scene].task
+        assert (ROOT / "neuprim" / "tasks" / task / "conf" / "effort" / f"{task}.yaml").read_text(encoding="utf-8") == script.frozen(
+            rows, scene
+        )
 
 
 def test_eight_bits_are_half_a_step_off_and_a_quarter_of_the_bytes(benchmark: Callable[[str], ModuleType]) -> None:

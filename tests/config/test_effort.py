@@ -1,0 +1,170 @@
+"""``effort=1`` to ``9``: levels that a task's package freezes, below what is typed and above the preset."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from neuprim.cli.listing import list_plugins
+from neuprim.config import RunConfig, compose, compose_all, presets
+from neuprim.config.effort import LEVELS, levels_of
+from neuprim.conformance import ConformanceError, named_checks
+from neuprim.core.errors import ConfigError
+from neuprim.plugins.registry import load_task
+from tests.plugins.fakes import site, toy
+
+__all__ = ["site", "toy"]
+
+RECORDS = Path(__file__).parents[2] / "benchmarks" / "results" / "effort"
+MEASURED = {"static": "chair", "dynamic": "smoke_fire", "relight": "lit_solids"}
+
+
+def write(toy: Path, text: str) -> None:
+    file = toy / "conf" / "effort" / "toy.yaml"
+    file.parent.mkdir(exist_ok=True)
+    file.write_text(text)
+
+
+@pytest.fixture
+def levels(toy: Path) -> Path:
+    lines = [f"  {n}: {{model.primitives: {100 * n}, train.iterations: {10 * n}}}" for n in LEVELS]
+    write(toy, "preset: long\nlevels:\n" + "\n".join(lines) + "\n")
+    return toy
+
+
+def run(*words: str) -> RunConfig:
+    return compose(["task=toy", *words], check_output=False)
+
+
+def test_a_level_lies_over_the_preset_that_it_was_measured_with(levels: Path) -> None:
+    config = run("effort=3")
+    assert (config.preset, config.model.primitives, config.train.iterations, config.renderer.near) == ("long", 300, 30, 0.5)
+    assert config.non_default == {"preset": ("quick", "long"), "model.primitives": (9, 300), "train.iterations": (700, 30)}
+    assert config.overrides == ["task=toy", "effort=3"]
+    assert run().preset == "quick", "without a level nothing changes"
+
+
+def test_what_is_typed_lies_over_the_level(levels: Path) -> None:
+    assert run("model.primitives=7", "effort=3").model.primitives == 7
+    assert run("effort=3", "preset=long").train.iterations == 30
+    timed = run("effort=3", "train.max_seconds=5").train
+    assert (timed.iterations, timed.max_seconds) == (None, 5.0), "a budget in seconds is used up"
+
+
+def test_levels_are_swept(levels: Path) -> None:
+    assert [c.model.primitives for c in compose_all(["task=toy", "effort=1,5,9"], check_output=False)] == [100, 500, 900]
+
+
+def test_the_list_of_tasks_says_that_there_are_levels(levels: Path) -> None:
+    assert any(line.split(maxsplit=1) == ["effort", "1 (fast) to 9 (good), of preset long"] for line in list_plugins())
+
+
+def test_a_run_is_the_same_as_if_its_settings_were_typed(levels: Path) -> None:
+    level, typed = run("effort=2"), run("preset=long", "model.primitives=200", "train.iterations=20")
+    assert (level.model, level.train, level.renderer, level.non_default) == (typed.model, typed.train, typed.renderer, typed.non_default)
+    assert RunConfig.from_yaml(_written(level)).train == typed.train
+
+
+def _written(config: RunConfig) -> Path:
+    config.output_dir.mkdir(parents=True)
+    (config.output_dir / "config.yaml").write_text(config.to_yaml())
+    return config.output_dir
+
+
+@pytest.mark.parametrize("word", ["0", "10", "best", "2.5", "-1"])
+def test_no_such_level(levels: Path, word: str) -> None:
+    with pytest.raises(ConfigError, match=rf"^effort={word}: expected a level from 1 \(fast\) to 9 \(good\)$"):
+        run(f"effort={word}")
+
+
+def test_levels_of_another_preset(levels: Path) -> None:
+    with pytest.raises(
+        ConfigError, match=r"^effort=2: levels of task 'toy' are of preset=long, found preset=quick; expected one of the two$"
+    ):
+        run("effort=2", "preset=quick")
+
+
+def test_a_task_without_levels(toy: Path) -> None:
+    with pytest.raises(ConfigError, match=r"^effort=2: task 'toy' has no levels; set model\.primitives=N and train\.iterations=N instead$"):
+        run("effort=2")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("preset: [", r"cannot be read"),
+        ("- 1", r"expected a mapping$"),
+        ("preset: quik\nlevels: {}", r"preset=quik: no such preset; did you mean 'quick'"),
+        ("preset: quick\nlevel: {}", r"level: no such setting; did you mean 'levels'"),
+        ("preset: quick\nlevels: {1: {model.primitives: 3}}", r"levels: found \[1\]; expected 1 to 9, in this order"),
+        ("preset: quick\nlevels: 3", r"levels: found 3; expected 1 to 9"),
+    ],
+)
+def test_a_damaged_file_is_named(toy: Path, text: str, expected: str) -> None:
+    write(toy, text)
+    with pytest.raises(ConfigError, match=r"^task 'toy': effort/toy\.yaml.*" + expected):
+        run("effort=1")
+
+
+@pytest.mark.parametrize(
+    ("one", "expected"),
+    [
+        ("{seed: 3}", r"levels\.1: found \{'seed': 3\}; expected settings of model, train and renderer"),
+        ("7", r"levels\.1: found 7; expected settings"),
+        ("{model.primitivs: 3}", r"model\.primitivs: no such setting; did you mean 'model\.primitives'"),
+        ("{model.primitives: 0}", r"model\.primitives=0: expected a whole number of at least 1"),
+    ],
+)
+def test_a_damaged_level_is_named(toy: Path, one: str, expected: str) -> None:
+    write(toy, "preset: quick\nlevels:\n" + "".join(f"  {n}: {one if n == 1 else '{}'}\n" for n in LEVELS))
+    with pytest.raises(ConfigError, match=expected):
+        run("effort=1")
+
+
+def test_conformance_holds_packages_to_their_levels(levels: Path) -> None:
+    """A task that is static but for its files; the check of files names the level that cannot be composed."""
+    task = replace(load_task("static"), name="toy", config_package="toytask.conf", scenes=load_task("toy").scenes, options={})
+    (levels / "conf" / "task" / "toy.yaml").write_text("scene: ball\n")
+    check = named_checks(task)["files"]
+    check()
+    file = levels / "conf" / "effort" / "toy.yaml"
+    file.write_text(file.read_text().replace("model.primitives: 400", "train.rates.glow: 0.1"))
+    with pytest.raises(ConformanceError, match=r"effort 4: train\.rates\.glow: found no such parameter"):
+        check()
+    file.write_text(file.read_text().replace("train.rates.glow: 0.1", "model.primitives: 0"))
+    with pytest.raises(ConformanceError, match=r"model\.primitives"):
+        check()
+
+
+# ---------------------------------------------------------------- the built-in tasks
+
+
+@pytest.mark.parametrize("name", MEASURED)
+def test_levels_are_points_that_were_measured(name: str) -> None:
+    """Each is a model that was trained in its time or less; a level is never worse than the one before, nor faster."""
+    spec = load_task(name)
+    levels = levels_of(spec, presets(spec))
+    if levels is None:
+        pytest.skip(f"no levels of task {name!r} have been measured yet")
+    trials = json.loads((RECORDS / f"{MEASURED[name]}.json").read_text())["trials"]
+    seen = []
+    for number, level in levels.items():
+        config = compose([f"task={name}", f"effort={number}"], check_output=False)
+        assert config.preset == level.preset == "quick"
+        there = [r for r in trials if (r["asked"], r["iterations"]) == (config.model.primitives, config.train.iterations)]
+        assert len(there) == 1 and there[0]["level"] <= number, f"level {number}"
+        seen.append(there[0])
+    judged = {"static": "psnr", "relight": "psnr_linear_clamped", "dynamic": "psnr_mask"}[name]
+    for measure in ("cpu_seconds", judged):
+        assert [row[measure] for row in seen] == sorted(row[measure] for row in seen), measure
+
+
+def test_what_a_file_says_is_yaml_that_people_read() -> None:
+    for name in MEASURED:
+        file = Path(__file__).parents[2] / "neuprim" / "tasks" / name / "conf" / "effort" / f"{name}.yaml"
+        if file.exists():
+            assert list(yaml.safe_load(file.read_text())["levels"]) == list(LEVELS)

@@ -199,8 +199,9 @@ def draw(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
         others = [row for row in rows if row not in levels]
         axis.scatter([r["cpu_seconds"] for r in others], [r[judged] for r in others], s=14, color="0.7", label="also tried", zorder=2)
         axis.plot([r["cpu_seconds"] for r in levels], [r[judged] for r in levels], marker="o", markersize=4.5, label="levels", zorder=3)
-        for level, row in zip(LEVELS, levels, strict=True):
-            axis.annotate(str(level), (row["cpu_seconds"], row[judged]), (-3, 5), textcoords="offset points", fontsize=8, ha="right")
+        for row in {row["trial"]: row for row in levels}.values():
+            name = ", ".join(str(level) for level, other in zip(LEVELS, levels, strict=True) if other is row)
+            axis.annotate(name, (row["cpu_seconds"], row[judged]), (-3, 5), textcoords="offset points", fontsize=8, ha="right")
         axis.set_xscale("log", base=2)
         axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axis.set_title(TITLES[scene].replace("`", ""), fontsize=9)

@@ -138,7 +138,9 @@ def _masks(model: Primitives, made: Schemes, codes: Mapping[str, Tensor]) -> tup
     One bit then says what would else be the most frequent code of every column of the piece.
     """
     shapes = {spec.name: spec.shape for spec in model.specs}
-    zero = {n: (s.values(codes[n]) == 0).reshape(model.count, *shapes[n]) for n, s in made.items() if isinstance(s, Columns) and n != "means"}
+    zero = {
+        n: (s.values(codes[n]) == 0).reshape(model.count, *shapes[n]) for n, s in made.items() if isinstance(s, Columns) and n != "means"
+    }
     masks: list[np.ndarray] = []
     whose: dict[str, Tensor] = {}
     for piece in pieces_by_name(model.density, model.colour).values():

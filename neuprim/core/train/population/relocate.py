@@ -18,7 +18,6 @@ __all__ = ["Relocate"]
 _GROWTH = 0.25
 """Share of the primitives that is born at once: a split costs quality that training has to win back. It is more where the count would else not be reached."""
 
-
 _PARTS = 3
 """Of the time between ``start`` and ``stop``, at least, between which primitives are born while some are missing."""
 

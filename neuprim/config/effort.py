@@ -54,9 +54,8 @@ def chosen_level(spec: TaskSpec, chosen: str | None, preset: str | None, presets
     """
     if chosen is None:
         return None
-    expected = f"a level from {LEVELS[0]} (fast) to {LEVELS[-1]} (good)"
     if chosen not in map(str, LEVELS):
-        raise ConfigError(f"{EFFORT}={chosen}: expected {expected}")
+        raise ConfigError(f"{EFFORT}={chosen}: expected a level from {LEVELS[0]} (fast) to {LEVELS[-1]} (good)")
     levels = levels_of(spec, presets)
     if levels is None:
         raise ConfigError(f"{EFFORT}={chosen}: task {spec.name!r} has no levels; set model.primitives=N and train.iterations=N instead")

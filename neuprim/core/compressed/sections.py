@@ -193,7 +193,7 @@ def _counts(section: Section, count: int, masks: Sequence[np.ndarray]) -> list[i
     whose = _whose(section)
     if max(whose, default=0) > len(masks):
         raise Damaged(f"a column of the primitives of mask {max(whose)}; expected at most {len(masks)}, as many as there are before it")
-    sizes = [count, *(int(mask.sum()) for mask in masks)]
+    sizes = {of: int(masks[of - 1].sum()) if of else count for of in set(whose)}  # no more work than the section has numbers
     return [sizes[of] for of in whose]
 
 

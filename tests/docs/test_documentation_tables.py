@@ -116,7 +116,7 @@ def test_the_levels_of_effort_are_those_that_were_measured(benchmark: Callable[[
     script = benchmark("effort")
     found = {scene: script.recorded(script.file_of(scene)) for scene in script.NAMES if script.file_of(scene).exists()}
     tables = [f"**{script.TITLES[scene]}**\n\n{script.table(rows, scene)}" for scene, rows in found.items()]
-    assert len(tables) >= 2 and between("docs/tradeoffs.md", "effort") == "\n\n".join(tables)
+    assert len(tables) == 3 and between("docs/tradeoffs.md", "effort") == "\n\n".join(tables)
     for scene, rows in found.items():
         task = script.SCENES[scene].task
         assert (ROOT / "neuprim" / "tasks" / task / "conf" / "effort" / f"{task}.yaml").read_text(encoding="utf-8") == script.frozen(

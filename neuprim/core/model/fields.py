@@ -139,6 +139,12 @@ class Field(ABC):
         """
         return dict(params)
 
+    def script(self) -> str | None:
+        """JavaScript that folds conditions into the field's closed form as :meth:`DensityField.lower` and :meth:`ColourField.lower` do, for
+        pages that draw the model in a browser; docs/plugins.md says what it must evaluate to. None: such pages cannot show the field.
+        """
+        return None
+
 
 def pieces_by_name(density: DensityField, colour: ColourField) -> dict[str, Piece]:
     """The pieces of both fields, as ``density.neuron 0`` and ``colour.band 1``."""

@@ -15,6 +15,7 @@ from neuprim.core.model.fields import ColourField, Conditions, Constant
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import ParameterSpec, Params
+from neuprim.core.model.scripts import script_beside
 from neuprim.tasks.dynamic.density import time_of
 
 __all__ = ["TimeHarmonics"]
@@ -120,6 +121,9 @@ class TimeHarmonics(ColourField):
         """Bands, and terms in time one by one."""
         terms = zip(_TIME, (self.powers, self.waves, self.waves), strict=True)
         return (*sh.bands(self.degree, "sh_rest"), *(Piece(f"{name} {i + 1}", {name: (i,)}) for name, count in terms for i in range(count)))
+
+    def script(self) -> str:
+        return script_beside(__package__, "colour.js")
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         dc, rest = self.harmonics(params, conditions)

@@ -26,6 +26,7 @@ from neuprim.core.model.folding import fold_cosines
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
+from neuprim.core.model.scripts import script_beside
 from neuprim.core.train.population import SPLIT_LONG, SPLIT_SHIFT
 from neuprim.tasks.dynamic.stilled import stilled
 
@@ -194,6 +195,9 @@ class TimeDensity(DensityField):
         if "motion" in self.parts:
             found += [Piece(name, {name: ()}) for name in ("velocity", "acceleration")]
         return tuple(found)
+
+    def script(self) -> str:
+        return script_beside(__package__, "density.js")
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         scaled = self.static.scale_density(params, factor)

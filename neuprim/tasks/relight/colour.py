@@ -26,6 +26,7 @@ from neuprim.core.model.folding import fold_cosines
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
+from neuprim.core.model.scripts import script_beside
 from neuprim.core.settings import RenderSettings
 from neuprim.tasks.relight.directions import unit
 from neuprim.tasks.relight.fewer import fewer_units
@@ -136,6 +137,9 @@ class LightNetwork(ColourField):
         """Hidden units."""
         inputs = ("net_x", "net_view", "net_light", "net_phase")
         return tuple(Piece(f"unit {h}", {**dict.fromkeys(inputs, (h,)), "net_out": (slice(None), h)}) for h in range(self.hidden))
+
+    def script(self) -> str:
+        return script_beside(__package__, "colour.js")
 
     def folded(self, params: Params) -> dict[str, Tensor]:
         return fold_cosines(params, ("net_x", "net_view", "net_light"), "net_phase", "net_out", self.boost)

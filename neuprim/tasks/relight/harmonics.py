@@ -15,6 +15,7 @@ from neuprim.core.model.fields import ColourField, Conditions, Constant
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import ParameterSpec, Params
+from neuprim.core.model.scripts import script_beside
 from neuprim.tasks.relight.directions import unit
 
 __all__ = ["LightHarmonics", "real_harmonics"]
@@ -52,6 +53,9 @@ class LightHarmonics(ColourField):
     def pieces(self) -> tuple[Piece, ...]:
         """Bands."""
         return bands(self.degree, "light_sh")
+
+    def script(self) -> str:
+        return script_beside(__package__, "harmonics.js")
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         color = params["c_dc"]

@@ -13,6 +13,7 @@ from neuprim.core.model.fields import ColourField, Conditions, Constant
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import ParameterSpec, Params
+from neuprim.core.model.scripts import script_beside
 
 __all__ = ["SphericalHarmonics"]
 
@@ -56,6 +57,9 @@ class SphericalHarmonics(ColourField):
     def pieces(self) -> tuple[Piece, ...]:
         """Bands."""
         return sh.bands(self.degree, "sh_rest")
+
+    def script(self) -> str:
+        return script_beside(__package__, "fields.js")
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         return Constant(sh.colors(geometry.means, params["sh_dc"], params.get("sh_rest"), camera.position, self.active))

@@ -22,6 +22,7 @@ from neuprim.core.model.footprint import gaussian_support
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
+from neuprim.core.model.scripts import script_beside
 from neuprim.core.model.tensors import number_fault
 
 __all__ = ["DENSITY_OPTIONS", "DENSITY_TRADE", "OMEGA0", "CosineDensity", "amplified", "cosine_density", "split_cosine", "split_scale"]
@@ -120,6 +121,9 @@ class CosineDensity(DensityField):
     def pieces(self) -> tuple[Piece, ...]:
         """Neurons."""
         return tuple(Piece(f"neuron {k}", {"W1": (k,), "b1": (k,), "w2": (k,)}) for k in range(self.neurons))
+
+    def script(self) -> str:
+        return script_beside(__package__, "cosine.js")
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         return {**params, "w2": params["w2"] * factor[:, None], "b2": params["b2"] * factor[:, None]}

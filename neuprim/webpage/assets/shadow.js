@@ -1,0 +1,67 @@
+// Light that arrives at primitives or points, by depth images out of the light in slabs: neuprim/tasks/relight/visibility.py has the mathematics.
+const FAR = 1e3; // scene radii
+
+// The light's camera over all living primitives, and the depths between slabs; null where the light is in the middle of everything.
+function lightCamera(scene, scales, living, light, { size, layers }) {
+  const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+  for (const i of living) {
+    for (let a = 0; a < 3; a++) {
+      low[a] = Math.min(low[a], scene[3 * i + a]);
+      high[a] = Math.max(high[a], scene[3 * i + a]);
+    }
+  }
+  const middle = low.map((x, a) => (x + high[a]) / 2);
+  let far = 0, largest = 0;
+  for (const i of living) {
+    far = Math.max(far, Math.hypot(scene[3 * i] - middle[0], scene[3 * i + 1] - middle[1], scene[3 * i + 2] - middle[2]));
+    largest = Math.max(largest, scales[i]);
+  }
+  const radius = far + largest;
+  let away = light.map((x, a) => x - middle[a]), distance = Math.hypot(...away);
+  if (distance < 1e-9 * Math.max(radius, 1e-30)) return null;
+  if (distance > FAR * radius) { // from there all rays are parallel
+    away = away.map(x => (x * FAR * radius) / distance);
+    distance = FAR * radius;
+  }
+  const from = away.map((x, a) => x + middle[a]), up = Math.abs(away[2]) < 0.9 * distance ? [0, 0, 1] : [0, 1, 0];
+  const z = away.map(x => -x / distance), x = lib.cross(z, up), length = Math.hypot(...x);
+  for (let a = 0; a < 3; a++) x[a] /= length;
+  const y = lib.cross(z, x), R = [...x, ...y, ...z], focal = (0.5 * size) / Math.tan(Math.asin(Math.min(radius / distance, 0.94)));
+  const t = [x, y, z].map(axis => -lib.dot(axis, from));
+  let nearest = Infinity, furthest = -Infinity;
+  for (const i of living) {
+    const d = z[0] * scene[3 * i] + z[1] * scene[3 * i + 1] + z[2] * scene[3 * i + 2] + t[2];
+    nearest = Math.min(nearest, d);
+    furthest = Math.max(furthest, d);
+  }
+  const edges = Array.from({ length: layers - 1 }, (_, k) => nearest + ((furthest - nearest) * (k + 1)) / layers);
+  const near = Math.max(1e-4 * radius, distance - 1.5 * radius, 1e-6);
+  return { R, t, fx: focal, fy: focal, cx: size / 2, cy: size / 2, width: size, height: size, near, edges, diameter: 2 * radius };
+}
+
+// Visibility of the point (x, y, z); maps: per slab Float32Array (size, size, 4) whose first number is sum of w z and whose last is T.
+function arrivingAt(px, py, pz, camera, maps, bias, softness) {
+  const { R, t, fx, width: size, near, diameter } = camera;
+  const x = R[0] * px + R[1] * py + R[2] * pz + t[0], y = R[3] * px + R[4] * py + R[5] * pz + t[1], z = R[6] * px + R[7] * py + R[8] * pz + t[2];
+  if (!(z > near)) return 1;
+  const u = (fx * x) / z + 0.5 * size - 0.5, v = (fx * y) / z + 0.5 * size - 0.5; // in pixels, 0 the middle of the first
+  if (!(u > -1 && u < size && v > -1 && v < size)) return 1;
+  const i = Math.floor(v), j = Math.floor(u), down = v - i, right = u - j;
+  let found = 1;
+  for (const map of maps) {
+    let alpha = 0, nearness = 0;
+    for (let k = 0; k < 4; k++) {
+      const row = i + (k >> 1), column = j + (k & 1);
+      if (row < 0 || row >= size || column < 0 || column >= size) continue;
+      const o = 4 * (row * size + column), opacity = 1 - map[o + 3];
+      if (!(opacity > 0)) continue;
+      const weight = (k >> 1 ? down : 1 - down) * (k & 1 ? right : 1 - right) * opacity;
+      alpha += weight;
+      nearness += weight / Math.max(map[o] / opacity, near);
+    }
+    const behind = z - alpha / Math.max(nearness, 1e-12);
+    const s = Math.min(Math.max(0.5 + (0.5 * (behind - bias * diameter)) / (softness * diameter), 0), 1);
+    found *= 1 - alpha * s * s * (3 - 2 * s);
+  }
+  return found;
+}

@@ -1,0 +1,47 @@
+// Off the main thread: unpacks the model, prepares frames, works out shadows. Messages: {kind, ...} here and back, one frame at a time.
+function preparing(post) {
+  let engine = null, colour = null, lit = "", camera = null, maps = null, visible = null;
+
+  async function begin({ page, numbers }) {
+    const tensors = await numbersOf(numbers, page.numbers, page.count);
+    const density = fieldScripts.density(page.fields.density, tensors, page.count, lib);
+    colour = fieldScripts.colour(page.fields.colour, tensors, page.count, lib);
+    engine = preparer(page, tensors, density, colour);
+    const { neurons, units, moving, turns, K, H, edge, phaseTexels } = engine;
+    const { where, bias, softness } = colour.shadow || {}; // functions do not travel
+    post({ kind: "ready", neurons, units, moving, turns, K, H, edge, phaseTexels, shadow: { where, bias, softness } });
+  }
+
+  function frame(request) {
+    const start = performance.now(), { conditions, rows, phases } = request, settled = engine.settle(conditions), shadow = colour.shadow;
+    if (shadow && lit !== JSON.stringify(conditions)) { // what the light sees has changed: the page draws it first, and asks again with the images
+      camera = settled.living.length ? lightCamera(engine.scene, engine.scales, settled.living, shadow.light(conditions), shadow) : null;
+      lit = JSON.stringify(conditions);
+      visible = null;
+      maps = null;
+      if (camera) {
+        const { count } = engine.frame(camera, conditions, settled, null, rows, phases);
+        const ends = [...engine.within(rows, count, camera.edges), count];
+        return post({ ...request, kind: "light", camera, ends, asked: request.camera }, [rows.buffer, phases.buffer]);
+      }
+    }
+    if (camera && maps && shadow.where === "primitive" && !visible) {
+      visible = new Float64Array(engine.scales.length);
+      for (const i of settled.living) {
+        const [x, y, z] = engine.scene.subarray(3 * i, 3 * i + 3);
+        visible[i] = Math.fround(arrivingAt(x, y, z, camera, maps, shadow.bias, shadow.softness));
+      }
+    }
+    const done = engine.frame(request.camera, conditions, settled, visible, rows, phases);
+    post({ ...request, kind: "frame", ...done, light: maps && camera, milliseconds: performance.now() - start }, [rows.buffer, phases.buffer]);
+  }
+
+  return ({ data }) => {
+    if (data.kind === "begin") begin(data).catch(error => post({ kind: "fault", text: error.message }));
+    if (data.kind === "frame") frame(data);
+    if (data.kind === "maps") {
+      maps = data.maps;
+      frame({ ...data, kind: "frame", maps: null });
+    }
+  };
+}

@@ -1,0 +1,85 @@
+"""A model's parameters in a page: codes of a few bits or whole floats, as byte planes, gzipped; ``assets/codec.js`` reads them."""
+
+from __future__ import annotations
+
+import gzip
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from neuprim.core.compressed import bit_table, file_order, folded, schemes
+from neuprim.core.compressed.rotations import Rotations
+from neuprim.core.model.primitives import Primitives
+
+__all__ = ["PackedModel", "pack_model"]
+
+
+@dataclass(frozen=True)
+class PackedModel:
+    """A model as a page holds it.
+
+    Attributes:
+        parts: how each parameter is coded, in the order of ``data``.
+        data: gzipped.
+        model: what comes back.
+    """
+
+    parts: tuple[dict[str, Any], ...]
+    data: bytes
+    model: Primitives
+
+
+def pack_model(model: Primitives, level: int) -> PackedModel:
+    """All parameters: every bit of them at level 0, else in as few bits as ``neuprim compress --level`` 1 to 5 gives them.
+
+    Raises:
+        ConfigError: no such level.
+        CheckpointError: numbers that cannot be stored.
+    """
+    made = _exact(model) if level == 0 else _coded(model, level)
+    parts, planes, params = zip(*made, strict=True) if made else ((), (), ())
+    data = gzip.compress(b"".join(planes), 9, mtime=0)
+    return PackedModel(
+        tuple(parts), data, Primitives(model.density, model.colour, {part["name"]: x for part, x in zip(parts, params, strict=True)})
+    )
+
+
+_Made = list[tuple[dict[str, Any], bytes, Tensor]]
+
+
+def _exact(model: Primitives) -> _Made:
+    made: _Made = []
+    for spec in model.specs:
+        x = model.params[spec.name].detach().cpu().float().contiguous()
+        whole = x.reshape(model.count, spec.size).numpy().astype("<f4").view("<u4")
+        made.append(({"name": spec.name, "shape": list(spec.shape), "coding": "float32"}, _planes(whole, [32] * spec.size), x))
+    return made
+
+
+def _coded(model: Primitives, level: int) -> _Made:
+    own = folded(model)
+    found = schemes(own, bit_table(level, (), own.specs))
+    order = file_order(own, found)
+    made: _Made = []
+    for spec in own.specs:
+        scheme = found[spec.name]
+        codes = scheme.codes(own.params[spec.name].reshape(own.count, spec.size)[order])
+        about: dict[str, Any] = {"name": spec.name, "shape": list(spec.shape)}
+        if isinstance(scheme, Rotations):
+            about |= {"coding": "rotations", "bits": scheme.bits}
+            bits = [2, *([scheme.bits] * 3)]
+        else:
+            bits = scheme.bits.tolist()
+            about |= {"coding": "columns", "bits": bits, "low": scheme.low.tolist(), "high": scheme.high.tolist()}
+        made.append((about, _planes(codes.numpy(), bits), scheme.values(codes).reshape(own.count, *spec.shape)))
+    return made
+
+
+def _planes(codes: np.ndarray, bits: list[int]) -> bytes:
+    """Column by column the low bytes of all codes (N, C), then the next, as many as so many bits need: they compress better so."""
+    return b"".join(
+        ((codes[:, c] >> (8 * i)) & 255).astype(np.uint8).tobytes() for c, width in enumerate(bits) for i in range(math.ceil(width / 8))
+    )

@@ -1,0 +1,179 @@
+"""Pages draw what the float64 reference draws: every field, near and far, cut and inside. Read back from headless Chromium as numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from browsers import Tab, open_tab
+from page_models import LIGHT, SETTINGS, camera_at, page_of, random_model
+
+from neuprim.core.cameras import Camera
+from neuprim.core.io.images import to_uint8
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import render
+from neuprim.core.settings import RenderSettings
+from neuprim.tasks.dynamic.colour import TimeHarmonics
+from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.relight.colour import LightNetwork
+from neuprim.tasks.relight.harmonics import LightHarmonics
+from neuprim.tasks.static.fields import SphericalHarmonics
+
+ERROR = 1e-5
+EYES = ((0.3, -3.0, 1.0), (2.0, 2.0, -1.5), (-0.4, 0.2, 0.1))
+"""Two from outside, one among the primitives."""
+
+
+def error(tab: Tab, model: Primitives, camera: Camera, conditions: dict[str, torch.Tensor], settings: RenderSettings = SETTINGS) -> float:
+    """Largest difference of colours and transmittances from the reference backend."""
+    with torch.no_grad():
+        truth = render(model, camera, conditions, replace(settings, backend="reference"))
+    found = tab.numbers(camera, conditions)
+    assert float(truth.alpha.max()) > 0.3
+    wrong = max(np.abs(found[..., :3] - truth.rgb.double().numpy()).max(), np.abs(1 - found[..., 3] - truth.alpha.double().numpy()).max())
+    return float(wrong)
+
+
+@pytest.mark.parametrize("edge", [0, 1, 2])
+@pytest.mark.parametrize("neurons", [0, 2, 5, 8])
+def test_static_models(neurons: int, edge: int, chromium: Any, tmp_path: Path) -> None:
+    degree = {0: 0, 2: 1, 5: 2, 8: 3}[neurons]
+    model = random_model(CosineDensity(neurons, edge=edge, gain=edge > 0), SphericalHarmonics(degree))
+    page_of(model, tmp_path / "p.html")
+    with open_tab(chromium, tmp_path / "p.html") as tab:
+        for eye in EYES:
+            assert error(tab, model, camera_at(eye), {}) < ERROR
+        assert tab.faults == []
+
+
+@pytest.mark.parametrize("edge", [0, 1, 2])
+def test_chords_that_the_near_plane_cuts(edge: int, chromium: Any, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, near=2.6)
+    model = random_model(CosineDensity(4, edge=edge), SphericalHarmonics(1), seed=1)
+    page_of(model, tmp_path / "p.html", settings=settings)
+    with open_tab(chromium, tmp_path / "p.html") as tab:
+        assert error(tab, model, camera_at((0.3, -3.0, 1.0)), {}, settings) < ERROR
+
+
+def test_from_very_far(chromium: Any, tmp_path: Path) -> None:
+    """At 1e5 times the distance, with the lens to match."""
+    model = random_model(CosineDensity(4, edge=2), SphericalHarmonics(2), seed=2)
+    page_of(model, tmp_path / "p.html")
+    with open_tab(chromium, tmp_path / "p.html") as tab:
+        assert error(tab, model, camera_at((3e4, -3e5, 1e5), focal=8e6), {}) < ERROR
+
+
+@pytest.mark.parametrize(
+    ("time", "colour"),
+    [
+        ("none", TimeHarmonics(0, powers=0, waves=0)),
+        ("window+motion", TimeHarmonics(1, powers=2, waves=0)),
+        ("phase+offset", TimeHarmonics(0, powers=0, waves=3, frequencies="printed")),
+        ("phase+offset+window+motion", TimeHarmonics(3)),
+    ],
+)
+def test_dynamic_models(time: str, colour: TimeHarmonics, chromium: Any, tmp_path: Path) -> None:
+    model = random_model(TimeDensity(3, time, edge=2, gain=True), colour, count=90)
+    xi = torch.tensor(0.3)
+    page_of(model, tmp_path / "p.html", {"time": xi})
+    with open_tab(chromium, tmp_path / "p.html") as tab:
+        for moment in (0.0, 0.37, 1.0):
+            assert error(tab, model, camera_at(EYES[0]), {"time": torch.tensor(moment, dtype=torch.float64)}) < ERROR
+        assert tab.faults == []
+
+
+@pytest.mark.parametrize("visibility", ["none", "primitive", "pixel"])
+@pytest.mark.parametrize(("form", "falloff"), [("additive", False), ("multiplicative", True)])
+def test_relit_models(visibility: str, form: str, falloff: bool, chromium: Any, tmp_path: Path) -> None:
+    """The depth images out of the light are drawn by the page too. What lies near their shadows' edges amplifies their rounding."""
+    model = random_model(CosineDensity(2, edge=2), LightNetwork(5, form=form, visibility=visibility, falloff=falloff), seed=3)
+    page_of(model, tmp_path / "p.html", LIGHT)
+    with open_tab(chromium, tmp_path / "p.html") as tab:
+        for light in (LIGHT["light"], torch.tensor([-1.0, 0.5, 3.0]), torch.tensor([0.0, 0.0, -0.3])):
+            assert error(tab, model, camera_at(EYES[0]), {**LIGHT, "light": light.double()}) < (ERROR if visibility == "none" else 5 * ERROR)
+        assert tab.faults == []
+
+
+@pytest.mark.parametrize("degree", [0, 2, 5, 8])
+def test_harmonics_of_the_light(degree: int, chromium: Any, tmp_path: Path) -> None:
+    model = random_model(CosineDensity(2), LightHarmonics(degree, falloff=True), seed=4)
+    page_of(model, tmp_path / "p.html", LIGHT)
+    with open_tab(chromium, tmp_path / "p.html") as tab:
+        assert error(tab, model, camera_at(EYES[0]), LIGHT) < ERROR
+
+
+def test_networks_of_any_size(chromium: Any, tmp_path: Path) -> None:
+    for hidden in (0, 3, 8, 16):
+        model = random_model(CosineDensity(1), LightNetwork(hidden, visibility="none"), seed=hidden)
+        page_of(model, tmp_path / "p.html", LIGHT)
+        with open_tab(chromium, tmp_path / "p.html") as tab:
+            assert error(tab, model, camera_at(EYES[1]), LIGHT) < ERROR
+
+
+def test_cuts_are_the_settings(chromium: Any, tmp_path: Path) -> None:
+    """Pairs fainter than alpha_min are left out; single ones may fall on the other side of it."""
+    settings = replace(SETTINGS, alpha_min=0.05, alpha_max=0.6)
+    model = random_model(CosineDensity(2, edge=1), SphericalHarmonics(1), seed=5)
+    page_of(model, tmp_path / "p.html", settings=settings)
+    with open_tab(chromium, tmp_path / "p.html") as tab:
+        camera = camera_at(EYES[0])
+        with torch.no_grad():
+            truth = render(model, camera, {}, replace(settings, backend="reference")).rgb.double().numpy()
+            uncut = render(model, camera, {}, replace(SETTINGS, backend="reference")).rgb.double().numpy()
+        wrong = np.abs(tab.numbers(camera)[..., :3] - truth)
+        assert np.quantile(wrong, 0.999) < ERROR and np.abs(uncut - truth).max() > 0.01
+
+
+def test_depth_and_density_slices(chromium: Any, tmp_path: Path) -> None:
+    model = random_model(CosineDensity(3, edge=1, gain=True), SphericalHarmonics(0), seed=6)
+    page_of(model, tmp_path / "p.html")
+    camera, plane = camera_at(EYES[0]), 3.0
+    with torch.no_grad():
+        truth = render(model, camera, {}, replace(SETTINGS, backend="reference", depth=True))
+        rows, columns = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+        local = torch.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, torch.ones_like(rows)], -1).double() * plane
+        view = camera.viewmat.double()
+        points = ((local - view[:3, 3]) @ view[:3, :3]).reshape(-1, 3)
+        sigma = torch.zeros(len(points), dtype=torch.float64)
+        geometry = model.geometry
+        for i in range(model.count):
+            whitened = (points - geometry.means[i].double()) @ geometry.rotations[i].double() / geometry.scales[i].double()
+            inside = ((whitened**2).sum(-1) < 1).nonzero()[:, 0]
+            sigma[inside] += model.living({}, torch.float64).sigma(torch.full((len(inside),), i), points[inside])
+    assert truth.depth is not None
+    with open_tab(chromium, tmp_path / "p.html") as tab:
+        found = tab.numbers(camera, mode="DEPTH")
+        hit = truth.alpha.numpy() > 0.05
+        assert np.abs(found[..., 0] / np.maximum(1 - found[..., 3], 1e-12) - truth.depth.double().numpy())[hit].max() < 1e-4
+        slices = tab.numbers(camera, mode="SLICE", plane=plane)[..., 0].reshape(-1)
+        assert sigma.max() > 1 and np.abs(slices - sigma.numpy()).max() < 1e-4 * float(sigma.max())
+
+
+def test_what_is_seen_is_the_display_s(chromium: Any, tmp_path: Path) -> None:
+    """Canvas bytes: over the background, through the sRGB curve where values are linear."""
+    model = random_model(CosineDensity(2, edge=2), SphericalHarmonics(1), seed=7)
+    background = torch.tensor([0.2, 0.5, 0.8])
+    camera = camera_at(EYES[0])
+    with torch.no_grad():
+        truth = render(model, camera, {}, replace(SETTINGS, backend="reference"), background).rgb
+    for linear in (False, True):
+        page_of(model, tmp_path / "p.html", background=background.tolist(), linear=linear)
+        encoded = torch.where(truth > 0.0031308, 1.055 * truth.clamp_min(1e-9) ** (1 / 2.4) - 0.055, 12.92 * truth) if linear else truth
+        with open_tab(chromium, tmp_path / "p.html") as tab:
+            wrong = np.abs(tab.shown(camera).astype(int) - to_uint8(encoded).numpy().astype(int))
+            assert wrong.max() <= 1 and (wrong > 0).mean() < 0.01
+
+
+@pytest.mark.parametrize("level", [0, 1, 3, 5])
+def test_the_page_has_the_numbers_that_python_says(level: int, chromium: Any, tmp_path: Path) -> None:
+    model = random_model(CosineDensity(3, edge=2, gain=True), SphericalHarmonics(2), seed=8)
+    page = page_of(model, tmp_path / "p.html", level=level)
+    with open_tab(chromium, tmp_path / "p.html") as tab:
+        assert error(tab, page.model, camera_at(EYES[0]), {}) < ERROR
+    if level == 0:
+        assert all(torch.equal(page.model.params[name], value) for name, value in model.params.items())

@@ -63,7 +63,9 @@ class Tab:
             assert time.monotonic() < end, f"{condition}: not within {patience} s; {self.faults} {self.page.inner_text('#fault')}"
             time.sleep(0.02)
 
-    def numbers(self, camera: Camera, conditions: Mapping[str, Tensor] | None = None, mode: str = "COLOUR", plane: float = 1.0) -> np.ndarray:
+    def numbers(
+        self, camera: Camera, conditions: Mapping[str, Tensor] | None = None, mode: str = "COLOUR", plane: float = 1.0
+    ) -> np.ndarray:
         """(H, W, 4) float64: colour before the background (of DEPTH, sum of w z), and transmittance."""
         values = {name: value.double().tolist() for name, value in (conditions or {}).items()}
         found = self.page.evaluate("([c, v, m, p]) => probe.numbers(c, v, m, p)", [camera_numbers(camera), values, mode, plane])

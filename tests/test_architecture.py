@@ -46,12 +46,13 @@ ROOMS: dict[str, set[str]] = {
     "core": {"version"},
     "scenes": {"core"},
     "tasks": {"core", "scenes"},
-    "plugins": {"core", "version"},
+    "webpage": {"core"},
+    "plugins": {"core", "version", "webpage"},
     "functional": {"core"},
     "report": {"core"},
     "config": {"core", "plugins", "version"},
     "conformance": {"config", "core", "plugins"},
-    "runs": {"config", "core", "plugins", "report", "version"},
+    "runs": {"config", "core", "plugins", "report", "version", "webpage"},
     "cli": {"config", "core", "plugins", "runs", "version"},
 }
 """Room of the package -> those it may import from."""

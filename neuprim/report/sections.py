@@ -29,6 +29,7 @@ __all__ = [
     "regions",
     "settings",
     "view_table",
+    "viewer",
 ]
 
 MAX_VIEWS = 24
@@ -100,6 +101,19 @@ def headline(run: RunRecord) -> str:
         picture = _figure(inline(run.orbit), caption, "camera orbit around the scene", exists=True)
         html = f'<div class="with-orbit"><div>{html}</div><div class="orbit">{picture}</div></div>'
     return html
+
+
+def viewer(page: str, linked: str) -> str:
+    """The model to turn: a page in this page, or a link to one."""
+    if page:
+        what = "Drag to turn, wheel to zoom, Shift and drag to move."
+        return f"""<section><h2>The model</h2>
+<iframe title="the model, drawn by this browser" loading="lazy" srcdoc="{escape(page)}"></iframe><p class="rule">{what}</p></section>"""
+    if linked:
+        return (
+            f'<section><h2>The model</h2><p><a href="{escape(linked)}">{escape(linked)}</a> draws it, to be turned by hand.</p></section>'
+        )
+    return ""
 
 
 Tile = tuple[str, str, str, str]

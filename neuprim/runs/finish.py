@@ -6,14 +6,18 @@ from pathlib import Path
 
 import torch
 
+from neuprim.core.cameras import Camera
 from neuprim.core.data import Clip, View
 from neuprim.core.io import images
 from neuprim.core.io.files import write_json
+from neuprim.core.model.fields import Conditions
+from neuprim.core.model.primitives import Primitives
 from neuprim.plugins.judging import clips_of, orbit_of
-from neuprim.report import error_map, write_report
+from neuprim.report import Viewer, error_map, write_report
 from neuprim.report.regions import Regions
 from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import draw, measure, summary
+from neuprim.webpage.scene import held_out, scene_page, start_of
 
 __all__ = ["finish"]
 
@@ -65,4 +69,30 @@ def finish(fitted: Fitted, directory: Path) -> None:
     views_around = orbit_of(task, dataset, _ORBIT_FRAMES)
     frames = [channels.display(draw(model, v, config.renderer, dataset.background)) for v in views_around]
     images.write_animation(folder / "orbit.webp", frames, fps=12.0)
-    write_report(directory, task.conditions)
+    write_report(directory, task.conditions, _viewer(fitted, directory))
+
+
+def _viewer(fitted: Fitted, directory: Path) -> Viewer | None:
+    """The page that draws the model; None of a model that no page can show."""
+    config, task, dataset, channels = fitted.config, fitted.task, fitted.dataset, fitted.channels
+    if channels.own is not None or channels.rgb is None or fitted.model.density.script() is None or fitted.model.colour.script() is None:
+        return None
+
+    def look(model: Primitives, camera: Camera, conditions: Conditions) -> torch.Tensor:
+        return draw(model, View("", camera, conditions), config.renderer, dataset.background)
+
+    views = held_out(dataset, channels, _SHOWN_VIEWS)
+    page = scene_page(
+        directory.resolve().name,
+        fitted.model,
+        channels,
+        config.renderer,
+        look,
+        specs=task.conditions,
+        start=start_of(task.conditions, views, {}),
+        views=views,
+        background=dataset.background.tolist(),
+        up=dataset.up.tolist(),
+        subtitle=task.name if dataset.data_source == "real" else f"{task.name}, {dataset.data_source} data",
+    )
+    return Viewer(page.text, page.nonce)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import hashlib
 import html
 import json
 import math
@@ -68,11 +69,13 @@ class WebPage:
         text: of the file.
         model: what the page draws: the model in the numbers that it holds.
         numbers: bytes of these, gzipped.
+        nonce: what its policy knows its own scripts by, for a page that embeds it and whose policy it falls under.
     """
 
     text: str
     model: Primitives
     numbers: int
+    nonce: str
 
 
 def web_page(
@@ -142,7 +145,9 @@ def web_page(
         "shared": "\n".join([*(texts[path] for path in _SHARED), fields]),
         "main": "\n".join([shaders, *(texts[path] for path in _MAIN)]),
     }
-    return WebPage(_PLACE.sub(lambda place: parts[place.group(1)], texts["page.html"]), packed.model, len(packed.data))
+    parts["nonce"] = hashlib.sha256("".join(parts.values()).encode()).hexdigest()[:32]  # no text inside can know it
+    text = _PLACE.sub(lambda place: parts[place.group(1)], texts["page.html"])
+    return WebPage(text, packed.model, len(packed.data), parts["nonce"])
 
 
 def _script(kind: str, field: Field) -> str:
@@ -206,6 +211,6 @@ def _condition(one: Condition, views: Sequence[PageView]) -> dict[str, Any]:
     value = one.value.double().tolist()
     if one.spec.shape == () and high - low > _WIDE:
         seen = [float(view.conditions[one.spec.name]) for view in views if one.spec.name in view.conditions]
-        low, high = (min(seen), max(seen)) if seen and min(seen) < max(seen) else (value - 1.0, value + 1.0)
+        low, high = (min(seen), max(seen)) if seen and min(seen) < max(seen) else (float(one.value) - 1.0, float(one.value) + 1.0)
     place = one.spec.shape == (3,) and one.spec.unit.startswith("position")
     return {"name": one.spec.name, "value": value, "range": [low, high], "unit": one.spec.unit, "place": place, "period": _PERIOD}

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from browsers import browser
+
+from tests.browsers import browser
 
 
 @pytest.fixture(scope="module")

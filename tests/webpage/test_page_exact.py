@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from browsers import Tab, open_tab
-from page_models import LIGHT, SETTINGS, camera_at, page_of, random_model
 
 from neuprim.core.cameras import Camera
 from neuprim.core.io.images import to_uint8
@@ -23,6 +21,8 @@ from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.relight.harmonics import LightHarmonics
 from neuprim.tasks.static.fields import SphericalHarmonics
+from tests.browsers import Tab, open_tab
+from tests.page_models import LIGHT, SETTINGS, camera_at, page_of, random_model
 
 ERROR = 1e-5
 EYES = ((0.3, -3.0, 1.0), (2.0, 2.0, -1.5), (-0.4, 0.2, 0.1))
@@ -95,7 +95,9 @@ def test_relit_models(visibility: str, form: str, falloff: bool, chromium: Any, 
     page_of(model, tmp_path / "p.html", LIGHT)
     with open_tab(chromium, tmp_path / "p.html") as tab:
         for light in (LIGHT["light"], torch.tensor([-1.0, 0.5, 3.0]), torch.tensor([0.0, 0.0, -0.3])):
-            assert error(tab, model, camera_at(EYES[0]), {**LIGHT, "light": light.double()}) < (ERROR if visibility == "none" else 5 * ERROR)
+            assert error(tab, model, camera_at(EYES[0]), {**LIGHT, "light": light.double()}) < (
+                ERROR if visibility == "none" else 5 * ERROR
+            )
         assert tab.faults == []
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from browsers import Tab, open_tab
-from page_models import LIGHT, camera_at, page_of, random_model
 from PIL import Image
 
 from neuprim.core.io.addresses import picture_address
@@ -19,6 +18,8 @@ from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.static.fields import SphericalHarmonics
 from neuprim.webpage import PageView
+from tests.browsers import Tab, open_tab
+from tests.page_models import LIGHT, camera_at, page_of, random_model
 
 MODES = ("COLOUR", "ALPHA", "DEPTH", "SLICE", "ELLIPSOIDS")
 
@@ -48,7 +49,9 @@ def change(before: np.ndarray, after: np.ndarray) -> float:
 
 def slide(tab: Tab, selector: str, value: float) -> None:
     """Moves a slider as a person does: its value, then what it tells the page."""
-    tab.page.eval_on_selector(selector, "(bar, value) => { bar.value = value; bar.dispatchEvent(new Event('input', {bubbles: true})); }", value)
+    tab.page.eval_on_selector(
+        selector, "(bar, value) => { bar.value = value; bar.dispatchEvent(new Event('input', {bubbles: true})); }", value
+    )
 
 
 def test_turning_zooming_and_panning_move_the_picture(still_page: Path, chromium: Any) -> None:
@@ -72,7 +75,7 @@ def test_turning_zooming_and_panning_move_the_picture(still_page: Path, chromium
         slide(tab, "#fov", 0.5)
         seen.append(middle(tab))
         tab.page.keyboard.press("ArrowLeft")
-        for before, after in zip(seen, seen[1:], strict=False):
+        for before, after in pairwise(seen):
             assert change(before, after) > 0.05
         tab.page.click("#home")
         assert change(seen[0], middle(tab)) == 0.0

@@ -1,0 +1,128 @@
+"""`neuprim export --format html`: the page of a run, with or without its data, and the page inside of a run's report."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from neuprim.cli import main
+from neuprim.core.errors import ConfigError
+from neuprim.report import Viewer, write_report
+from neuprim.report.page import LIMIT
+from neuprim.runs.export import export_run
+from tests.core import tiny
+from tests.plugins import marked
+from tests.short_runs import fit, words
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return marked.static_run(tmp_path_factory.mktemp("runs") / "marked <run>")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("trained")
+    return fit(words(tiny.write_blender(folder / "scene"), folder / "run", 20))
+
+
+def header_of(text: str) -> dict[str, Any]:
+    found = re.search(r'<script id="page" type="application/json">(.*?)</script>', text, re.DOTALL)
+    assert found
+    header: dict[str, Any] = json.loads(found[1])
+    return header
+
+
+def test_a_run_with_its_data(trained: Path, tmp_path: Path) -> None:
+    report = export_run(trained, "html", tmp_path / "p.html", ["views=2"])
+    header = header_of((tmp_path / "p.html").read_text(encoding="utf-8"))
+    assert len(header["views"]) == 2 and all(view["truth"].startswith("data:image/webp;base64,") for view in header["views"])
+    assert header["home"] == header["views"][0]["camera"] and header["count"] == 40
+    assert not report.lossless and report.errors["psnr"] > 50
+    assert any("MB" in note for note in report.notes)
+
+
+def test_levels_lose_what_they_say(trained: Path, tmp_path: Path) -> None:
+    errors = [export_run(trained, "html", tmp_path / f"{level}.html", [f"level={level}", "views=1"]).errors for level in (0, 1, 5)]
+    assert errors[0] == {} and math.inf > errors[1]["psnr"] > errors[2]["psnr"] + 6
+    with pytest.raises(ConfigError, match=r"^level: found 6; expected a whole number from 0 to 5|^level"):
+        export_run(trained, "html", tmp_path / "x.html", ["level=6"])
+
+
+def test_a_run_without_its_data(trained: Path, tmp_path: Path) -> None:
+    """No cameras to jump to, and a note that says why."""
+    config = (trained / "config.yaml").read_text(encoding="utf-8")
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    (copy / "config.yaml").write_text(config.replace(str(trained.parent / "scene"), str(tmp_path / "gone")), encoding="utf-8")
+    (copy / "model.safetensors").write_bytes((trained / "model.safetensors").read_bytes())
+    report = export_run(copy, "html", tmp_path / "p.html")
+    assert any(note.startswith("no held-out cameras: ") and "gone" in note for note in report.notes)
+    header = header_of((tmp_path / "p.html").read_text(encoding="utf-8"))
+    assert header["views"] == [] and report.errors["psnr"] > 50
+
+
+def test_conditions_begin_where_asked(tmp_path: Path) -> None:
+    run = marked.dynamic_run(tmp_path / "run", marked.write_sequence(tmp_path / "vdb"))
+    for given, time in (([], 0.5), (["time=0.25"], 0.25)):
+        export_run(run, "html", tmp_path / f"{time}.html", [*given, "views=0"])
+        (found,) = header_of((tmp_path / f"{time}.html").read_text(encoding="utf-8"))["conditions"]
+        assert (found["name"], found["value"], found["range"]) == ("time", time, [0.0, 1.0])
+
+
+def test_other_orders_and_samples_are_said(run_dir: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    text = (run_dir / "config.yaml").read_text(encoding="utf-8").replace("sort: center", "sort: entry")
+    (copy / "config.yaml").write_text(text, encoding="utf-8")
+    (copy / "model.safetensors").write_bytes((run_dir / "model.safetensors").read_bytes())
+    notes = export_run(copy, "html", tmp_path / "p.html", ["views=0"]).notes
+    assert any("sort=entry" in note and "by centres" in note for note in notes)
+
+
+def test_a_name_of_strangers_is_text(run_dir: Path, tmp_path: Path) -> None:
+    export_run(run_dir, "html", tmp_path / "p.html", ["views=0"])
+    page = (tmp_path / "p.html").read_text(encoding="utf-8")
+    assert "<title>marked &lt;run&gt;</title>" in page and "marked <run>" not in page
+
+
+def test_a_damaged_header_has_an_upward_axis_all_the_same(tmp_path: Path) -> None:
+    for k, up in enumerate(([0, 0], "up", [0, 0, 0], [1, None, 2], {})):
+        run = marked.write_run(tmp_path / f"run{k}", marked.static_model(), ["task=static", "scene=solids"], data={"up": up})
+        export_run(run, "html", tmp_path / f"{k}.html", ["views=0"])
+        assert header_of((tmp_path / f"{k}.html").read_text(encoding="utf-8"))["up"] == [0.0, 0.0, 1.0]
+
+
+def test_the_command_names_and_refuses(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(run_dir), "--format", "html", "--out", str(tmp_path / "page.txt")]) == 2
+    assert "expected a file name that ends in .html" in capsys.readouterr().err
+    assert main(["export", str(run_dir), "--format", "html", "--help"]) == 0
+    assert "level of `neuprim compress`" in capsys.readouterr().out.replace("\n", " ").replace("  ", " ")
+
+
+# ---------------------------------------------------------------- in the report
+
+
+def test_the_report_of_a_run_holds_its_page(trained: Path) -> None:
+    text = (trained / "report.html").read_text(encoding="utf-8")
+    frame = re.search(r'<iframe [^>]*srcdoc="([^"]*)"', text)
+    assert frame and not (trained / "viewer.html").exists()
+    page = html.unescape(frame[1])
+    assert header_of(page)["count"] == 40
+    inner, outer = (re.search(r"script-src 'nonce-(\w+)'", part) for part in (page, text))
+    assert inner and outer and inner[1] == outer[1] and len(text.encode()) < LIMIT
+
+
+def test_a_large_page_lies_beside_the_report(trained: Path) -> None:
+    viewer = Viewer("<!doctype html><p>" + "x" * LIMIT, "nonce")
+    text = write_report(trained, viewer=viewer).read_text(encoding="utf-8")
+    assert (trained / "viewer.html").read_text(encoding="utf-8") == viewer.text
+    assert '<a href="viewer.html">' in text and "iframe title" not in text and "script-src" not in text
+    write_report(trained)
+    assert not (trained / "viewer.html").exists(), "of an earlier report"

@@ -1,0 +1,111 @@
+"""What a page is made of: numbers that come back, what it refuses, no word of strangers that could run. Without a browser."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from neuprim.core.errors import ConfigError
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.densities.gaussian import GaussianDensity
+from neuprim.core.model.edge import profile
+from neuprim.tasks.relight import visibility
+from neuprim.tasks.relight.colour import LightNetwork
+from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.webpage import PageView
+from neuprim.webpage.constants import shader_constants
+from neuprim.webpage.numbers import pack_model
+from tests.page_models import LIGHT, SETTINGS, camera_at, page_of, random_model
+
+
+def header_of(text: str) -> dict[str, Any]:
+    found = re.search(r'<script id="page" type="application/json">(.*?)</script>', text, re.DOTALL)
+    assert found
+    header: dict[str, Any] = json.loads(found[1])
+    return header
+
+
+def test_what_a_level_keeps(tmp_path: Path) -> None:
+    """Fewer bytes and larger errors from level to level; level 0 keeps every bit."""
+    model = random_model(CosineDensity(4, edge=2, gain=True), SphericalHarmonics(3), count=400)
+    sizes, errors = [], []
+    for level in range(6):
+        packed = pack_model(model, level)
+        sizes.append(len(packed.data))
+        order = torch.cdist(packed.model.params["means"], model.params["means"]).argmin(1)  # the file's own order
+        errors.append(float((packed.model.params["sh_rest"] - model.params["sh_rest"][order]).abs().max()))
+    assert sizes == sorted(sizes, reverse=True) and sizes[0] > 1.5 * sizes[1]
+    assert errors == sorted(errors) and errors[0] == 0.0 < errors[1] < 0.01
+    with pytest.raises(ConfigError, match="--level 6: expected one of 1, 2, 3, 4, 5"):
+        pack_model(model, 6)
+
+
+@pytest.mark.parametrize("edge", [0, 1, 2])
+def test_polynomials_are_good_to_float32(edge: int) -> None:
+    found, v = shader_constants(edge), torch.linspace(-0.5, 0.5, 1001, dtype=torch.float64)
+    truths = {"cos": (2 * torch.pi * v).cos(), "sinc": torch.special.sinc(2 * v), "edge": profile(2 * torch.pi * v, edge)}
+    for name, truth in truths.items():
+        value = torch.zeros_like(v)
+        for coefficient in found[name]:
+            value = value * v.square() + coefficient
+        assert float((value - truth).abs().max()) < 1e-7, name
+    assert sum(found["weights"]) == pytest.approx(1.0)
+
+
+def test_a_field_without_a_script_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="density field GaussianDensity has no script for browsers; a page cannot show it"):
+        page_of(random_model(GaussianDensity(), SphericalHarmonics(0)), tmp_path / "p.html")
+
+
+@pytest.mark.parametrize("text", ["() => 1</script><script>alert(1)", "() => '<!--'", 7])
+def test_a_script_that_would_end_its_element_is_refused(text: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(CosineDensity, "script", lambda self: text)
+    with pytest.raises(ConfigError, match=r"density field CosineDensity: script\(\) must be a text of JavaScript"):
+        page_of(random_model(CosineDensity(1), SphericalHarmonics(0)), tmp_path / "p.html")
+
+
+def test_names_do_not_become_parts_of_the_page(tmp_path: Path) -> None:
+    """Neither by HTML nor by the marks that parts are put in place of."""
+    hostile = "</script><script>alert(1)</script>@numbers@"
+    views = [PageView(hostile, camera_at((0.3, -3.0, 1.0)), {})]
+    page = page_of(random_model(CosineDensity(1), SphericalHarmonics(0)), tmp_path / "p.html", name=hostile, subtitle=hostile, views=views)
+    plain = page_of(random_model(CosineDensity(1), SphericalHarmonics(0)), tmp_path / "q.html")
+    assert page.text.count("<script") == plain.text.count("<script") == 4
+    assert page.text.count("</script>") == plain.text.count("</script>")
+    assert header_of(page.text)["views"][0]["name"] == hostile
+    assert "@numbers@" in header_of(page.text)["name"]
+
+
+def test_the_policy_lets_nothing_else_run_or_load(tmp_path: Path) -> None:
+    text = page_of(random_model(CosineDensity(1), SphericalHarmonics(0)), tmp_path / "p.html").text
+    policy = re.search(r'Content-Security-Policy" content="(.*?)"', text)
+    assert (
+        policy and policy[1].startswith("default-src 'none'; script-src 'nonce-") and "unsafe-inline" not in policy[1].split("style-src")[0]
+    )
+    assert "http:" not in text and "https:" not in text
+    assert not re.search(r"<(script|link|img|iframe)[^>]*\s(src|href)=[\"'](?!data:|\")", text)
+
+
+def test_pages_are_the_same_bytes_again(tmp_path: Path) -> None:
+    made = [page_of(random_model(CosineDensity(2), SphericalHarmonics(1)), tmp_path / "p.html", level=2).text for _ in range(2)]
+    assert made[0] == made[1]
+
+
+def test_the_controls_of_conditions(tmp_path: Path) -> None:
+    header = header_of(page_of(random_model(CosineDensity(1), LightNetwork(2)), tmp_path / "p.html", LIGHT).text)
+    light, intensity = header["conditions"]
+    assert light["place"] and not intensity["place"] and light["value"] == pytest.approx([1.5, -2.0, 2.5])
+    assert header["renderer"] == {"alpha_min": SETTINGS.alpha_min, "alpha_max": SETTINGS.alpha_max}
+
+
+def test_the_script_s_shadows_are_those_of_the_model() -> None:
+    """Constants that stand in both languages."""
+    text = LightNetwork(2).script()
+    for name, value in (("size", visibility.SIZE), ("layers", visibility.LAYERS)):
+        assert f"{name}: {value}" in text
+    assert visibility.BIAS == visibility.SOFTNESS == 1 / 20 and "bias: 1 / 20, softness: 1 / 20" in text

@@ -8,6 +8,7 @@ import torch
 
 from neuprim.core.cameras import Camera
 from neuprim.core.data import Clip, View
+from neuprim.core.errors import CheckpointError, FormError
 from neuprim.core.io import images
 from neuprim.core.io.files import write_json
 from neuprim.core.model.fields import Conditions
@@ -82,17 +83,20 @@ def _viewer(fitted: Fitted, directory: Path) -> Viewer | None:
         return draw(model, View("", camera, conditions), config.renderer, dataset.background)
 
     views = held_out(dataset, channels, _SHOWN_VIEWS)
-    page = scene_page(
-        directory.resolve().name,
-        fitted.model,
-        channels,
-        config.renderer,
-        look,
-        specs=task.conditions,
-        start=start_of(task.conditions, views, {}),
-        views=views,
-        background=dataset.background.tolist(),
-        up=dataset.up.tolist(),
-        subtitle=task.name if dataset.data_source == "real" else f"{task.name}, {dataset.data_source} data",
-    )
+    try:
+        page = scene_page(
+            directory.resolve().name,
+            fitted.model,
+            channels,
+            config.renderer,
+            look,
+            specs=task.conditions,
+            start=start_of(task.conditions, views, {}),
+            views=views,
+            background=dataset.background.tolist(),
+            up=dataset.up.tolist(),
+            subtitle=task.name if dataset.data_source == "real" else f"{task.name}, {dataset.data_source} data",
+        )
+    except (CheckpointError, FormError):  # numbers that no code of few bits can stand for; the report does without
+        return None
     return Viewer(page.text, page.nonce)

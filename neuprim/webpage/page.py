@@ -35,6 +35,7 @@ _MAIN = ("painter.js", "frames.js", "camera.js", "conditions.js", "main.js", "pr
 _SHADERS = ("splat.vert", "splat.frag", "screen.vert", "resolve.frag")
 _PLACE = re.compile(r"@(\w+)@")
 _WIDE = 1e4  # a range that no slider has
+_ENDLESS = 1e30
 _PERIOD = 6.0  # seconds of a sweep that plays
 
 
@@ -207,7 +208,7 @@ def _view(view: PageView) -> dict[str, Any]:
 
 def _condition(one: Condition, views: Sequence[PageView]) -> dict[str, Any]:
     """What controls need of it. A range that no slider has is that of the views."""
-    low, high = one.spec.range
+    low, high = (min(max(float(end), -_ENDLESS), _ENDLESS) for end in one.spec.range)  # JSON knows no infinity
     value = one.value.double().tolist()
     if one.spec.shape == () and high - low > _WIDE:
         seen = [float(view.conditions[one.spec.name]) for view in views if one.spec.name in view.conditions]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import os
 import shutil
 import time
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
@@ -81,10 +83,6 @@ class Tab:
 
     def canvas(self) -> np.ndarray:
         """What the window shows now, (H, W, 3) uint8, controls included."""
-        import io
-
-        from PIL import Image
-
         return np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB"))
 
     def settled(self) -> None:

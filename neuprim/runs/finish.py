@@ -95,7 +95,8 @@ def _viewer(fitted: Fitted, directory: Path) -> Viewer | None:
             views=views,
             background=dataset.background.tolist(),
             up=dataset.up.tolist(),
-            subtitle=task.name if dataset.data_source == "real" else f"{task.name}, {dataset.data_source} data",
+            task=task.name,
+            data_source=dataset.data_source,
         )
     except (CheckpointError, FormError):  # numbers that no code of few bits can stand for; the report does without
         return None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from neuprim.core.compressed import bit_table, file_order, folded, schemes
 from neuprim.core.compressed.rotations import Rotations
+from neuprim.core.compressed.sections import COLUMNS, ROTATIONS, pack
 from neuprim.core.model.primitives import Primitives
 
 __all__ = ["PackedModel", "pack_model"]
@@ -54,8 +54,9 @@ def _exact(model: Primitives) -> _Made:
     made: _Made = []
     for spec in model.specs:
         x = model.params[spec.name].detach().cpu().float().contiguous()
-        whole = x.reshape(model.count, spec.size).numpy().astype("<f4").view("<u4")
-        made.append(({"name": spec.name, "shape": list(spec.shape), "coding": "float32"}, _planes(whole, [32] * spec.size), x))
+        whole = x.reshape(model.count, spec.size, 1).numpy().astype("<f4").view(np.uint8)  # (N, C, 4)
+        planes = np.ascontiguousarray(whole.transpose(1, 2, 0)).tobytes()
+        made.append(({"name": spec.name, "shape": list(spec.shape), "coding": "float32"}, planes, x))
     return made
 
 
@@ -70,16 +71,8 @@ def _coded(model: Primitives, level: int) -> _Made:
         about: dict[str, Any] = {"name": spec.name, "shape": list(spec.shape)}
         if isinstance(scheme, Rotations):
             about |= {"coding": "rotations", "bits": scheme.bits}
-            bits = [2, *([scheme.bits] * 3)]
         else:
-            bits = scheme.bits.tolist()
-            about |= {"coding": "columns", "bits": bits, "low": scheme.low.tolist(), "high": scheme.high.tolist()}
-        made.append((about, _planes(codes.numpy(), bits), scheme.values(codes).reshape(own.count, *spec.shape)))
+            about |= {"coding": "columns", "bits": scheme.bits.tolist(), "low": scheme.low.tolist(), "high": scheme.high.tolist()}
+        section = pack(spec.name, spec.shape, scheme, codes.numpy(), ROTATIONS if isinstance(scheme, Rotations) else COLUMNS)
+        made.append((about, b"".join(section.planes), scheme.values(codes).reshape(own.count, *spec.shape)))
     return made
-
-
-def _planes(codes: np.ndarray, bits: list[int]) -> bytes:
-    """Column by column the low bytes of all codes (N, C), then the next, as many as so many bits need: they compress better so."""
-    return b"".join(
-        ((codes[:, c] >> (8 * i)) & 255).astype(np.uint8).tobytes() for c, width in enumerate(bits) for i in range(math.ceil(width / 8))
-    )

@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import html
 import json
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,9 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras import Camera, look_at
+from neuprim.core.cameras import Camera, orbit
 from neuprim.core.errors import ConfigError
-from neuprim.core.model.densities.cosine import OMEGA0
+from neuprim.core.model.edge import EDGES
 from neuprim.core.model.fields import ConditionSpec, Field
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.settings import RenderSettings
@@ -116,20 +115,21 @@ def web_page(
     header = {
         "name": name,
         "count": model.count,
-        "fields": {"density": _settings(model.density), "colour": _settings(model.colour)},
+        "fields": {"density": model.density.settings(), "colour": model.colour.settings()},
         "numbers": packed.parts,
         "rgb": list(rgb),
         "background": [float(background[c]) for c in rgb],
         "linear": linear,
         "renderer": {key: getattr(settings, key) for key in ("alpha_min", "alpha_max")},
         "near": settings.near,
-        "constants": shader_constants(int(getattr(model.density, "edge", model.density.settings().get("edge", 0)))),
+        "constants": [shader_constants(edge) for edge in EDGES],
         "up": [float(x) for x in up],
         "center": middle,
         "radius": radius,
         "top": top,
         "conditions": [_condition(one, views) for one in conditions],
         "views": [_view(view) for view in views],
+        "still": bool(still),
         "home": camera_numbers(views[0].camera if views else _home(middle, radius, up)),
     }
     assets = resources.files(__package__).joinpath("assets")
@@ -161,10 +161,6 @@ def _script(kind: str, field: Field) -> str:
     return re.sub(r"^(//[^\n]*\n)+", "", text)
 
 
-def _settings(field: Field) -> dict[str, Any]:
-    return {"omega0": OMEGA0, **field.settings()} if "neurons" in field.settings() else dict(field.settings())
-
-
 # ---------------------------------------------------------------- what the page knows of the scene
 
 
@@ -185,13 +181,9 @@ def _extent(model: Primitives, conditions: Mapping[str, Tensor]) -> tuple[list[f
 
 def _home(middle: Sequence[float], radius: float, up: Sequence[float]) -> Camera:
     """A camera that sees all of a scene, from the side and a little above."""
-    axis = torch.tensor(up, dtype=torch.float64)
-    axis = axis / axis.norm()
-    helper = torch.tensor([1.0, 0.0, 0.0] if abs(float(axis[0])) < 0.9 else [0.0, 1.0, 0.0], dtype=torch.float64)
-    side = torch.linalg.cross(axis, helper)
-    center = torch.tensor(middle, dtype=torch.float64)
-    eye = center + 3.2 * radius * (math.cos(0.4) * side / side.norm() + math.sin(0.4) * axis)
-    return Camera(look_at(eye, center, axis), 512 * 1.4, 512 * 1.4, 256, 256, 512, 512)
+    template = Camera(torch.eye(4, dtype=torch.float64), 717.0, 717.0, 256, 256, 512, 512)
+    (found,) = orbit(template, torch.tensor(middle), torch.tensor(up), 3.2 * radius, 0.4, 1)
+    return found
 
 
 def camera_numbers(camera: Camera) -> dict[str, Any]:
@@ -214,4 +206,4 @@ def _condition(one: Condition, views: Sequence[PageView]) -> dict[str, Any]:
         seen = [float(view.conditions[one.spec.name]) for view in views if one.spec.name in view.conditions]
         low, high = (min(seen), max(seen)) if seen and min(seen) < max(seen) else (float(one.value) - 1.0, float(one.value) + 1.0)
     place = one.spec.shape == (3,) and one.spec.unit.startswith("position")
-    return {"name": one.spec.name, "value": value, "range": [low, high], "unit": one.spec.unit, "place": place, "period": _PERIOD}
+    return {"name": one.spec.name, "value": value, "range": [low, high], "place": place, "period": _PERIOD}

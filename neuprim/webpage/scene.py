@@ -61,13 +61,15 @@ def scene_page(
     views: Sequence[PageView],
     background: Sequence[float],
     up: Sequence[float],
-    subtitle: str = "",
+    task: str,
+    data_source: str,
     level: int = 1,
 ) -> WebPage:
     """See :func:`~neuprim.webpage.page.web_page`.
 
     Args:
         draw: makes the still, of the first view.
+        task, data_source: what the page says beside its name; that data are real goes without saying.
 
     Raises:
         ConfigError: channels that are not red, green and blue, or a field without a script for browsers.
@@ -85,7 +87,7 @@ def scene_page(
         channels.rgb,
         settings,
         level=level,
-        subtitle=subtitle,
+        subtitle=task if data_source == "real" else f"{task}, {data_source} data",
         background=background,
         linear=channels.color_space == "linear",
         up=_axis(up),

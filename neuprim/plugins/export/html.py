@@ -62,7 +62,8 @@ def _write(job: ExportJob) -> ExportReport:
         views=views,
         background=run.header["background"],
         up=data.get("up", ()) if isinstance(data, Mapping) else (),
-        subtitle=_subtitle(run),
+        task=run.task.name,
+        data_source=str(run.header.get("data_source", "real")),
         level=level,
     )
     job.progress("measuring", 0.7)
@@ -102,11 +103,6 @@ def _error(job: ExportJob, held: Primitives, views: Sequence[PageView], start: M
     wrong = [(draw(job.run.model, *view) - draw(held, *view)).double().square().mean() for view in shown]
     mean = float(torch.stack(wrong).mean())
     return -10.0 * math.log10(mean) if mean else math.inf
-
-
-def _subtitle(run: TrainedModel) -> str:
-    source = str(run.header.get("data_source", "real"))
-    return run.task.name if source == "real" else f"{run.task.name}, {source} data"
 
 
 EXPORTER = Exporter(

@@ -1,5 +1,5 @@
 // Frames from the worker, one at a time: the buffers travel there and back.
-function framesOf(page, source, fault) {
+function framesOf(page, source) {
   let worker = null, answer = null, paint = null, buffers = null;
   const script = new Blob([source + '\n"use strict"; onmessage = preparing((message, transfer) => postMessage(message, transfer || []));'], { type: "text/javascript" });
   const ready = new Promise((resolve, reject) => {
@@ -9,7 +9,7 @@ function framesOf(page, source, fault) {
       if (data.kind === "ready") resolve(data);
       else if (data.kind === "fault") reject(new Error(data.text));
       else if (data.kind === "light") { // what the light sees is drawn here, then the frame goes on there
-        const maps = paint.shadowMaps(data.camera, data.rows, data.phases, data.ends, true);
+        const maps = paint.shadowMaps(data.camera, data.rows, data.phases, data.ends);
         const copies = maps.map(map => map.buffer);
         worker.postMessage({ ...data, kind: "maps", camera: data.asked, maps }, [data.rows.buffer, data.phases.buffer, ...copies]);
       } else if (data.kind === "frame") {
@@ -19,7 +19,6 @@ function framesOf(page, source, fault) {
     };
   });
   worker.postMessage({ kind: "begin", page, numbers: document.getElementById("numbers").textContent });
-  ready.catch(error => fault(error.message));
   return {
     ready,
     drawnBy(painter, made) {

@@ -6,11 +6,11 @@ const BACKGROUNDS = { model: page.background, black: [0, 0, 0], white: [1, 1, 1]
 
 function fault(text) {
   element("fault").textContent = text;
-  element("still").hidden = false;
+  element("still").hidden = !page.still;
 }
 
-const frames = framesOf(page, element("shared").textContent, fault), look = lookout(page);
-let paint = null, made = null, busy = false, again = false, drawn = 0, spent = 0, last = null, moved = 0, coarse = 1, settleLater = 0;
+const frames = framesOf(page, element("shared").textContent), look = lookout(page);
+let paint = null, made = null, busy = false, again = false, drawn = 0, pictured = false, moved = 0, coarse = 1, settleLater = 0;
 const conditions = controls(page, element("conditions"), () => request(true));
 
 function view() {
@@ -46,15 +46,18 @@ function request(moving = false) {
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     paint.draw(frame, view());
     paint.show(frame, view());
-    last = frame;
     drawn++;
+    if (pictured) { // what is on a canvas is gone once it was shown
+      pictured = false;
+      canvas.toBlob(blob => Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: `${page.name}.png` }).click());
+    }
     const { gl } = paint, fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
     (function wait() {
       const state = gl.clientWaitSync(fence, 0, 0);
       if (state === gl.TIMEOUT_EXPIRED) return void setTimeout(wait, 1);
       gl.deleteSync(fence);
-      spent = performance.now() - start;
+      const spent = performance.now() - start;
       if (performance.now() - moved < 250) coarse = spent > SLOW ? Math.min(2 * coarse, 8) : spent < SLOW / 4 ? Math.max(coarse / 2, 1) : coarse;
       const size = `${width} × ${height}`, exactness = paint.exact ? "" : ", in 16-bit floats";
       element("info").textContent = `${count.toLocaleString("en")} of ${page.count.toLocaleString("en")} primitives, ${size}, prepared in ${frame.milliseconds.toFixed(1)} ms${exactness}`;
@@ -84,7 +87,7 @@ function goTo(index) {
   element("truth").hidden = !chosen.truth;
   if (chosen.truth) {
     element("truthImage").src = chosen.truth;
-    element("truthName").textContent = `ground truth of ${chosen.name}${chosen.psnr === undefined ? "" : `, ${chosen.psnr.toFixed(1)} dB`}`;
+    element("truthName").textContent = `ground truth of ${chosen.name}`;
   }
   request();
 }
@@ -106,10 +109,8 @@ element("home").onclick = () => {
   request();
 };
 element("picture").onclick = () => {
-  if (!last) return;
-  paint.draw(last, view()); // what is on a canvas is gone once it was shown
-  paint.show(last, view());
-  canvas.toBlob(blob => Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: `${page.name}.png` }).click());
+  pictured = true;
+  request();
 };
 addEventListener("resize", () => request());
 

@@ -10,7 +10,7 @@ function painter(canvas, page, made) {
   if (!gl.getExtension("EXT_color_buffer_float")) throw new Error("this browser's WebGL2 cannot draw into float textures");
   const exact = !!gl.getExtension("EXT_float_blend"); // else 16-bit floats, which always blend
   const horner = list => list.slice(1).reduce((text, c) => `(${text}) * z + (${c.toExponential(12)})`, list[0].toExponential(12));
-  const { cos, sinc, edge, nodes, weights } = page.constants;
+  const { cos, sinc, edge, nodes, weights } = page.constants[made.edge];
   const words = { COS_POLY: horner(cos), SINC_POLY: horner(sinc), EDGE_POLY: horner(edge), NODES: nodes.join(), WEIGHTS: weights.join() };
   const sizes = {
     EDGE: made.edge, CORNERS, MAX_WIDTH, HIDDEN: made.H, NEURON_TEXELS: made.neurons.texels, MOVING: made.moving,
@@ -143,13 +143,13 @@ function painter(canvas, page, made) {
   }
 
   // Depth images out of the light, slab by slab: Float32Array (size, size, 4) each.
-  function shadowMaps(camera, rows, phases, ends, keep) {
+  function shadowMaps(camera, rows, phases, ends) {
     upload(rows, phases, ends[ends.length - 1]);
     const found = ends.map((end, k) => {
       splats("light", SPARE, camera, k ? ends[k - 1] : 0, end, "DEPTH");
       return read(camera.width, camera.height, targets.light.frame);
     });
-    if (keep) {
+    if (made.shadow.where === "pixel") {
       if (maps) gl.deleteTexture(maps);
       maps = texture(MAPS, gl.RGBA32F, camera.width, camera.height, found.length);
       found.forEach((map, k) => gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, k, camera.width, camera.height, 1, gl.RGBA, gl.FLOAT, map));

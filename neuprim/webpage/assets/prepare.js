@@ -121,7 +121,7 @@ function preparer(page, tensors, density, colour) {
     }
     const order = sort(alive, ahead, depth);
 
-    let n = 0, covered = 0;
+    let n = 0;
     for (let p = 0; p < ahead; p++) {
       const i = order[p], m = unit[i], c0 = centre[3 * i], c1 = centre[3 * i + 1], c2 = centre[3 * i + 2];
       for (let a = 0; a < 3; a++) {
@@ -155,7 +155,6 @@ function preparer(page, tensors, density, colour) {
       span.fill(0);
       span[3] = span[4] = -1; // the whole screen
       if (inFront && !silhouette(tc, aa, xe, ye)) continue;
-      covered += span[3] < 0 ? 0 : Math.PI * span[3] * span[4];
 
       for (let a = 0; a < 3; a++) place[a] = scene[3 * i + a];
       seen.factor.fill(1);
@@ -194,7 +193,7 @@ function preparer(page, tensors, density, colour) {
       }
       n++;
     }
-    return { count: n, covered };
+    return n;
   }
 
   // How many of the first n rows, which are in order, are no further away than each of the edges.

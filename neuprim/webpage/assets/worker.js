@@ -14,13 +14,14 @@ function preparing(post) {
 
   function frame(request) {
     const start = performance.now(), { conditions, rows, phases } = request, settled = engine.settle(conditions), shadow = colour.shadow;
-    if (shadow && lit !== JSON.stringify(conditions)) { // what the light sees has changed: the page draws it first, and asks again with the images
+    const words = JSON.stringify(conditions);
+    if (shadow && lit !== words) { // what the light sees has changed: the page draws it first, and asks again with the images
       camera = settled.living.length ? lightCamera(engine.scene, engine.scales, settled.living, shadow.light(conditions), shadow) : null;
-      lit = JSON.stringify(conditions);
+      lit = words;
       visible = null;
       maps = null;
       if (camera) {
-        const { count } = engine.frame(camera, conditions, settled, null, rows, phases);
+        const count = engine.frame(camera, conditions, settled, null, rows, phases);
         const ends = [...engine.within(rows, count, camera.edges), count];
         return post({ ...request, kind: "light", camera, ends, asked: request.camera }, [rows.buffer, phases.buffer]);
       }
@@ -32,8 +33,8 @@ function preparing(post) {
         visible[i] = Math.fround(arrivingAt(x, y, z, camera, maps, shadow.bias, shadow.softness));
       }
     }
-    const done = engine.frame(request.camera, conditions, settled, visible, rows, phases);
-    post({ ...request, kind: "frame", ...done, light: maps && camera, milliseconds: performance.now() - start }, [rows.buffer, phases.buffer]);
+    const count = engine.frame(request.camera, conditions, settled, visible, rows, phases);
+    post({ ...request, kind: "frame", count, light: maps && camera, milliseconds: performance.now() - start }, [rows.buffer, phases.buffer]);
   }
 
   return ({ data }) => {

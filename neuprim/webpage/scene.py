@@ -28,13 +28,16 @@ _WIDEST, _STILL = 320, 640
 
 
 def held_out(dataset: Dataset, channels: Channels, most: int) -> list[PageView]:
-    """At most so many of the held-out views, evenly spread, those of pinholes."""
-    count, found = min(most, len(dataset.test)), []
+    """At most so many of the held-out views, evenly spread, those of pinholes; first the one in which most is to be seen."""
+    count, found, contrasts = min(most, len(dataset.test)), [], []
     for index in (k * len(dataset.test) // count for k in range(count)):
         view = dataset.test.view(index)
         if isinstance(view.camera, Camera):
             image = channels.display(dataset.test.pixels(index).over(dataset.background)).clamp(0.0, 1.0)
             found.append(PageView(view.name, view.camera, view.conditions, picture_address(image, _WIDEST)))
+            contrasts.append(float(image.std()))
+    if found:  # a sequence may begin with nothing
+        found.insert(0, found.pop(contrasts.index(max(contrasts))))
     return found
 
 

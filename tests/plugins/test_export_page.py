@@ -16,6 +16,8 @@ from neuprim.core.errors import ConfigError
 from neuprim.report import Viewer, write_report
 from neuprim.report.page import LIMIT
 from neuprim.runs.export import export_run
+from neuprim.runs.open import open_run
+from neuprim.webpage.scene import held_out
 from tests.core import tiny
 from tests.plugins import marked
 from tests.short_runs import fit, words
@@ -46,6 +48,18 @@ def test_a_run_with_its_data(trained: Path, tmp_path: Path) -> None:
     assert header["home"] == header["views"][0]["camera"] and header["count"] == 40
     assert not report.lossless and report.errors["psnr"] > 50
     assert any("MB" in note for note in report.notes)
+
+
+def test_a_page_begins_where_something_is_to_be_seen(tmp_path: Path) -> None:
+    """The first frame of a sequence may be empty."""
+    run = marked.dynamic_run(tmp_path / "run", marked.write_sequence(tmp_path / "vdb"))
+    dataset = open_run(run).dataset()
+    views = held_out(dataset, open_run(run).channels, 4)
+    picked = {
+        view.name: float(dataset.test.pixels(i).over(dataset.background).std())
+        for i, view in enumerate(map(dataset.test.view, range(len(dataset.test))))
+    }
+    assert len(views) == 4 and max(picked[view.name] for view in views) == pytest.approx(picked[views[0].name], rel=0.2)
 
 
 def test_levels_lose_what_they_say(trained: Path, tmp_path: Path) -> None:

@@ -135,11 +135,15 @@ def test_a_picture_is_what_is_seen(still_page: Path, chromium: Any, tmp_path: Pa
 
 def test_time_moves_and_plays(chromium: Any, tmp_path: Path) -> None:
     model = random_model(TimeDensity(2, "window+motion", edge=2), TimeHarmonics(1), count=120)
-    page_of(model, tmp_path / "p.html", {"time": torch.tensor(0.2)})
+    time = {"time": torch.tensor(0.2)}
+    views = [PageView("first", camera_at((0.3, -3.0, 1.0)), time, picture_address(torch.rand(8, 8, 3), 320))]
+    page_of(model, tmp_path / "p.html", time, views=views)
     with open_tab(chromium, tmp_path / "p.html") as tab:
         before = middle(tab)
+        assert tab.page.is_visible("#truth")
         slide(tab, "#conditions input[type=range]", 0.7)
         after = middle(tab)
+        assert not tab.page.is_visible("#truth") and tab.page.input_value("#views") == "", "the truth is of another time"
         assert change(before, after) > 0.05 and tab.page.inner_text("#conditions output") == "0.70"
         tab.page.click("#conditions button")
         first = tab.page.inner_text("#conditions output")

@@ -11,7 +11,16 @@ function fault(text) {
 
 const frames = framesOf(page, element("shared").textContent), look = lookout(page);
 let paint = null, made = null, busy = false, again = false, drawn = 0, pictured = false, moved = 0, coarse = 1, settleLater = 0;
-const conditions = controls(page, element("conditions"), () => request(true));
+const conditions = controls(page, element("conditions"), () => {
+  leave();
+  request(true);
+});
+
+// What is seen is no held-out view any more.
+function leave() {
+  element("truth").hidden = true;
+  element("views").value = "";
+}
 
 function view() {
   const far = look.now.distance, plane = far * +element("plane").value;
@@ -74,8 +83,7 @@ function request(moving = false) {
 function home() {
   look.at(page.home);
   element("fov").value = 0;
-  element("truth").hidden = true;
-  element("views").value = "";
+  leave();
 }
 function goTo(index) {
   const chosen = page.views[index];
@@ -132,8 +140,7 @@ canvas.onpointermove = event => {
     look.nearer(gap(...before) / gap(event.clientX, event.clientY));
   } else if (event.shiftKey || event.buttons & 6) look.pan(dx / innerHeight, dy / innerHeight);
   else look.turn(-0.008 * dx, -0.008 * dy);
-  element("views").value = "";
-  element("truth").hidden = true;
+  leave();
   request(true);
 };
 canvas.addEventListener("wheel", event => {

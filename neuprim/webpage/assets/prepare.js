@@ -106,8 +106,9 @@ function preparer(page, tensors, density, colour) {
   }
 
   // camera: {R: 9 numbers, t: 3, fx, fy, cx, cy, width, height, near}, OpenCV axes; settled: of settle; arriving: null, or (count,) light that
-  // arrives at each primitive. Fills rows (Float32Array of ROW a primitive) and phases (4 `moving` numbers a primitive), front to back.
-  function frame(camera, conditions, { folded, living }, arriving, rows, phases) {
+  // arrives at each primitive; coloured: whether colours are needed, which depth images have none of. Fills rows (Float32Array of ROW a primitive)
+  // and phases (4 `moving` numbers a primitive), front to back.
+  function frame(camera, conditions, { folded, living }, arriving, rows, phases, coloured = true) {
     const { R, t, fx, fy, cx, cy, near = page.near } = camera;
     for (let a = 0; a < 3; a++) eye[a] = -(R[a] * t[0] + R[3 + a] * t[1] + R[6 + a] * t[2]);
     const tint = colour.at(conditions, eye);
@@ -156,9 +157,11 @@ function preparer(page, tensors, density, colour) {
       span[3] = span[4] = -1; // the whole screen
       if (inFront && !silhouette(tc, aa, xe, ye)) continue;
 
-      for (let a = 0; a < 3; a++) place[a] = scene[3 * i + a];
-      seen.factor.fill(1);
-      tint.look(i, place, seen);
+      if (coloured) {
+        for (let a = 0; a < 3; a++) place[a] = scene[3 * i + a];
+        seen.factor.fill(1);
+        tint.look(i, place, seen);
+      }
       const light = arriving ? arriving[i] : 1, o = ROW * n, tu = (-tc * xe) / aa, tv = (-tc * ye) / aa;
       for (let a = 0; a < 3; a++) {
         rows[o + a] = e0[a];

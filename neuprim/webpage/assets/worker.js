@@ -1,6 +1,6 @@
 // Off the main thread: unpacks the model, prepares frames, works out shadows. Messages: {kind, ...} here and back, one frame at a time.
 function preparing(post) {
-  let engine = null, colour = null, lit = "", camera = null, maps = null, visible = null;
+  let engine = null, colour = null, known = "", settled = null, lit = "", camera = null, maps = null, visible = null;
 
   async function begin({ page, numbers }) {
     const tensors = await numbersOf(numbers, page.numbers, page.count);
@@ -13,15 +13,18 @@ function preparing(post) {
   }
 
   function frame(request) {
-    const start = performance.now(), { conditions, rows, phases } = request, settled = engine.settle(conditions), shadow = colour.shadow;
-    const words = JSON.stringify(conditions);
+    const start = performance.now(), { conditions, rows, phases } = request, shadow = colour.shadow, words = JSON.stringify(conditions);
+    if (known !== words) { // while only the camera moves, who lives and where stays
+      settled = engine.settle(conditions);
+      known = words;
+    }
     if (shadow && lit !== words) { // what the light sees has changed: the page draws it first, and asks again with the images
       camera = settled.living.length ? lightCamera(engine.scene, engine.scales, settled.living, shadow.light(conditions), shadow) : null;
       lit = words;
       visible = null;
       maps = null;
       if (camera) {
-        const count = engine.frame(camera, conditions, settled, null, rows, phases);
+        const count = engine.frame(camera, conditions, settled, null, rows, phases, false);
         const ends = [...engine.within(rows, count, camera.edges), count];
         return post({ ...request, kind: "light", camera, ends, asked: request.camera }, [rows.buffer, phases.buffer]);
       }

@@ -1,0 +1,237 @@
+"""Pages of models: how exact they are, how large, how long a frame is prepared, and how much a card computes.
+
+    python benchmarks/webpage.py ROW=RUN_DIR … [--views 8] [--docs]
+    python benchmarks/webpage.py --prepare [--docs]
+    python benchmarks/webpage.py --print [--docs]
+
+ROW=RUN_DIR: a name in the table, and a finished run whose data are at hand. Held-out views of it, evenly spread, are drawn by its page, with every bit of its numbers, in headless Chromium
+and read back as floats, and by the run's backend, without a limit of transmittance (blending cannot stop a ray) and with the run's own: largest differences, colours
+as the model has them. Sizes and errors are those of pages at levels 0, 1 and 3, pictures of held-out views among them. Chords are the pixels of the silhouettes
+in the first view at 1280 x 720. Instructions of a chord are those of the page's own fragment shader after inlining and simplification (glslangValidator and
+spirv-opt; without them the column stays empty).
+
+--prepare: milliseconds of the worker, preparation and sort, for models of 5,000 and 20,000 primitives where the trainings of `solids`, `smoke_fire` and
+`lit_solids` begin: the median of 60 frames after 60, while the camera moves, and while time or the light moves, too.
+
+Needs a Chromium and the package playwright. Results go to benchmarks/results/webpage.json, by row and scene; --docs puts both tables into docs/export.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from shared.shaders import LISTEN, instructions
+from shared.tables import ROOT, Table, between_markers
+from torch import Tensor
+
+from neuprim.config import compose
+from neuprim.core.cameras import Camera, orbit
+from neuprim.core.compute.machine import cpu_name
+from neuprim.core.extensions import TrainedModel
+from neuprim.core.io.files import write_json
+from neuprim.core.render import render
+from neuprim.runs.export import export_run
+from neuprim.runs.fit import start
+from neuprim.runs.open import open_run
+from neuprim.webpage import Condition, web_page
+from neuprim.webpage.page import camera_numbers
+
+sys.path.insert(0, str(ROOT))
+
+from tests.browsers import Tab, browser, open_tab
+
+RESULTS = Path(__file__).parent / "results" / "webpage.json"
+PAGE = ROOT / "docs" / "export.md"
+LEVELS = (0, 1, 3)
+WIDE, HIGH = 1280, 720
+RATES = (110e9, 220e9)
+"""Instructions a second of integrated graphics: half and all of 24 units of 8 lanes at 1.15 GHz."""
+
+COUNTS = (5_000, 20_000)
+STARTS: dict[str, tuple[tuple[str, ...], str]] = {
+    "solids": (("task=static", "scene=solids", "scene.size=64"), ""),
+    "smoke_fire": (("task=dynamic", "scene=smoke_fire", "scene.size=32", "scene.timesteps=8", "scene.cameras=8"), "time"),
+    "lit_solids": (("task=relight", "scene=lit_solids", "scene.size=32"), "light"),
+}
+"""Scene -> words, and the condition that moves. Images are small, as none is looked at."""
+
+
+# ---------------------------------------------------------------- exactness, size and work
+
+
+def measured(chromium: Any, run_dir: Path, count: int, folder: Path) -> dict[str, Any]:
+    """Everything about the pages of one run."""
+    run = open_run(run_dir)
+    found: dict[str, Any] = {"task": run.task.name, "primitives": run.model.count, "levels": {}}
+    pages = {level: folder / f"{run_dir.name}_{level}.html" for level in LEVELS}
+    for level, path in pages.items():
+        report = export_run(run_dir, "html", path, (f"level={level}",), overwrite=True)
+        found["levels"][str(level)] = {"bytes": path.stat().st_size, **report.errors}
+    with open_tab(chromium, pages[0], script=LISTEN) as tab:
+        found["views"] = list(differences(tab, run, count))
+        found["chords"] = chords(tab, run)
+        found["instructions"] = instructions(tab.page.evaluate("sources"))
+        assert not tab.faults, tab.faults
+    return found
+
+
+def differences(tab: Tab, run: TrainedModel, count: int) -> Iterator[dict[str, Any]]:
+    """The largest difference in each of some held-out views."""
+    views, background = run.dataset().test, torch.tensor(run.header["background"])
+    for index in sorted({k * len(views) // count for k in range(count)}):
+        view = views.view(index)
+        pixels = torch.from_numpy(tab.numbers(view.camera, view.conditions))
+        got = pixels[..., :3] + pixels[..., 3:] * background.double()
+        row: dict[str, Any] = {"view": view.name, "brightest": float(got.max())}
+        for key, least in (("whole", 0.0), ("configured", run.settings.transmittance_min)):
+            settings = replace(run.settings, transmittance_min=least, samples=1, sort="center")
+            with torch.no_grad():
+                wanted = render(run.model, view.camera, view.conditions, settings, background).rgb
+            row[key] = float((got - wanted.double()).abs().max())
+        yield row
+
+
+def chords(tab: Tab, run: TrainedModel) -> int:
+    """Pixels of all silhouettes of the first held-out view: ellipses of half axes hx and hy on sheared axes, none more than the screen."""
+    view = run.dataset().test.view(0)
+    scale = HIGH / view.camera.height
+    camera = replace(view.camera, fx=scale * view.camera.fx, fy=scale * view.camera.fy, cx=WIDE / 2, cy=HIGH / 2, width=WIDE, height=HIGH)
+    halves = tab.page.evaluate(_HALVES, [camera_numbers(camera), plain(view.conditions)])
+    return round(sum(min(math.pi * hx * hy, WIDE * HIGH) if hx >= 0 else WIDE * HIGH for hx, hy in halves))
+
+
+_HALVES = """async ([camera, values]) => {
+  const { rows, count } = await probe.frame(camera, values), halves = [];
+  for (let n = 0; n < count; n++) halves.push([rows[ROW * n + 35], rows[ROW * n + 36]]);
+  busy = false;
+  return halves;
+}"""
+
+
+def plain(conditions: Mapping[str, Tensor]) -> dict[str, Any]:
+    return {name: value.double().tolist() for name, value in conditions.items()}
+
+
+# ---------------------------------------------------------------- preparation
+
+
+def prepared(chromium: Any, scene: str, count: int, folder: Path) -> dict[str, Any]:
+    """Milliseconds of the worker. The model has not learned yet: how much work it is does not depend on what it would have."""
+    words, name = STARTS[scene]
+    fitted = start(compose([*words, f"model.primitives={count}", "train.population.grow_from=1"], check_output=False))
+    fitted.unlock()
+    model, view, specs = fitted.model, fitted.dataset.test.view(0), fitted.task.conditions
+    page = web_page(scene, model, (0, 1, 2), fitted.config.renderer, conditions=[Condition(s, view.conditions[s.name]) for s in specs])
+    path = folder / f"{scene}_{count}.html"
+    path.write_text(page.text, encoding="utf-8")
+    middle = model.params["means"].detach().mean(0)
+    away = float((view.camera.position - middle).norm())
+    around = orbit(view.camera, middle, fitted.dataset.up, away, 0.3, 60)
+    still = [dict(view.conditions) for _ in around]
+    moving = [values | {name: _moved(values[name], k / len(around))} for k, values in enumerate(still)] if name else []
+    result: dict[str, Any] = {"scene": scene, "primitives": model.count}
+    with open_tab(chromium, path) as tab:
+        for key, values in (("camera", still), ("conditions", moving)):
+            if values:
+                result |= {key: timed(tab, around, values)}
+        assert not tab.faults, tab.faults
+    return result
+
+
+def _moved(value: Tensor, share: float) -> Tensor:
+    """A time from 0 to 1, or a light around the axis that is up."""
+    if value.ndim == 0:
+        return torch.tensor(share)
+    c, s = math.cos(2 * math.pi * share), math.sin(2 * math.pi * share)
+    x, y, z = value.tolist()
+    return torch.tensor([c * x - s * y, s * x + c * y, z])
+
+
+def timed(tab: Tab, cameras: Sequence[Camera], conditions: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:
+    """Median and fastest frame, and how many primitives a frame has; frames before are for the browser's compiler."""
+    frames = [[camera_numbers(camera), plain(values)] for camera, values in zip(cameras, conditions, strict=True)]
+    rounds = [tab.page.evaluate(_TIMES, frames) for _ in range(2)]
+    times = [one["milliseconds"] for one in rounds[-1]]
+    return {"median": statistics.median(times), "fastest": min(times), "drawn": statistics.median(one["count"] for one in rounds[-1])}
+
+
+_TIMES = """async frames => {
+  const found = [];
+  for (const [camera, values] of frames) {
+    const { milliseconds, count } = await probe.frame(camera, values);
+    busy = false;
+    found.push({ milliseconds, count });
+  }
+  return found;
+}"""
+
+
+# ---------------------------------------------------------------- tables
+
+
+def page_table(runs: Mapping[str, dict[str, Any]]) -> Table:
+    table = Table(
+        "run", "primitives", "brightest value", "without `transmittance_min`", "as configured", "page, level 0", "level 1", "level 3",
+        "chords at 1280×720", "instructions of a chord, texels", "integrated graphics, by its peak",
+    )  # fmt: skip
+    for name, run in runs.items():
+        worst = [f"{max(view[key] for view in run['views']):.1e}" for key in ("whole", "configured")]
+        brightest = max(view["brightest"] for view in run["views"])
+        sizes = [f"{one['bytes'] / 1e6:.2f} MB" + (f", {one['psnr']:.1f} dB" if "psnr" in one else "") for one in run["levels"].values()]
+        work, chord = run["instructions"], run["chords"]
+        low, high = (1e3 * chord * work["arithmetic"] / rate for rate in reversed(RATES)) if work else (0.0, 0.0)
+        spent = (f"{work['arithmetic']}, {work['texels']}", f"{low:.0f}–{high:.0f} ms") if work else ("", "")
+        table.row(
+            f"`{name}`, {len(run['views'])} views",
+            f"{run['primitives']:,}",
+            f"{brightest:.2f}",
+            *worst,
+            *sizes,
+            f"{chord / 1e6:.1f} M",
+            *spent,
+        )
+    return table
+
+
+def prepare_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    table = Table("scene", "primitives", "drawn", "only the camera moves", "time or light moves")
+    for row in rows:
+        cells = [f"{row[key]['median']:.1f} ms" if key in row else "" for key in ("camera", "conditions")]
+        table.row(f"`{row['scene']}`", f"{row['primitives']:,}", f"{row['camera']['drawn']:,.0f}", *cells)
+    return table
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=lambda text: text.split("=", 1), nargs="*", metavar="ROW=RUN_DIR")
+    parser.add_argument("--views", type=int, default=8)
+    parser.add_argument("--prepare", action="store_true")
+    parser.add_argument("--print", action="store_true")
+    parser.add_argument("--docs", action="store_true")
+    args = parser.parse_args()
+    known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"runs": {}, "prepare": []}
+    if not args.print:
+        with browser() as chromium, tempfile.TemporaryDirectory() as name:
+            for row, run in args.runs:
+                known["runs"][row] = measured(chromium, Path(run), args.views, Path(name))
+            if args.prepare:
+                known["prepare"] = [prepared(chromium, scene, count, Path(name)) for scene in STARTS for count in COUNTS]
+        write_json(RESULTS, known | {"cpu": cpu_name()})
+    tables = {"webpage": page_table(known["runs"]), "webpage-prepare": prepare_table(known["prepare"])}
+    if args.docs:
+        for marker, table in tables.items():
+            between_markers(PAGE, marker, str(table))
+
+
+if __name__ == "__main__":
+    main()

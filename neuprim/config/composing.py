@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuprim.config.declared import check_names, check_preset, check_typed, complete_options, options_of, unused
-from neuprim.config.effort import EFFORT, Level, chosen_level
+from neuprim.config.effort import EFFORT, LEVELS, Level, chosen_level
 from neuprim.config.groups import check_groups, check_scene, presets, task_choices
 from neuprim.config.outputs import output_directory
 from neuprim.config.overrides import Assignment, expand_sweep, parse, sweep_names, swept_keys
@@ -162,7 +162,10 @@ def _choice(assignments: Sequence[Assignment], key: str) -> str | None:
         return None
     value = given[-1].value
     if not isinstance(value, (str, int, float)) or isinstance(value, bool) or not str(value):
-        raise ConfigError(f"{given[-1].text}: expected the name of a {key}")
+        raise ConfigError(
+            f"{given[-1].text}: expected "
+            + (f"a level from {LEVELS[0]} (fast) to {LEVELS[-1]} (good)" if key == EFFORT else f"the name of a {key}")
+        )
     return str(value)
 
 

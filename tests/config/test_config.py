@@ -107,6 +107,7 @@ def test_interpolation_follows_the_override(toy: Path) -> None:
         (["task=ty"], "task=ty: no such task; did you mean 'toy'?"),
         (["scene=bal"], "scene=bal: task 'toy' has no such scene; did you mean 'ball'?"),
         (["scene=[1]"], "expected the name of a scene"),
+        (["effort=true"], "effort=true: expected a level from 1 (fast) to 9 (good)"),
         (["preset=lng"], "preset=lng: task 'toy' has no such preset; did you mean 'long'?"),
         (["train.iterations=abc"], "train.iterations=abc: expected a whole number"),
         (["train.iterations=1.5"], "train.iterations=1.5: expected a whole number"),

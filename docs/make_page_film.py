@@ -39,7 +39,8 @@ def moments(page: dict[str, Any], side: int, count: int) -> Iterator[tuple[Camer
     """A camera and conditions per frame, which begin again where they end."""
     focal = 0.5 * side / math.tan(math.radians(_FOV) / 2)
     template = Camera(torch.eye(4, dtype=torch.float64), focal, focal, side / 2, side / 2, side, side)
-    place = (torch.tensor(page["center"]), torch.tensor(page["up"]), _AWAY * page["radius"], _ELEVATION)
+    center, up = (torch.tensor(page[key], dtype=torch.float64) for key in ("center", "up"))
+    place = (center, up, _AWAY * page["radius"], _ELEVATION)
     fine = 360
     around = orbit(template, *place, fine)
     conditions = {one["name"]: torch.tensor(one["value"], dtype=torch.float64) for one in page["conditions"]}

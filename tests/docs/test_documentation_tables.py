@@ -111,6 +111,15 @@ def test_the_table_of_voxels_is_that_of_the_recorded_results(benchmark: Callable
     assert between("docs/dynamic.md", "voxels") == benchmark("voxels").table(recorded)
 
 
+def test_the_tables_of_web_pages_are_those_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
+    script, found = benchmark("webpage"), json.loads((RESULTS / "webpage.json").read_text(encoding="utf-8"))
+    assert between("docs/export.md", "webpage") == str(script.page_table(found["runs"]))
+    assert between("docs/export.md", "webpage-prepare") == str(script.prepare_table(found["prepare"]))
+    assert {run["task"] for run in found["runs"].values()} == {"static", "dynamic", "relight"}
+    for run in found["runs"].values():
+        assert max(view["whole"] for view in run["views"]) < 1e-5 and len(run["views"]) == 8
+
+
 def test_the_levels_of_effort_are_those_that_were_measured(benchmark: Callable[[str], ModuleType]) -> None:
     """Both the tables and the files that a run reads."""
     script = benchmark("effort")

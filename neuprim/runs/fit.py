@@ -46,6 +46,7 @@ class Fitted:
     channels: Channels
     trainer: Trainer
     lpips: Lpips | None = None
+    split: str = "test"  # what judges: "train, held out" where training views took the place of the test views
 
     @property
     def model(self) -> Primitives:
@@ -63,11 +64,11 @@ class Fitted:
             field.set_progress(1.0)
 
     def metrics(self) -> dict[str, Any]:
-        """The content of ``metrics.json``, measured on the test views; the model's size is that of its tensors."""
+        """The content of ``metrics.json``, measured on the views that judge; the model's size is that of its tensors."""
         self.unlock()
         views = measure(self.model, self.task, self.dataset, self.config.renderer, self.channels, lpips=self.lpips)
         size = 4 * sum(value.numel() for value in self.model.params.values())
-        return summary(self.config, self.model, self.task, self.dataset, self.channels, views, size, self.training, self.lpips)
+        return summary(self.config, self.model, self.task, self.dataset, self.channels, views, size, self.training, self.lpips, self.split)
 
 
 def fit(config: RunConfig, events: Events = silent, dataset: Dataset | None = None) -> Fitted:
@@ -128,7 +129,7 @@ def start(
         grows = config.train.population.strategy == "relocate"
         rest = "the rest is born where the error is largest" if grows else "there will be no more of them"
         events(Note(f"{dataset.name} offers {found:,} starting points for model.primitives={asked:,}: {rest}"))
-    return Fitted(config, task, dataset, channels, trainer, lpips)
+    return Fitted(config, task, dataset, channels, trainer, lpips, "train, held out" if hold_out else "test")
 
 
 def steps(trainer: Trainer, events: Events = silent) -> Iterator[tuple[StepReport, float | None]]:

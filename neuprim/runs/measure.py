@@ -202,8 +202,13 @@ def summary(
     model_bytes: int,
     training: Mapping[str, Any],
     lpips: Lpips | None = None,
+    split: str = "test",
 ) -> dict[str, Any]:
-    """The content of ``metrics.json``. ``training`` holds iterations and train_seconds as the run recorded them."""
+    """The content of ``metrics.json``. ``training`` holds iterations and train_seconds as the run recorded them.
+
+    Args:
+        split: what the judging views are; those that are not the data set's test views make none of the task's films.
+    """
     worst, camera = min(views, key=lambda v: v.psnr), dataset.test.view(0).camera
     lowered = model.lower(dataset.test.view(0).camera, dataset.test.view(0).conditions, config.renderer)
     backend = choose(lowered, config.renderer)
@@ -213,7 +218,7 @@ def summary(
         "scene": config.scene_name,
         "dataset": dataset.name,
         "preset": config.preset,
-        "split": "test",
+        "split": split,
         **to_json("psnr", float(np.mean([v.psnr for v in views]))),
         "ssim": float(np.mean([v.ssim for v in views])),
         **_means(views),
@@ -221,7 +226,7 @@ def summary(
         **to_json("psnr_worst", worst.psnr),
         "view_worst": worst.name,
         "per_view": [_entry(v) for v in views],
-        **_per_frame(clips_of(task, dataset), views),
+        **_per_frame(clips_of(task, dataset) if split == "test" else (), views),
         "primitives": model.count,
         "parameters": model.count * model.parameters_per_primitive,
         "parameters_per_primitive": model.parameters_per_primitive,

@@ -54,3 +54,24 @@ def test_a_count_that_is_not_reached_is_said(scene: Path, tmp_path: Path) -> Non
 def test_shares_that_cannot_be(scene: Path, tmp_path: Path, more: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         compose(words(scene, tmp_path / "out", 100, *more))
+
+
+def test_a_sequence_is_judged_by_held_out_training_views(tmp_path: Path) -> None:
+    """Its films are of test cameras, whose views nobody has then."""
+    asked = [
+        "task=dynamic",
+        "scene=smoke_fire",
+        "scene.size=16",
+        "scene.timesteps=6",
+        "scene.cameras=6",
+        "scene.resolution=16",
+        "model.primitives=20",
+    ]
+    config = compose([*asked, "train.iterations=2", "train.max_seconds=null", f"output_dir={tmp_path / 'out'}"])
+    fitted = complete(start(config, hold_out=3))
+    metrics = fitted.metrics()
+    assert metrics["split"] == "train, held out" and "per_frame" not in metrics
+    assert len(metrics["per_view"]) == len(fitted.dataset.test) == 8
+    assert not {view["name"] for view in metrics["per_view"]} & {
+        fitted.dataset.train.view(i).name for i in range(len(fitted.dataset.train))
+    }

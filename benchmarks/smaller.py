@@ -1,9 +1,9 @@
 """What a scene requires: models of the presets, pruned, in few bits, and both.
 
     python benchmarks/smaller.py --orders RUN_DIR
-    python benchmarks/smaller.py [--chair DIR] [--fire DIR] [--scenes chair fire lit_solids smoke_fire] [--seeds 3] [--jobs 2] [--docs] [--print]
+    python benchmarks/smaller.py [--chair DIR] [--fire DIR] [--scenes chair fire fire_half lit_solids smoke_fire] [--seeds 3] [--jobs 2] [--docs] [--print]
 
-Every model is its preset's own (`quick`, the preset's number of views). Then, as `neuprim prune` and `neuprim compress` do it:
+Every model is its preset's own (`quick`, the preset's number of views), but for `fire_half`, half as large as the preset's and with the 4,000 views of docs/dynamic.md. Then, as `neuprim prune` and `neuprim compress` do it:
 
     trained as long   the whole model, fine-tuned for the steps that pruning has: what they bring without pruning
     pruned            `neuprim prune --tolerance 0.1dB --steps 4000`
@@ -48,16 +48,31 @@ RUNS = ROOT / "outputs" / "smaller"
 SCENES = {
     "chair": ("task=static", "scene=blender"),
     "fire": ("task=dynamic", "scene=vdb", "scene.size=64"),
+    "fire_half": (
+        "task=dynamic",
+        "scene=vdb",
+        "scene.frames='1:40'",
+        "scene.look=embergen_fire",
+        "scene.size=96",
+        "model.primitives=6750",
+        "train.iterations=4000",
+    ),
     "lit_solids": ("task=relight", "scene=lit_solids", "scene.size=128"),
     "smoke_fire": ("task=dynamic", "scene=smoke_fire", "scene.size=64"),
 }
 PRUNED, FEW_BITS, TOLERANCE = 4000, 1000, 0.1
 LEVELS = (2, 3, 4)
-SHOWN = {"chair": "chair, 200×200", "fire": "real fire, 64×64", "lit_solids": "lit_solids, 128×128", "smoke_fire": "smoke_fire, 64×64"}
+SHOWN = {
+    "chair": "chair, 200×200",
+    "fire": "real fire, 64×64",
+    "fire_half": "real fire, 96×96, half as many",
+    "lit_solids": "lit_solids, 128×128",
+    "smoke_fire": "smoke_fire, 64×64",
+}
 
 
 def words(scene: str, data: Path | None, seed: int) -> list[str]:
-    where = [] if data is None else [f"scene.{'vdb' if scene == 'fire' else 'path'}='{data.resolve()}'"]
+    where = [] if data is None else [f"scene.{'vdb' if scene.startswith('fire') else 'path'}='{data.resolve()}'"]
     return [*SCENES[scene], *where, f"seed={seed}", "renderer.threads=1", "train.eval_every=0", f"output_dir='{RUNS / f'{scene}-{seed}'}'"]
 
 
@@ -191,7 +206,7 @@ def main() -> None:
         orders(args.orders)
         return
     rows: list[dict[str, Any]] = json.loads(RESULTS.read_text())["rows"] if RESULTS.exists() else []
-    data = {"chair": args.chair, "fire": args.fire}
+    data = {"chair": args.chair, "fire": args.fire, "fire_half": args.fire}
     if not args.print:
         context = multiprocessing.get_context("spawn")
         queue = context.Manager().Queue()

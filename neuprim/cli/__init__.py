@@ -250,6 +250,7 @@ def _render(args: argparse.Namespace) -> int:
             tell=progress.note,
             progress=progress.show,
             words=args.words,
+            **{name: value for name, value in (("layers", args.layers), ("datatype", args.datatype)) if value is not None},
         )
     for path in paths:
         print(path)

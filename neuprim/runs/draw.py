@@ -23,6 +23,7 @@ from neuprim.core.io.film import write_film
 from neuprim.core.model.fields import Conditions
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import facts_of, orbit_of
+from neuprim.runs.layers import Layers
 from neuprim.runs.measure import draw_sum
 from neuprim.runs.open import LOGS, load_dataset, load_run, placed
 from neuprim.runs.operating import read_point
@@ -48,6 +49,8 @@ def render_run(
     tell: Callable[[str], None] = lambda text: None,
     progress: Callable[[str, float], None] = lambda text, fraction: None,
     words: Sequence[str] = (),
+    layers: str | None = None,
+    datatype: str | None = None,
 ) -> list[Path]:
     """Draw a run's model: ``camera`` is "orbit", "test" or a JSON file of cameras (see :mod:`neuprim.core.cameras.file`).
 
@@ -61,6 +64,8 @@ def render_run(
         tell: called with lines for the user, e.g. what the model never saw.
         progress: called with (text, fraction 0..1) while images are drawn.
         words: of an operating point (:mod:`neuprim.runs.operating`), over how the run draws.
+        layers: of an OpenEXR file, names separated by commas (:mod:`neuprim.core.layers`); None for all but a layer per light.
+        datatype: of light and alpha in an OpenEXR file, "half" or "float" (16 or 32 bits, the default).
 
     Raises:
         DataError, ConfigError, CheckpointError: bad cameras, conditions, or run directory.
@@ -98,6 +103,10 @@ def render_run(
         model = point.applied(model)
     model = placed(model, point.settings, views[0])
     format = format or _format_of(out, animated)
+    for flag_given, value in (("--layers", layers), ("--datatype", datatype)):
+        if value is not None and format != "exr":
+            raise ConfigError(f"{flag_given} {value}: of OpenEXR files; expected --format exr, found {format}")
+    layered = Layers(run_dir, task, channels, point, background, layers, datatype == "half", lights) if format == "exr" else None
     if channels.partial and format not in _RAW:
         tell(f"shown: {channels.shown}; --format exr and npy hold all channels")
 
@@ -110,13 +119,14 @@ def render_run(
         )
     done = 0
 
-    def image(view: View) -> torch.Tensor:
-        def drawn() -> None:
-            nonlocal done
-            done += 1
-            progress(f"view {done // each + (done % each > 0)} of {len(views)}", done / (each * len(views)))
+    each = max(len(lights), 1)
 
-        each = max(len(lights), 1)
+    def drawn() -> None:
+        nonlocal done
+        done += 1
+        progress(f"view {done // each + (done % each > 0)} of {len(views)}", done / (each * len(views)))
+
+    def image(view: View) -> torch.Tensor:
         with watch:
             if lights:
                 return point.enlarged(draw_sum(model, point.seen(view), lights, point.settings, background, drawn), view.camera)
@@ -134,17 +144,18 @@ def render_run(
     for v in views:
         path = out if single and out is not None else folder / f"{_file_name(v.name)}.{format}"
         path.parent.mkdir(parents=True, exist_ok=True)
-        _write(path, format, image(v), channels, fps)
+        if layered is None:
+            _write(path, format, image(v), channels, fps)
+        else:
+            with watch:
+                layered.write(path, model, v, drawn)
         paths.append(path)
     return paths
 
 
 def _write(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fps: float | None) -> None:
-    """One image: all channels, linear in EXR and as the data set has them in npy; or what its channels look like."""
-    if format == "exr":
-        linear = pixels if channels.color_space == "linear" else images.srgb_to_linear(pixels.clamp_min(0.0))
-        images.write_exr(path, linear, half=False, names=channels.names)
-    elif format == "npy":
+    """One image: all channels as the data set has them in npy, or what its channels look like."""
+    if format == "npy":
         write_npy(path, pixels.contiguous().numpy())
     elif format == "png":
         images.write_png(path, channels.display(pixels))

@@ -17,6 +17,7 @@ from neuprim.tasks.relight.colour import FORMS, VISIBILITY, LightNetwork
 from neuprim.tasks.relight.data import lighting_of
 from neuprim.tasks.relight.environment import illuminate
 from neuprim.tasks.relight.harmonics import LightHarmonics
+from neuprim.tasks.relight.layers import LAYERS
 from neuprim.tasks.relight.lights import parse_intensities, parse_lights, typical_light
 
 __all__ = ["TASK"]
@@ -100,4 +101,5 @@ TASK = TaskSpec(
     clips=judging.clips,
     facts=judging.facts,
     orbit=judging.orbit,
+    layers=LAYERS,
 )

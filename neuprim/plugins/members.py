@@ -31,7 +31,7 @@ _CALLS: dict[type, tuple[str, ...]] = {
     TaskSpec: ("build", "loss", "check", "mask", "judge", "diagnose", "clips", "facts", "orbit", "trade"),
     SceneSpec: ("load",),
     SceneExtension: (),
-    ConditionSpec: ("parse",),
+    ConditionSpec: ("parse", "in_frames"),
     LossExtension: ("make",),
     Exporter: ("write",),
     Inspector: ("layers",),

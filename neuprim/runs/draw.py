@@ -12,7 +12,7 @@ import torch
 from neuprim.config import RunConfig, suspects_of
 from neuprim.core.cameras.file import read_cameras
 from neuprim.core.channels import Channels, stored_channels
-from neuprim.core.conditions import flag, read_conditions
+from neuprim.core.conditions import flag, in_step, read_conditions
 from neuprim.core.data import View
 from neuprim.core.data.records import Record
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
@@ -192,28 +192,25 @@ def _format_of(out: Path | None, animated: bool) -> str:
 def with_conditions(
     views: list[View], task: TaskSpec, texts: Mapping[str, str], warn: Callable[[str], None] = lambda text: None
 ) -> tuple[list[View], bool]:
-    """Views with the conditions the user gave, and whether one of these is animated; an animated condition repeats or stretches the
-    cameras to its length.
+    """Views with the conditions the user gave, and whether one of these is animated. Animated conditions go along together, frame by frame;
+    where there are more frames than cameras, or the other way round, the fewer are spread evenly over the more.
 
     Raises:
         ConfigError: a view lacks a condition that the task needs, or as :func:`neuprim.core.conditions.read_conditions`.
     """
-    animated = False
     given = read_conditions(task.conditions, texts, warn)
+    frames = in_step(texts, given)
+    if frames > 1:
+        count = max(frames, len(views))
+        names = f"{{}}_{{:0{max(3, len(str(count - 1)))}d}}"
+        views = [replace(views[i * len(views) // count], name=names.format(views[i * len(views) // count].name, i)) for i in range(count)]
+    moments = [{name: values[i * len(values) // len(views)] for name, values in given.items()} for i in range(len(views))]
+    views = [replace(v, conditions={**v.conditions, **moment}) for v, moment in zip(views, moments, strict=True)]
     for spec in task.conditions:
-        if spec.name in given:
-            values = given[spec.name]
-            if len(values) == 1:
-                views = [replace(v, conditions={**v.conditions, spec.name: values[0]}) for v in views]
-            else:
-                animated = True
-                count = max(len(values), len(views))
-                pick = [(views[i * len(views) // count], values[i * len(values) // count]) for i in range(count)]
-                views = [replace(v, name=f"{v.name}_{i:03d}", conditions={**v.conditions, spec.name: x}) for i, (v, x) in enumerate(pick)]
         for v in views:
             if spec.name not in v.conditions:
                 raise ConfigError(f"view {v.name} has no {spec.name}, which task {task.name!r} needs; give {flag(spec.name)}")
-    return views, animated
+    return views, frames > 1
 
 
 def _file_name(name: str) -> str:

@@ -31,8 +31,8 @@ def exr_attributes(camera: Camera, near: float) -> dict[str, Any]:
         ]
     )
     return {
-        "worldToCamera": (up @ view).T.astype(np.float32),
-        "worldToNDC": (project @ view).T.astype(np.float32),
+        "worldToCamera": np.ascontiguousarray((up @ view).T, dtype=np.float32),
+        "worldToNDC": np.ascontiguousarray((project @ view).T, dtype=np.float32),
         "screenWindowCenter": np.array([(width / 2 - camera.cx) / camera.fx, (camera.cy - height / 2) / camera.fy], np.float32),
         "screenWindowWidth": width / camera.fx,
         "neuprim:focalLength": np.array([camera.fx, camera.fy], np.float32),

@@ -18,8 +18,8 @@ from neuprim.core.render.shading import points_seen
 
 __all__ = ["LayerFrame"]
 
-_CLEAR = 1e-4
-"""A pixel whose transmittance stays above this has no clamped primitive: one alone, at ``alpha_max`` = 0.9999, would take it there."""
+_CLEAR = 2e-4
+"""A pixel whose transmittance stays above this has no clamped primitive: one alone, at ``alpha_max`` = 0.9999, would take it to half of that."""
 
 _WEAKEN = 1 / 8
 _ROUNDS = 14  # at most: densities of 4e12 along a ray, and float32 knows hardly more

@@ -64,7 +64,7 @@ CORE: dict[str, set[str]] = {
     "checked": {"errors"},
     "settings": {"checked"},
     "metrics": {"errors"},
-    "cameras": {"errors"},
+    "cameras": {"errors", "io"},
     "compute": {"io"},
     "environment": {"errors", "io"},
     "model": {"cameras", "checked", "compute", "errors", "settings"},

@@ -40,7 +40,8 @@ def for_bench(parser: argparse.ArgumentParser) -> None:
 def for_render(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of ``neuprim render``, but those of light from all around."""
     parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
-    parser.add_argument("--camera", required=True, metavar="orbit|test|FILE.json", help="which cameras")
+    cameras = "which cameras; a file is JSON (frames, or a path of nerfstudio's viewer), USD (FILE#/PRIM) or a COLMAP model's folder"
+    parser.add_argument("--camera", required=True, metavar="orbit|test|FILE", help=cameras)
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the data set's)")
     parser.add_argument("--format", choices=("png", "exr", "npy", "webp", "gif", "mp4"), help="default: png, or webp for an animation")
     layers = "of an .exr: beauty, alpha, depth, density, and what the run's task adds (an unknown name lists them); default: all"

@@ -10,16 +10,16 @@ from typing import Any
 import torch
 
 from neuprim.config import RunConfig, suspects_of
-from neuprim.core.cameras.file import read_cameras
+from neuprim.core.cameras.file import CameraViews, read_camera_file
 from neuprim.core.channels import Channels, stored_channels
 from neuprim.core.conditions import flag, in_step, read_conditions
 from neuprim.core.data import View
-from neuprim.core.data.records import Record
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io import images
 from neuprim.core.io.files import write_npy
 from neuprim.core.io.film import write_film
+from neuprim.core.io.records import Record
 from neuprim.core.model.fields import Conditions
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import facts_of, orbit_of
@@ -28,7 +28,12 @@ from neuprim.runs.measure import draw_sum
 from neuprim.runs.open import LOGS, load_dataset, load_run, placed
 from neuprim.runs.operating import read_point
 
-__all__ = ["FORMATS", "render_run", "with_conditions"]
+__all__ = ["FORMATS", "SETS", "render_run", "with_conditions"]
+
+SETS = ("orbit", "test")
+"""Cameras of the run's own."""
+
+_TIME = "time"
 
 ANIMATIONS = ("webp", "gif", "mp4")
 _RAW = ("exr", "npy")
@@ -52,14 +57,14 @@ def render_run(
     layers: str | None = None,
     datatype: str | None = None,
 ) -> list[Path]:
-    """Draw a run's model: ``camera`` is "orbit", "test" or a JSON file of cameras (see :mod:`neuprim.core.cameras.file`).
+    """Draw a run's model: ``camera`` is "orbit", "test" or a file of cameras (see :mod:`neuprim.core.cameras.file`).
 
     Writes one file per view, or one animation for the formats of :data:`ANIMATIONS` with more than one view; returns the files.
     Without a format, the suffix of ``out`` decides, else views that differ in a condition become a WebP animation and others PNGs.
 
     Args:
         conditions: name -> text, e.g. ``{"time": "0:1"}``.
-        fps: of an animation; None lets it last four seconds, at 5 to 30 frames per second.
+        fps: of an animation; None for what the file of cameras says, or lets it last four seconds, at 5 to 30 frames per second.
         environment: light from all around instead of the task's light.
         tell: called with lines for the user, e.g. what the model never saw.
         progress: called with (text, fraction 0..1) while images are drawn.
@@ -87,8 +92,11 @@ def render_run(
         hint = " (--environment-unseen drop leaves it out)" if environment.guesses and any(around.guessed) else ""
         for note in around.notes:
             tell(f"{environment.path}: {note}{hint}")
-    if camera.endswith(".json"):
-        views = [View(name, c) for name, c in read_cameras(Path(camera), size)]
+    if camera not in SETS:
+        file = read_camera_file(Path(camera), size)
+        for note in file.notes:
+            tell(f"{camera}: {note}")
+        views, fps = _views_of(file, task, conditions), fps or file.fps
     else:
         dataset = load_dataset(config, task, run_dir=run_dir)
         suspects.know(dataset)
@@ -111,7 +119,7 @@ def render_run(
         tell(f"shown: {channels.shown}; --format exr and npy hold all channels")
 
     single = out is not None and out.suffix.lower() == f".{format}"
-    folder = out if out is not None and not single else run_dir / "renders" / camera.removesuffix(".json").split("/")[-1]
+    folder = out if out is not None and not single else run_dir / "renders" / _file_name(Path(camera.partition("#")[0]).resolve().stem)
     animate = format in ANIMATIONS and len(views) > 1
     if single and len(views) > 1 and not animate:
         raise ConfigError(
@@ -163,6 +171,13 @@ def _write(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fp
         images.write_webp(path, channels.display(pixels))
     else:
         write_film(path, [channels.display(pixels)], fps or 12.0)
+
+
+def _views_of(file: CameraViews, task: TaskSpec, conditions: Mapping[str, str]) -> list[View]:
+    """A view per camera; each at its own time where the file has times, the task has one, and the user gave no other."""
+    timed = file.times is not None and _TIME not in conditions and any(spec.name == _TIME and not spec.shape for spec in task.conditions)
+    times = [{_TIME: torch.tensor(time)} for time in file.times or ()] if timed else [{} for _ in file.named]
+    return [View(name, camera, time) for (name, camera), time in zip(file.named, times, strict=True)]
 
 
 def _illumination(

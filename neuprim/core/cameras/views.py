@@ -1,0 +1,32 @@
+"""What a file of cameras holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from neuprim.core.cameras.pinhole import Camera
+
+__all__ = ["LARGEST", "MOST", "CameraViews"]
+
+MOST = 100_000
+"""Cameras of one file."""
+
+LARGEST = 32768
+"""Pixels of an image's side."""
+
+
+@dataclass(frozen=True)
+class CameraViews:
+    """Cameras in their order, one or more.
+
+    Attributes:
+        named: name and camera of each; names differ.
+        times: what the file says as the time of each, in its own unit; None where it does not.
+        fps: frames per second of the film that they are; None where the file does not say.
+        notes: one line each, for the user: conventions that were met, and what of the file cannot be drawn.
+    """
+
+    named: tuple[tuple[str, Camera], ...]
+    times: tuple[float, ...] | None = None
+    fps: float | None = None
+    notes: tuple[str, ...] = ()

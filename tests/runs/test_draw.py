@@ -7,10 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from neuprim.core.cameras.file import CameraViews
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import ConditionSpec
-from neuprim.runs.draw import with_conditions
+from neuprim.runs.draw import _views_of, with_conditions
 from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.relight import TASK as RELIGHT
 from tests import scenes
@@ -53,3 +54,13 @@ def test_ten_thousand_frames_have_names_in_order() -> None:
     views, _ = with_conditions(VIEWS[:1], replace(DYNAMIC, conditions=(spec,)), {"time": "0:1:10001"})
     names = [v.name for v in views]
     assert names[0] == "v0_00000" and names == sorted(names)
+
+
+def test_a_files_times_are_the_frames_where_the_task_has_a_time() -> None:
+    file = CameraViews(tuple((v.name, v.camera) for v in VIEWS), times=(0.0, 0.25, 0.5, 1.0))
+    assert [float(v.conditions["time"]) for v in _views_of(file, DYNAMIC, {})] == [0.0, 0.25, 0.5, 1.0]
+    assert [v.conditions for v in _views_of(file, DYNAMIC, {"time": "0.5"})] == [{}] * 4, "what the user says comes first"
+    assert [v.conditions for v in _views_of(file, RELIGHT, {})] == [{}] * 4
+    assert [v.conditions for v in _views_of(replace(file, times=None), DYNAMIC, {})] == [{}] * 4
+    views, animated = with_conditions(_views_of(file, BOTH, {}), BOTH, {"light": "orbit:4:40:4", "light_intensity": "2"})
+    assert animated and [float(v.conditions["time"]) for v in views] == [0.0, 0.25, 0.5, 1.0]

@@ -149,8 +149,8 @@ def render_run(
         write_film(target, stack, fps or min(30.0, max(len(views) / 4.0, 5.0)))
         return [target]
     paths = []
-    for v in views:
-        path = out if single and out is not None else folder / f"{_file_name(v.name)}.{format}"
+    for v, name in zip(views, _file_names(views), strict=True):
+        path = out if single and out is not None else folder / f"{name}.{format}"
         path.parent.mkdir(parents=True, exist_ok=True)
         if layered is None:
             _write(path, format, image(v), channels, fps)
@@ -226,6 +226,12 @@ def with_conditions(
             if spec.name not in v.conditions:
                 raise ConfigError(f"view {v.name} has no {spec.name}, which task {task.name!r} needs; give {flag(spec.name)}")
     return views, frames > 1
+
+
+def _file_names(views: Sequence[View]) -> list[str]:
+    """Of each view, with its number where two would share a file."""
+    names = [_file_name(v.name) for v in views]
+    return names if len({name.lower() for name in names}) == len(names) else [f"{i:03d}_{name}" for i, name in enumerate(names)]
 
 
 def _file_name(name: str) -> str:

@@ -31,6 +31,7 @@ from neuprim.tasks.relight.colour import LightNetwork
 from tests import scenes
 from tests.lit_models import light
 from tests.lit_models import model as lit
+from tests.pretend_card import CARD, pretended
 from tests.timed_models import model as timed
 
 CAMERA = scenes.camera(20, 16, distance=2.6)
@@ -170,3 +171,23 @@ def test_any_size(tmp_path: Path) -> None:
     camera = Camera(CAMERA.viewmat, 1.0, 1.0, 0.5, 0.5, 1, 1)
     found, _ = written(tmp_path / "a.exr", layers(), volume(), replace(VIEW, camera=camera))
     assert found["R"].shape == (1, 1)
+
+
+@pytest.mark.parametrize("shadows", ["none", "primitive", "pixel", "volume"])
+def test_a_model_on_a_card_makes_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shadows: str) -> None:
+    """Nothing is taken from two devices at once."""
+    if shadows == "volume":
+        how, model, view = layers(), volume(), VIEW
+    else:
+        how, model = replace(layers(), task=RELIGHT), lit(LightNetwork(3, visibility=shadows), torch.float32)
+        view = replace(VIEW, conditions=light(1.5, -2.0, 2.0))
+    expected, _ = written(tmp_path / "a.exr", how, model, view)
+    with pretended(monkeypatch):
+        there = model.to(CARD)
+        assert there.device == CARD
+        how.write(tmp_path / "b.exr", there, view)
+    with OpenEXR.File(str(tmp_path / "b.exr"), separate_channels=True) as file:
+        found = {name: torch.from_numpy(np.array(c.pixels)) for name, c in file.channels().items()}
+    assert found.keys() == expected.keys()
+    for name, plane in found.items():
+        assert (plane - expected[name]).abs().max() < 1e-4, name

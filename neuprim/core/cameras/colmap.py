@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections import Counter
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -103,7 +103,7 @@ def is_model(path: Path) -> Path | None:
 
 
 def posed_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
-    """Name and camera of every image with a pose, by name, and lines for the user. Points need not be there.
+    """Name, without its suffix, and camera of every image with a pose, by name, and lines for the user. Points need not be there.
 
     Raises:
         BackendUnavailable: pycolmap is not installed.
@@ -122,7 +122,7 @@ def posed_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
         if any(value for name, value in zip(names, lens.params, strict=True) if name not in ("f", "fx", "fy", "cx", "cy")):
             bent[lens.model_name] += 1
         camera = Camera(viewmat_of(image), *pinhole_of(lens, where), int(lens.width), int(lens.height))
-        found.append((image.name, camera.validate(where)))
+        found.append((str(PurePosixPath(image.name).with_suffix("")), camera.validate(where)))
     notes = [f"the lens distortion of {count} of {len(found)} cameras ({model}) is left out" for model, count in sorted(bent.items())]
     return found, notes
 

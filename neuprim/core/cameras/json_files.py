@@ -17,6 +17,22 @@ __all__ = ["read_json_cameras"]
 
 _MAX_BYTES = 64 * 1024 * 1024
 
+_COMMON = (
+    "w",
+    "h",
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "camera_angle_x",
+    "camera_angle_y",
+    "camera_model",
+    "is_fisheye",
+    *COEFFICIENTS,
+    "transform_matrix",
+)
+"""What a frame may leave to its file."""
+
 
 def read_json_cameras(path: Path, size: tuple[int, int] | None = None) -> CameraViews:
     """The cameras of a file with ``frames`` or ``camera_path``.
@@ -67,8 +83,9 @@ def _rate(document: Record) -> float | None:
 def _frames(document: Record, size: tuple[int, int] | None) -> CameraViews:
     """``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``; a frame may override every intrinsic."""
     records, found, bent = _checked(document, "frames"), [], 0
+    common = {key: document.values[key] for key in _COMMON if document.has(key)}  # not all of what a file may hold, for every frame
     for i, record in enumerate(records):
-        merged = Record({**document.values, **{k: v for k, v in record.values.items() if v is not None}}, record.where)
+        merged = Record({**common, **{k: v for k, v in record.values.items() if v is not None}}, record.where)
         if is_fisheye(merged, ()):
             raise DataError(f"{merged.where}: the camera is a fisheye (camera_model, is_fisheye); expected one of {', '.join(MODELS)}")
         bent += any(merged.number_or(key, 0.0) != 0.0 for key in COEFFICIENTS)

@@ -20,7 +20,7 @@ class CameraViews:
     """Cameras in their order, one or more.
 
     Attributes:
-        named: name and camera of each; names differ.
+        named: name and camera of each.
         times: what the file says as the time of each, in its own unit; None where it does not.
         fps: frames per second of the film that they are; None where the file does not say.
         notes: one line each, for the user: conventions that were met, and what of the file cannot be drawn.

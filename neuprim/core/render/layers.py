@@ -113,16 +113,15 @@ class LayerFrame:
         return found if n == 1 else found.reshape(self.camera.height, n, self.camera.width, n).mean((1, 3))
 
     def _thin(self, transmittance: Callable[[float], Tensor]) -> Tensor:
-        factor, found, open_ = 1.0, torch.zeros(()), torch.ones((), dtype=torch.bool)
+        """-log of the transmittance for densities times 1, for the pixels that are opaque then for thinner ones, and so on."""
+        T = transmittance(1.0)
+        found, opaque, factor = _depth(T), T <= _CLEAR, 1.0
         for _ in range(_ROUNDS):
-            T = transmittance(factor)
-            clear = T > _CLEAR
-            here = -T.clamp_min(torch.finfo(T.dtype).tiny).double().log() / factor
-            found = torch.where(open_, here, found)
-            open_ = open_ & ~clear
-            if not bool(open_.any()):
+            if not bool(opaque.any()):
                 break
             factor *= _WEAKEN
+            T = transmittance(factor)
+            found, opaque = torch.where(opaque, _depth(T) / factor, found), opaque & (T <= _CLEAR)
         return found.clamp_min(0.0).add(0.0).to(T.dtype)  # no -0
 
     def _transmittance(self, weights: Tensor, camera: Camera, settings: RenderSettings) -> Tensor:
@@ -136,3 +135,8 @@ class LayerFrame:
     def _render(self, lowered: Lowered, settings: RenderSettings) -> RenderOutput:
         with torch.no_grad():
             return render_lowered(lowered, self.camera, settings)
+
+
+def _depth(transmittance: Tensor) -> Tensor:
+    """Optical depth, float64; of what float32 calls 0, that of its smallest number."""
+    return -transmittance.clamp_min(torch.finfo(transmittance.dtype).tiny).double().log()

@@ -30,7 +30,7 @@ def model(folder: Path, cameras: str = CAMERAS, images: str = IMAGES, points: st
 
 def check(path: Path) -> None:
     found = read_camera_file(path)
-    assert [name for name, _ in found.named] == ["a.png", "b.png"] and found.notes == () and found.times is None
+    assert [name for name, _ in found.named] == ["a", "b"] and found.notes == () and found.times is None
     camera = found.named[0][1]
     assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height) == (500, 510, 320.5, 240.25, 640, 480)
     pixels, z = camera.project(torch.tensor([[1.5, 2.4, -1.0]], dtype=torch.float64))  # 0.5 right, 0.4 down, 2 ahead

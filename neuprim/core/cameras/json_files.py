@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neuprim.core.cameras.intrinsics import COEFFICIENTS, MODELS, camera_of, is_fisheye
 from neuprim.core.cameras.pinhole import Camera, opengl_to_viewmat
-from neuprim.core.cameras.views import LARGEST, MOST, CameraViews
+from neuprim.core.cameras.views import LARGEST, MOST, RATES, CameraViews
 from neuprim.core.errors import DataError
 from neuprim.core.io.records import Record, read_json
 
@@ -71,9 +71,14 @@ def _times(records: list[Record], key: str) -> tuple[float, ...] | None:
     return tuple(r.number(key, "a time") for r in records) if all(r.has(key) for r in records) else None
 
 
-def _rate(document: Record) -> float | None:
-    if document.has("fps"):
-        return document.number("fps", "frames per second above 0", 0.0)
+def _rate(document: Record, count: int) -> float | None:
+    """``fps``, else the ``count`` of frames over ``seconds``; None where the file says neither."""
+    for key, rate in (("fps", lambda value: value), ("seconds", lambda value: count / value)):
+        if document.has(key):
+            found = rate(document.number(key, "a number above 0", 0.0))
+            if not RATES[0] <= found <= RATES[1]:
+                raise document.fail(key, f"{RATES[0]:g} to {RATES[1]:g} frames per second")
+            return found
     return None
 
 
@@ -92,7 +97,7 @@ def _frames(document: Record, size: tuple[int, int] | None) -> CameraViews:
         width, height = _size(merged, ("w", "h"), size)
         found.append((f"camera_{i:03d}", camera_of(merged, width, height).validate(record.where)))
     notes = (f"the lens distortion of {bent} of {len(found)} cameras is left out",) if bent else ()
-    return CameraViews(tuple(found), _times(records, "time"), _rate(document), notes)
+    return CameraViews(tuple(found), _times(records, "time"), _rate(document, len(found)), notes)
 
 
 # ---------------------------------------------------------------- nerfstudio's viewer
@@ -114,11 +119,8 @@ def _camera_path(document: Record, size: tuple[int, int] | None) -> CameraViews:
         view = opengl_to_viewmat(_flat_matrix(record, "camera_to_world"))
         camera = Camera(view, focal, focal, 0.5 * width, 0.5 * height, width, height)
         found.append((f"camera_{i:03d}", camera.validate(f"{record.where}.camera_to_world")))
-    rate = _rate(document)
-    if rate is None and document.has("seconds"):
-        rate = len(found) / document.number("seconds", "a duration above 0", 0.0)
     note = "poses are taken as they are; nerfstudio's viewer has them in the frame that its dataparser moved and scaled the scene to"
-    return CameraViews(tuple(found), _times(records, "render_time"), rate, (note,))
+    return CameraViews(tuple(found), _times(records, "render_time"), _rate(document, len(found)), (note,))
 
 
 def _flat_matrix(record: Record, key: str) -> Tensor:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import usd_stage
 from neuprim.core.cameras.pinhole import Camera, opengl_to_viewmat
-from neuprim.core.cameras.views import LARGEST, MOST, CameraViews
+from neuprim.core.cameras.views import LARGEST, MOST, RATES, CameraViews
 from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.io.records import Record
 
@@ -62,6 +62,8 @@ def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = 
     cameras = [_camera(Record(r.values, where if len(records) == 1 else f"{where}, frame {i}"), wanted) for i, r in enumerate(records)]
     note = f"{stage.text('up')} is up and a unit is {stage.number('meters', 'metres per unit', 0.0):g} m in this file; taken as the scene's own axes and units"
     fps = stage.number("fps", "time codes per second above 0", 0.0) if len(cameras) > 1 else None
+    if fps is not None and not RATES[0] <= fps <= RATES[1]:  # some tools count in ticks
+        note, fps = f"{note}; timeCodesPerSecond {fps:g} is no rate of a film, --fps says another", None
     return CameraViews(tuple((f"camera_{i:03d}", camera) for i, camera in enumerate(cameras)), None, fps, (note,))
 
 

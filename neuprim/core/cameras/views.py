@@ -6,13 +6,16 @@ from dataclasses import dataclass
 
 from neuprim.core.cameras.pinhole import Camera
 
-__all__ = ["LARGEST", "MOST", "CameraViews"]
+__all__ = ["LARGEST", "MOST", "RATES", "CameraViews"]
 
 MOST = 100_000
 """Cameras of one file."""
 
 LARGEST = 32768
 """Pixels of an image's side."""
+
+RATES = (0.1, 240.0)
+"""Least and most frames per second of a film, as ``--fps`` takes them."""
 
 
 @dataclass(frozen=True)

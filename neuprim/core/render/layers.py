@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import FormError
-from neuprim.core.model.fields import Conditions, Constant, LoweredColour, Shading
+from neuprim.core.model.fields import Conditions, Constant, LoweredColour
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from neuprim.core.render.shading import points_seen
@@ -69,7 +69,7 @@ class LayerFrame:
         geometry, density = self.lowered.geometry, self.lowered.density
         with torch.no_grad():
             found = self.model.colour.shade(geometry, density, self.conditions, self.settings)
-        if found is None or found == Shading():
+        if found is None or (found.primitives is None and found.pixels is None):
             return None
         factor = torch.ones_like(self.drawn.alpha)
         if found.primitives is not None:

@@ -84,7 +84,8 @@ BAD: list[tuple[str, Any, str]] = [
     ("focal negative", {**GOOD, "fl_x": 50, "fl_y": -50}, "focal"),
     ("width of halves", {**GOOD, "w": 64.5}, "w is 64.5; expected a positive whole number"),
     ("time of text", {**GOOD, "frames": [{"transform_matrix": POSE, "time": "late"}]}, "time is"),
-    ("rate", {**GOOD, "fps": 0}, "fps is 0; expected frames per second above 0"),
+    ("rate", {**GOOD, "fps": 0}, "fps is 0; expected a number above 0"),
+    ("rate of ticks", {**GOOD, "fps": 6000}, "fps is 6000; expected 0.1 to 240 frames per second"),
     ("fisheye", {**GOOD, "camera_model": "OPENCV_FISHEYE"}, r"frames\[0\]: the camera is a fisheye"),
     ("fisheye by a flag", {**GOOD, "is_fisheye": True}, "the camera is a fisheye"),
     ("panorama", {**GOOD, "camera_model": "EQUIRECTANGULAR"}, "camera_model is .* expected one of OPENCV"),
@@ -207,7 +208,8 @@ def test_a_paths_times_and_seconds(tmp_path: Path) -> None:
         ({"camera_path": [{"camera_to_world": [2 * x for x in FLAT[:15]] + [1], "fov": 50}]}, "rotation is singular or scaled"),
         ({"render_width": None}, "render_width is null; expected a positive whole number"),
         ({"render_height": 10**6}, "render_height is 1000000; expected 1 to 32768 pixels"),
-        ({"fps": None, "seconds": 0}, "seconds is 0; expected a duration above 0"),
+        ({"fps": None, "seconds": 0}, "seconds is 0; expected a number above 0"),
+        ({"fps": None, "seconds": 1e-9}, "seconds is 1e-09; expected 0.1 to 240 frames per second"),
     ],
 )
 def test_bad_camera_paths_are_refused_by_name_and_field(tmp_path: Path, change: dict[str, Any], words: str) -> None:

@@ -100,6 +100,12 @@ def test_a_camera_that_moves_has_a_frame_per_time_code(tmp_path: Path) -> None:
         assert close(camera, projected(path, "/World/Cam", 1 + i, POINTS, (640, 480)))
 
 
+def test_a_rate_of_ticks_is_no_films(tmp_path: Path) -> None:
+    path = usd(tmp_path / "a.usda", MOVING, "startTimeCode = 1\n    endTimeCode = 3\n    timeCodesPerSecond = 6000")
+    found = read_camera_file(path, (64, 48))
+    assert found.fps is None and "timeCodesPerSecond 6000 is no rate of a film" in found.notes[0]
+
+
 @pytest.mark.parametrize("size", [(640, 300), (300, 480)])
 def test_another_shape_shows_the_whole_aperture_and_more(tmp_path: Path, size: tuple[int, int]) -> None:
     path = usd(tmp_path / "a.usda")

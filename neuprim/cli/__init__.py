@@ -233,11 +233,8 @@ def _eval(args: argparse.Namespace) -> int:
 
 def _render(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
-    if args.camera not in ("orbit", "test"):
-        if not args.camera.lower().endswith(".json"):
-            raise ConfigError(f"--camera {args.camera}: expected orbit, test or a .json file")
-        if not Path(args.camera).is_file():
-            raise ConfigError(f"--camera {args.camera}: no such file")
+    if args.camera not in ("orbit", "test") and not any(Path(name).exists() for name in (args.camera, args.camera.partition("#")[0])):
+        raise ConfigError(f"--camera {args.camera}: no such file; expected orbit, test, or a file or folder of cameras")
     environment = environment_of(args)
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
@@ -250,6 +247,7 @@ def _render(args: argparse.Namespace) -> int:
             tell=progress.note,
             progress=progress.show,
             words=args.words,
+            **{name: value for name, value in (("layers", args.layers), ("datatype", args.datatype)) if value is not None},
         )
     for path in paths:
         print(path)

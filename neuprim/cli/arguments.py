@@ -40,9 +40,14 @@ def for_bench(parser: argparse.ArgumentParser) -> None:
 def for_render(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of ``neuprim render``, but those of light from all around."""
     parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
-    parser.add_argument("--camera", required=True, metavar="orbit|test|FILE.json", help="which cameras")
+    cameras = "which cameras; a file is JSON (frames, or a path of nerfstudio's viewer), USD (FILE#/PRIM) or a COLMAP model's folder"
+    parser.add_argument("--camera", required=True, metavar="orbit|test|FILE", help=cameras)
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the data set's)")
     parser.add_argument("--format", choices=("png", "exr", "npy", "webp", "gif", "mp4"), help="default: png, or webp for an animation")
+    layers = "of an .exr: beauty, alpha, depth, density, and what the run's task adds (an unknown name lists them); default: all"
+    parser.add_argument("--layers", metavar="NAME,...", help=layers)
+    datatype = "light and alpha of an .exr in 16 or 32 bits (default: float); depth and other numbers are float in either"
+    parser.add_argument("--datatype", choices=("half", "float"), help=datatype)
     parser.add_argument("--fps", type=rate, metavar="F", help="frames per second of an animation (default: about four seconds in all)")
     parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
     parser.add_argument("--frames", type=count, default=60, metavar="N", help="frames of an orbit (default: 60)")

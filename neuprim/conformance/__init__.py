@@ -30,6 +30,7 @@ from neuprim.conformance.forms import (
     check_lowered_forms,
     check_opaque_twin,
 )
+from neuprim.conformance.layers import check_layers
 from neuprim.conformance.less import check_pieces, check_reductions
 from neuprim.conformance.parameters import (
     check_fields,
@@ -72,6 +73,7 @@ CHECKS: dict[str, Callable[[Subject], None]] = {
         check_judging,
         check_lowered_forms,
         check_channels,
+        check_layers,
         check_alive,
         check_line_integral,
         check_opaque_twin,

@@ -20,7 +20,7 @@ from torch import Tensor
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.model.fields import ConditionSpec
 
-__all__ = ["FRAMES", "Warn", "export_frames", "flag", "named", "read_conditions", "split_words"]
+__all__ = ["FRAMES", "Warn", "export_frames", "flag", "in_step", "named", "read_conditions", "split_words"]
 
 FRAMES = 60
 """Frames of a range that does not say how many."""
@@ -86,13 +86,44 @@ def split_words(words: Sequence[str], specs: Sequence[ConditionSpec], bare: bool
 def read_conditions(specs: Sequence[ConditionSpec], texts: Mapping[str, str], warn: Warn = _silent) -> dict[str, list[Tensor]]:
     """Name -> values, one per frame, of the conditions that were given, in the task's order.
 
+    An animation that does not say how many frames it has, ``0:1`` or ``orbit``, takes the number of those that do.
+
     Args:
         warn: called with one line for each condition that leaves its range; those of strict ones are refused.
 
     Raises:
         ConfigError: a text that the condition does not take, values that are not finite, or beyond the range of a strict condition.
     """
-    return {spec.name: _read(spec, texts[spec.name], warn) for spec in specs if spec.name in texts}
+    given = [spec for spec in specs if spec.name in texts]
+    said = {}
+    for spec in given:
+        found = _read(spec, texts[spec.name], _silent)
+        if len(found) > 1 and _in_frames(spec, texts[spec.name], len(found)) is None:
+            said[spec.name] = len(found)
+    count = max(said.values(), default=0)
+    lengths = {spec.name: None if spec.name in said or not count else _in_frames(spec, texts[spec.name], count) for spec in given}
+    return {spec.name: _read(spec, lengths[spec.name] or texts[spec.name], warn) for spec in given}
+
+
+def in_step(texts: Mapping[str, str], found: Mapping[str, Sequence[Tensor]]) -> int:
+    """How many frames conditions of :func:`read_conditions` have together; those of one value hold it in all of them.
+
+    Raises:
+        ConfigError: two have several values each, and not as many.
+    """
+    counts = {name: len(values) for name, values in found.items() if len(values) > 1}
+    if len(set(counts.values())) > 1:
+        each = " and ".join(f"{flag(name)} {texts[name]} has {count} frames" for name, count in counts.items())
+        raise ConfigError(f"{each}; expected as many of each, or one of them without a number of its own")
+    return max(counts.values(), default=1)
+
+
+def _in_frames(spec: ConditionSpec, text: str, count: int) -> str | None:
+    """The text in so many frames; None where it says its number, or is a single value or a list."""
+    if spec.shape:
+        return spec.in_frames(text, count)
+    found = _RANGE.fullmatch(text.strip())
+    return f"{text.strip()}:{count}" if found is not None and found[3] is None else None
 
 
 def _read(spec: ConditionSpec, text: str, warn: Warn) -> list[Tensor]:
@@ -179,11 +210,10 @@ def export_frames(specs: Sequence[ConditionSpec], texts: Mapping[str, str], seve
             raise ConfigError(f"{what}; for example {flag(spec.name)} {_example(spec)}")
     found = read_conditions(specs, texts)
     counts = {name: len(values) for name, values in found.items() if len(values) > 1}
-    if counts and (not several or len(set(counts.values())) > 1):
+    if counts and not several:
         name = next(iter(counts))
-        expected = "one value" if not several else "as many values for each"
-        raise ConfigError(f"{flag(name)} {texts[name]}: {counts[name]} values; expected {expected}")
-    frames = max(counts.values(), default=1)
+        raise ConfigError(f"{flag(name)} {texts[name]}: {counts[name]} values; expected one value")
+    frames = in_step(texts, found)
     return [{name: values[i if len(values) > 1 else 0] for name, values in found.items()} for i in range(frames)]
 
 

@@ -12,6 +12,7 @@ from neuprim.core.checked import Option
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.context import SceneContext
 from neuprim.core.environment import Environment, Illumination
+from neuprim.core.layers import LayerSpec
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField, Field
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.source import VolumeSource
@@ -111,6 +112,8 @@ class TaskSpec:
     """What pictures show: (H, W, C) colours in the data set's colour space -> (H, W, 3) sRGB values 0..1. It must take each pixel by
     itself, as it also gets the colours of primitives, as an image one pixel high. None: three channels are red, green and blue, one is
     grey, and of others the first three are shown."""
+    layers: tuple[LayerSpec, ...] = ()
+    """What ``neuprim render --format exr`` can write of its frames beside beauty, alpha, depth and density: see :class:`~neuprim.core.layers.LayerSpec`."""
     options: Mapping[str, Option] = field(default_factory=dict)
     uses: tuple[str, ...] = ()
     mask: Callable[[Dataset, int], Tensor | None] = lambda dataset, index: None

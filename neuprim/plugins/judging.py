@@ -12,10 +12,11 @@ from torch import Tensor
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.check import DatasetFault, check_mask
 from neuprim.core.errors import NeuprimError
+from neuprim.core.layers import LayerFrame, LayerSpec
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 
-__all__ = ["TaskFault", "clips_of", "diagnosed", "facts_of", "judged", "mask_of", "orbit_of"]
+__all__ = ["TaskFault", "clips_of", "diagnosed", "facts_of", "judged", "layer_of", "mask_of", "orbit_of"]
 
 Kind = TypeVar("Kind")
 
@@ -102,6 +103,27 @@ def orbit_of(task: TaskSpec, dataset: Dataset, frames: int) -> list[View]:
     if not found:
         raise TaskFault("orbit: found no views; expected some")
     return found
+
+
+def layer_of(spec: LayerSpec, frame: LayerFrame, channels: int) -> Tensor | None:
+    """(H, W, C) values of a layer, those of light with the image's ``channels``; None where the model has no such layer.
+
+    Raises:
+        TaskFault: it is something else, or not finite.
+    """
+    found = spec.draw(frame)
+    if found is None:
+        return None
+    count = len(spec.channels) or channels
+    expected = (frame.camera.height, frame.camera.width, count)
+    if isinstance(found, Tensor) and tuple(found.shape) == expected[:2] and count == 1:
+        found = found[..., None]
+    if not isinstance(found, Tensor) or tuple(found.shape) != expected or not found.is_floating_point():
+        what = f"{found.dtype} of shape {tuple(found.shape)}" if isinstance(found, Tensor) else f"a {type(found).__name__}"
+        raise TaskFault(f"layers: {spec.name} is {what}; expected floats of shape {expected}")
+    if not bool(found.isfinite().all()):
+        raise TaskFault(f"layers: {spec.name} has {int((~found.isfinite()).sum())} NaN or infinite values; expected finite numbers")
+    return found.detach()
 
 
 def _listed(found: Any, where: str, kind: type[Kind]) -> list[Kind]:

@@ -11,6 +11,7 @@ from neuprim.core.checked import converted, option_type
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import Exporter, Inspector, LossExtension, SceneExtension
 from neuprim.core.io.channel_names import names_fault
+from neuprim.core.layers import layer_fault
 from neuprim.core.model.fields import ConditionSpec, Field
 from neuprim.core.task import SceneSpec, TaskSpec
 from neuprim.core.uses import OPTIONAL
@@ -30,7 +31,7 @@ _CALLS: dict[type, tuple[str, ...]] = {
     TaskSpec: ("build", "loss", "check", "mask", "judge", "diagnose", "clips", "facts", "orbit", "trade"),
     SceneSpec: ("load",),
     SceneExtension: (),
-    ConditionSpec: ("parse",),
+    ConditionSpec: ("parse", "in_frames"),
     LossExtension: ("make",),
     Exporter: ("write",),
     Inspector: ("layers",),
@@ -128,7 +129,8 @@ def _task(spec: TaskSpec) -> str | None:
         return f"channels{wrong}"
     if spec.display is not None and not callable(spec.display):
         return f"display is of type {type(spec.display).__name__}; expected a function or None"
-    return None
+    wrong = layer_fault(spec.layers)
+    return f"layers{wrong}" if wrong else None
 
 
 def _one(member: Any, kind: type, where: str) -> str | None:

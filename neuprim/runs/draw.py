@@ -10,24 +10,30 @@ from typing import Any
 import torch
 
 from neuprim.config import RunConfig, suspects_of
-from neuprim.core.cameras.file import read_cameras
+from neuprim.core.cameras.file import CameraViews, read_camera_file
 from neuprim.core.channels import Channels, stored_channels
-from neuprim.core.conditions import flag, read_conditions
+from neuprim.core.conditions import flag, in_step, read_conditions
 from neuprim.core.data import View
-from neuprim.core.data.records import Record
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io import images
 from neuprim.core.io.files import write_npy
 from neuprim.core.io.film import write_film
+from neuprim.core.io.records import Record
 from neuprim.core.model.fields import Conditions
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import facts_of, orbit_of
+from neuprim.runs.layers import Layers
 from neuprim.runs.measure import draw_sum
 from neuprim.runs.open import LOGS, load_dataset, load_run, placed
 from neuprim.runs.operating import read_point
 
-__all__ = ["FORMATS", "render_run", "with_conditions"]
+__all__ = ["FORMATS", "SETS", "render_run", "with_conditions"]
+
+SETS = ("orbit", "test")
+"""Cameras of the run's own."""
+
+_TIME = "time"
 
 ANIMATIONS = ("webp", "gif", "mp4")
 _RAW = ("exr", "npy")
@@ -48,19 +54,23 @@ def render_run(
     tell: Callable[[str], None] = lambda text: None,
     progress: Callable[[str, float], None] = lambda text, fraction: None,
     words: Sequence[str] = (),
+    layers: str | None = None,
+    datatype: str | None = None,
 ) -> list[Path]:
-    """Draw a run's model: ``camera`` is "orbit", "test" or a JSON file of cameras (see :mod:`neuprim.core.cameras.file`).
+    """Draw a run's model: ``camera`` is "orbit", "test" or a file of cameras (see :mod:`neuprim.core.cameras.file`).
 
     Writes one file per view, or one animation for the formats of :data:`ANIMATIONS` with more than one view; returns the files.
     Without a format, the suffix of ``out`` decides, else views that differ in a condition become a WebP animation and others PNGs.
 
     Args:
         conditions: name -> text, e.g. ``{"time": "0:1"}``.
-        fps: of an animation; None lets it last four seconds, at 5 to 30 frames per second.
+        fps: of an animation; None for what the file of cameras says, or lets it last four seconds, at 5 to 30 frames per second.
         environment: light from all around instead of the task's light.
         tell: called with lines for the user, e.g. what the model never saw.
         progress: called with (text, fraction 0..1) while images are drawn.
         words: of an operating point (:mod:`neuprim.runs.operating`), over how the run draws.
+        layers: of an OpenEXR file, names separated by commas (:mod:`neuprim.core.layers`); None for all but a layer per light.
+        datatype: of light and alpha in an OpenEXR file, "half" or "float" (16 or 32 bits, the default).
 
     Raises:
         DataError, ConfigError, CheckpointError: bad cameras, conditions, or run directory.
@@ -82,8 +92,11 @@ def render_run(
         hint = " (--environment-unseen drop leaves it out)" if environment.guesses and any(around.guessed) else ""
         for note in around.notes:
             tell(f"{environment.path}: {note}{hint}")
-    if camera.endswith(".json"):
-        views = [View(name, c) for name, c in read_cameras(Path(camera), size)]
+    if camera not in SETS:
+        file = read_camera_file(Path(camera), size)
+        for note in file.notes:
+            tell(f"{camera}: {note}")
+        views, fps = _views_of(file, task, conditions), fps or file.fps
     else:
         dataset = load_dataset(config, task, run_dir=run_dir)
         suspects.know(dataset)
@@ -98,11 +111,15 @@ def render_run(
         model = point.applied(model)
     model = placed(model, point.settings, views[0])
     format = format or _format_of(out, animated)
+    for flag_given, value in (("--layers", layers), ("--datatype", datatype)):
+        if value is not None and format != "exr":
+            raise ConfigError(f"{flag_given} {value}: of OpenEXR files; expected --format exr, found {format}")
+    layered = Layers(run_dir, task, channels, point, background, layers, datatype == "half", lights) if format == "exr" else None
     if channels.partial and format not in _RAW:
         tell(f"shown: {channels.shown}; --format exr and npy hold all channels")
 
     single = out is not None and out.suffix.lower() == f".{format}"
-    folder = out if out is not None and not single else run_dir / "renders" / camera.removesuffix(".json").split("/")[-1]
+    folder = out if out is not None and not single else run_dir / "renders" / _file_name(Path(camera.partition("#")[0]).resolve().stem)
     animate = format in ANIMATIONS and len(views) > 1
     if single and len(views) > 1 and not animate:
         raise ConfigError(
@@ -110,13 +127,14 @@ def render_run(
         )
     done = 0
 
-    def image(view: View) -> torch.Tensor:
-        def drawn() -> None:
-            nonlocal done
-            done += 1
-            progress(f"view {done // each + (done % each > 0)} of {len(views)}", done / (each * len(views)))
+    each = max(len(lights), 1)
 
-        each = max(len(lights), 1)
+    def drawn() -> None:
+        nonlocal done
+        done += 1
+        progress(f"view {done // each + (done % each > 0)} of {len(views)}", done / (each * len(views)))
+
+    def image(view: View) -> torch.Tensor:
         with watch:
             if lights:
                 return point.enlarged(draw_sum(model, point.seen(view), lights, point.settings, background, drawn), view.camera)
@@ -131,20 +149,21 @@ def render_run(
         write_film(target, stack, fps or min(30.0, max(len(views) / 4.0, 5.0)))
         return [target]
     paths = []
-    for v in views:
-        path = out if single and out is not None else folder / f"{_file_name(v.name)}.{format}"
+    for v, name in zip(views, _file_names(views), strict=True):
+        path = out if single and out is not None else folder / f"{name}.{format}"
         path.parent.mkdir(parents=True, exist_ok=True)
-        _write(path, format, image(v), channels, fps)
+        if layered is None:
+            _write(path, format, image(v), channels, fps)
+        else:
+            with watch:
+                layered.write(path, model, v, drawn)
         paths.append(path)
     return paths
 
 
 def _write(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fps: float | None) -> None:
-    """One image: all channels, linear in EXR and as the data set has them in npy; or what its channels look like."""
-    if format == "exr":
-        linear = pixels if channels.color_space == "linear" else images.srgb_to_linear(pixels.clamp_min(0.0))
-        images.write_exr(path, linear, half=False, names=channels.names)
-    elif format == "npy":
+    """One image: all channels as the data set has them in npy, or what its channels look like."""
+    if format == "npy":
         write_npy(path, pixels.contiguous().numpy())
     elif format == "png":
         images.write_png(path, channels.display(pixels))
@@ -152,6 +171,13 @@ def _write(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fp
         images.write_webp(path, channels.display(pixels))
     else:
         write_film(path, [channels.display(pixels)], fps or 12.0)
+
+
+def _views_of(file: CameraViews, task: TaskSpec, conditions: Mapping[str, str]) -> list[View]:
+    """A view per camera; each at its own time where the file has times, the task has one, and the user gave no other."""
+    timed = file.times is not None and _TIME not in conditions and any(spec.name == _TIME and not spec.shape for spec in task.conditions)
+    times = [{_TIME: torch.tensor(time)} for time in file.times or ()] if timed else [{} for _ in file.named]
+    return [View(name, camera, time) for (name, camera), time in zip(file.named, times, strict=True)]
 
 
 def _illumination(
@@ -181,28 +207,31 @@ def _format_of(out: Path | None, animated: bool) -> str:
 def with_conditions(
     views: list[View], task: TaskSpec, texts: Mapping[str, str], warn: Callable[[str], None] = lambda text: None
 ) -> tuple[list[View], bool]:
-    """Views with the conditions the user gave, and whether one of these is animated; an animated condition repeats or stretches the
-    cameras to its length.
+    """Views with the conditions the user gave, and whether one of these is animated. Animated conditions go along together, frame by frame;
+    where there are more frames than cameras, or the other way round, the fewer are spread evenly over the more.
 
     Raises:
         ConfigError: a view lacks a condition that the task needs, or as :func:`neuprim.core.conditions.read_conditions`.
     """
-    animated = False
     given = read_conditions(task.conditions, texts, warn)
+    frames = in_step(texts, given)
+    if frames > 1:
+        count = max(frames, len(views))
+        names = f"{{}}_{{:0{max(3, len(str(count - 1)))}d}}"
+        views = [replace(views[i * len(views) // count], name=names.format(views[i * len(views) // count].name, i)) for i in range(count)]
+    moments = [{name: values[i * len(values) // len(views)] for name, values in given.items()} for i in range(len(views))]
+    views = [replace(v, conditions={**v.conditions, **moment}) for v, moment in zip(views, moments, strict=True)]
     for spec in task.conditions:
-        if spec.name in given:
-            values = given[spec.name]
-            if len(values) == 1:
-                views = [replace(v, conditions={**v.conditions, spec.name: values[0]}) for v in views]
-            else:
-                animated = True
-                count = max(len(values), len(views))
-                pick = [(views[i * len(views) // count], values[i * len(values) // count]) for i in range(count)]
-                views = [replace(v, name=f"{v.name}_{i:03d}", conditions={**v.conditions, spec.name: x}) for i, (v, x) in enumerate(pick)]
         for v in views:
             if spec.name not in v.conditions:
                 raise ConfigError(f"view {v.name} has no {spec.name}, which task {task.name!r} needs; give {flag(spec.name)}")
-    return views, animated
+    return views, frames > 1
+
+
+def _file_names(views: Sequence[View]) -> list[str]:
+    """Of each view, with its number where two would share a file."""
+    names = [_file_name(v.name) for v in views]
+    return names if len({name.lower() for name in names}) == len(names) else [f"{i:03d}_{name}" for i, name in enumerate(names)]
 
 
 def _file_name(name: str) -> str:

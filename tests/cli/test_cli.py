@@ -120,7 +120,7 @@ def test_a_failing_combination_does_not_lose_the_others(
         (["eval", ".", "x"], "x: no such argument"),
         (["render", "nowhere", "--camera", "orbit"], "nowhere: no such run directory"),
         (["render", "."], "--camera"),
-        (["render", ".", "--camera", "spiral"], "expected orbit, test or a .json file"),
+        (["render", ".", "--camera", "spiral"], "expected orbit, test, or a file or folder of cameras"),
         (["render", ".", "--camera", "no.json"], "no.json: no such file"),
         (["render", ".", "--camera", "orbit", "--size", "640"], "expected WIDTHxHEIGHT"),
         (["render", ".", "--camera", "orbit", "--size", "0x5"], "expected WIDTHxHEIGHT"),

@@ -10,9 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.conditions import FRAMES, export_frames, flag, named, read_conditions, split_words
+from neuprim.core.conditions import FRAMES, export_frames, flag, in_step, named, read_conditions, split_words
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import ConditionSpec
+from neuprim.tasks.relight.lights import orbit_in_frames, parse_lights
 
 
 def number(text: str) -> list[Tensor]:
@@ -179,7 +180,11 @@ def test_an_export_has_every_condition_in_each_frame() -> None:
     assert export_frames((), {}) == [{}]
     for texts, several, expected in (
         ({"wavelength_shift": "0,1", "sun": "0,0,0"}, False, "--wavelength-shift 0,1: 2 values; expected one value"),
-        ({"wavelength_shift": "0:1:3", "sun": "1,2,0;0,0,0"}, True, "3 values; expected as many values for each"),
+        (
+            {"wavelength_shift": "0:1:3", "sun": "1,2,0;0,0,0"},
+            True,
+            "3 frames and --sun 1,2,0;0,0,0 has 2 frames; expected as many of each",
+        ),
         ({"wavelength_shift": "0"}, True, r"--sun: required, as the model depends on it \(m\); for example --sun 1,1,1"),
     ):
         with pytest.raises(ConfigError, match=expected):
@@ -190,3 +195,55 @@ def test_the_example_is_within_the_range() -> None:
     for ends, expected in (((0.0, 1.0), "--x 0.5"), ((400.0, 700.0), "--x 550")):
         with pytest.raises(ConfigError, match=f"for example {expected}$"):
             export_frames([ConditionSpec("x", (), "nm", ends, number)], {})
+
+
+# ---------------------------------------------------------------- two animations at once
+
+
+TIME = ConditionSpec("time", (), "s", (0.0, 1.0), number)
+LIGHT = ConditionSpec("light", (3,), "scene units", (-1e6, 1e6), parse_lights, in_frames=orbit_in_frames)
+
+
+def lengths(time: str, light: str) -> tuple[int, int]:
+    found = read_conditions([TIME, LIGHT], {"time": time, "light": light})
+    return len(found["time"]), len(found["light"])
+
+
+@pytest.mark.parametrize(
+    ("time", "light", "count"),
+    [
+        ("0:1:48", "orbit", 48),
+        ("0:1:48", "orbit:3", 48),
+        ("0:1", "orbit:3:30:24", 24),
+        ("0:1", "orbit", FRAMES),
+        ("0:1:24", "orbit:3:30:24", 24),
+        ("0.1,0.5,0.9", "orbit", 3),
+        ("0:0.5, 1", "orbit:3:30:61", 61),
+    ],
+)
+def test_an_animation_without_a_length_takes_the_others(time: str, light: str, count: int) -> None:
+    assert lengths(time, light) == (count, count)
+    found = read_conditions([TIME, LIGHT], {"time": time, "light": light})
+    assert in_step({}, found) == count
+    assert float(found["time"][0]) == pytest.approx(float(time.replace(":", ",").split(",")[0]))
+    assert len({tuple(place.tolist()) for place in found["light"]}) == count, "once round, no place twice"
+
+
+def test_one_value_holds_in_every_frame() -> None:
+    assert lengths("0:1:48", "1,2,3") == (48, 1) and lengths("0.5", "orbit") == (1, 60)
+    assert in_step({}, read_conditions([TIME, LIGHT], {"time": "0:1:48", "light": "1,2,3"})) == 48
+
+
+def test_lengths_that_differ_are_refused_with_both() -> None:
+    texts = {"time": "0:1:48", "light": "orbit:4:40:60"}
+    with pytest.raises(ConfigError, match=r"--time 0:1:48 has 48 frames and --light orbit:4:40:60 has 60 frames; expected as many of each"):
+        in_step(texts, read_conditions([TIME, LIGHT], texts))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("orbit", "orbit:4.5:40:9"), ("orbit:3", "orbit:3:40:9"), ("orbit:3:20", "orbit:3:20:9"), ("orbit:3:20:60", None), ("1,2,3", None)],
+)
+def test_an_orbit_in_so_many_frames(text: str, expected: str | None) -> None:
+    assert orbit_in_frames(text, 9) == expected
+    assert expected is None or len(parse_lights(expected)) == 9

@@ -16,6 +16,7 @@ from neuprim.conformance.example import example
 from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.data import Clip, Dataset, Pixels
 from neuprim.core.errors import ConfigError
+from neuprim.core.layers import LayerSpec
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Conditions, ConditionSpec, Constant, Cosine, Field
@@ -342,6 +343,7 @@ def wordy(settings: Mapping[str, Any]) -> Any:
     return lambda rendered, truth, frame: ((rendered - truth).abs().mean(), {"l1": "small"})
 
 
+GLOW = LayerSpec("glow", "light, but of one channel", lambda frame: frame.drawn.alpha)
 GHOST = SceneSpec("ghost", "has no file", lambda s, c: None)  # type: ignore[arg-type, return-value]
 UNNAMED = replace(TASK, check=lambda model: None)
 
@@ -412,6 +414,12 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("channels", "with data of 5 channels: colour field FirstThree: lower returned a colour of C=3; expected 5", using(colour=FirstThree)),
     ("channels", "colour.channels with data of 5 channels: found 3; expected 5", replace(using(), build=at_most_three)),
     ("channels", "stopped by RuntimeError", replace(using(), loss=three_only)),
+    ("layers", "layers: glow is torch.float32 of shape (9, 10); expected floats of shape (9, 10, 3)", using(layers=(GLOW,))),
+    (
+        "layers",
+        "layer 'noise' of view",
+        using(layers=(replace(GLOW, name="noise", draw=lambda frame: torch.rand(9, 10), channels=("N",)),)),
+    ),
     ("alive", "density.alive: density of a primitive that it leaves out", using(LeavesOut)),
     ("alive", "density.alive: found torch.int64 [11, 10", using(Unsorted)),
     ("line_integral", "density.lower: line integral of a chord, primitive", using(Doubled)),

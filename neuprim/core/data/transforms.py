@@ -6,21 +6,19 @@ a frame, which wins. Poses are camera to world with OpenGL axes.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from neuprim.core.cameras import Camera, opengl_to_viewmat
+from neuprim.core.cameras import Camera
+from neuprim.core.cameras.intrinsics import camera_of, is_fisheye
 from neuprim.core.data.common import every_nth, find_image, missing_files, unique_names
 from neuprim.core.data.distortion import Distortion, Fisheye, Radial
-from neuprim.core.data.records import Record
 from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import ImageInfo, image_info
+from neuprim.core.io.records import Record
 
 __all__ = ["read_frames", "split_frames"]
-
-_RADIAL = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 
 
 def read_frames(folder: Path, document: Record, records: list[Record], skip_missing: bool) -> tuple[list[Record], list[ImageFrame]]:
@@ -69,28 +67,12 @@ def _camera(record: Record, file: Path, info: ImageInfo) -> Camera:
     height = record.count("h") if record.has("h") else info.height
     if (width, height) != (info.width, info.height):
         raise DataError(f"{file}: image is {info.width}x{info.height}; expected {width}x{height} (w, h in {record.where})")
-    if record.has("fl_x"):
-        fx = record.number("fl_x", "a focal length in pixels above 0", 0.0)
-        fy = record.number_or("fl_y", fx, "a focal length in pixels above 0", 0.0)
-    elif record.has("camera_angle_x"):
-        fx = _focal(record, "camera_angle_x", width)
-        fy = _focal(record, "camera_angle_y", height) if record.has("camera_angle_y") else fx
-    else:
-        raise record.fail("fl_x", "a focal length in pixels (or camera_angle_x), in the frame or in the file")
-    cx, cy = record.number_or("cx", 0.5 * width), record.number_or("cy", 0.5 * height)
-    return Camera(opengl_to_viewmat(record.matrix("transform_matrix")), fx, fy, cx, cy, width, height)
-
-
-def _focal(record: Record, key: str, size: int) -> float:
-    return 0.5 * size / math.tan(0.5 * record.number(key, "a field of view in radians, between 0 and pi", 0.0, math.pi))
+    return camera_of(record, width, height)
 
 
 def _distortion(record: Record) -> Distortion | None:
     """The lens; None where all of its coefficients are zero."""
-    model = record.text("camera_model") if record.has("camera_model") else "OPENCV"
-    fisheye = model == "OPENCV_FISHEYE" or record.values.get("is_fisheye") is True
-    if not fisheye and model not in _RADIAL:
-        raise record.fail("camera_model", "one of " + ", ".join((*_RADIAL, "OPENCV_FISHEYE")))
+    fisheye = is_fisheye(record)
     k = [record.number_or(f"k{i}", 0.0) for i in (1, 2, 3, 4)]
     if fisheye:
         return Fisheye(*k)

@@ -17,7 +17,7 @@ from neuprim.core.errors import DataError
 if TYPE_CHECKING:
     import numpy as np
 
-__all__ = ["atomic_path", "cache_directory", "publish_folder", "read_json", "write_json", "write_npy", "write_text"]
+__all__ = ["atomic_path", "cache_directory", "publish_folder", "read_json", "write_json", "write_npy", "write_text", "writing"]
 
 
 def cache_directory() -> Path:
@@ -50,6 +50,18 @@ def atomic_path(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[Path]:
+    """:func:`atomic_path` in a folder that exists, with the file's errors as DataError."""
+    if not path.parent.is_dir():
+        raise DataError(f"{path}: cannot be written (no such folder {path.parent})")
+    try:
+        with atomic_path(path) as temporary:
+            yield temporary
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def publish_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:

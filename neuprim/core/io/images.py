@@ -9,7 +9,7 @@ Every failure is a :class:`~neuprim.core.errors.DataError` that names the file, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +22,8 @@ from PIL import Image
 from torch import Tensor
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.channel_names import names_fault
-from neuprim.core.io.files import atomic_path
+from neuprim.core.io.exr import check_finite, write_exr, write_layers
+from neuprim.core.io.files import writing
 
 __all__ = [
     "MAX_PIXELS",
@@ -37,6 +37,7 @@ __all__ = [
     "to_uint8",
     "write_animation",
     "write_exr",
+    "write_layers",
     "write_png",
     "write_webp",
 ]
@@ -272,32 +273,11 @@ def _read_exr(path: Path, names: list[str], width: int, height: int) -> Tensor:
     if any(p.shape != (height, width) for p in planes):
         raise DataError(f"{path}: OpenEXR data is {planes[0].shape[1]}x{planes[0].shape[0]}; expected {width}x{height} as in its header")
     pixels = np.stack(planes, axis=-1)
-    _check_finite(path, pixels)
+    check_finite(path, pixels)
     return torch.from_numpy(pixels)
 
 
-def _check_finite(path: Path, pixels: np.ndarray) -> None:
-    bad = ~np.isfinite(pixels)
-    if bad.any():
-        row, column, channel = (int(i[0]) for i in np.nonzero(bad))
-        raise DataError(
-            f"{path}: value {pixels[row, column, channel]} at row {row}, column {column}, channel {channel}; expected finite numbers"
-        )
-
-
 # ---------------------------------------------------------------- writing
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[Path]:
-    """:func:`neuprim.core.io.files.atomic_path`, with the file's errors as DataError."""
-    if not path.parent.is_dir():
-        raise DataError(f"{path}: cannot be written (no such folder {path.parent})")
-    try:
-        with atomic_path(path) as temporary:
-            yield temporary
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def to_uint8(image: Tensor) -> Tensor:
@@ -323,7 +303,7 @@ def _pillow_image(path: Path, image: Tensor) -> Image.Image:
 
 
 def _save(path: Path, image: Image.Image, kind: str, **options: Any) -> None:
-    with _writing(path) as temporary:
+    with writing(path) as temporary:
         image.save(temporary, format=kind, **options)
 
 
@@ -361,46 +341,6 @@ def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: i
     options: dict[str, Any] = {"quality": quality} if kind == "WEBP" else {"disposal": 2}
     duration = max(1, round(1000.0 / fps)) if kind == "WEBP" else 10 * max(1, round(100.0 / fps))
     _save(path, images[0], kind, save_all=True, append_images=images[1:], duration=duration, loop=0, **options)
-
-
-def write_exr(
-    path: Path, image: Tensor, half: bool = True, extra: Mapping[str, Tensor] | None = None, names: Sequence[str] | None = None
-) -> None:
-    """Write (H, W, 3 or 4) *linear* values, alpha premultiplied, or channels of other names as OpenEXR without clamping; atomic.
-
-    Args:
-        half: store colour as 16-bit instead of 32-bit floats.
-        extra: further channels by name, each (H, W), stored as 32-bit floats, e.g. ``{"Z": depth}``.
-        names: of the channels C of an (H, W, C) image that is not R, G, B(, A).
-
-    Raises:
-        DataError: wrong shapes or names, colour values that are not finite or (with ``half``) beyond 65504, or the file cannot be written.
-    """
-    wrong = None if names is None else names_fault(names)
-    if wrong:
-        raise DataError(f"{path}: names{wrong}")
-    if image.ndim != 3 or 0 in image.shape or (image.shape[-1] not in (3, 4) if names is None else image.shape[-1] != len(names)):
-        expected = "(H, W, 3) or (H, W, 4)" if names is None else f"(H, W, {len(names)}), for the channels {', '.join(names)}"
-        raise DataError(f"{path}: image to write has shape {tuple(image.shape)}; expected {expected}")
-    pixels = image.detach().cpu().float().numpy()
-    _check_finite(path, pixels)
-    if half and np.abs(pixels).max() > 65504.0:
-        raise DataError(f"{path}: value {np.abs(pixels).max():.6g} does not fit 16-bit floats (65504); write with half=False")
-    kind = np.float16 if half else np.float32
-    channels = {c: np.ascontiguousarray(pixels[..., i], dtype=kind) for i, c in enumerate(names or "RGBA"[: pixels.shape[-1]])}
-    for name, plane in (extra or {}).items():
-        if tuple(plane.shape) != tuple(image.shape[:2]) or name in channels:
-            raise DataError(
-                f"{path}: channel {name!r} has shape {tuple(plane.shape)}; expected {tuple(image.shape[:2])} and a name of its own"
-            )
-        channels[name] = np.ascontiguousarray(plane.detach().cpu().float().numpy())
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with _writing(path) as temporary:
-        try:
-            with OpenEXR.File(header, channels) as file:
-                file.write(str(temporary))
-        except RuntimeError as error:
-            raise DataError(f"{path}: cannot be written ({error})") from None
 
 
 # ---------------------------------------------------------------- transfer curve

@@ -59,6 +59,8 @@ class ConditionSpec:
             need not know ranges ``A:B:COUNT`` (:mod:`neuprim.core.conditions`).
         strict: whether numbers beyond the range are refused, a data set's among them.
         sweep: a text of ``--NAME TEXT`` that animates the condition, for the commands a report offers; empty: none.
+        in_frames: (text, count) -> the text that means the same in so many frames, where the text does not say itself how many; None
+            where it does. So an animation without a length takes that of another one beside it. Not asked about ranges of numbers.
     """
 
     name: str
@@ -68,6 +70,7 @@ class ConditionSpec:
     parse: Callable[[str], list[Tensor]]
     strict: bool = False
     sweep: str = ""
+    in_frames: Callable[[str, int], str | None] = lambda text, count: None
 
 
 # ---------------------------------------------------------------- fields

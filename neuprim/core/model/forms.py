@@ -96,6 +96,12 @@ class Cosine(Shaped):
         W1, b1, w2, b2 = (x.detach()[index] for x in (self.W1, self.b1, self.w2, self.b2))
         return Cosine(W1, b1, w2, b2, self.omega0, self.edge)
 
+    def scaled(self, factors: Tensor) -> Cosine:
+        """sigma times (N,) factors, at least 0."""
+        factors = factors.to(self.b2)
+        w2, b2 = self.w2 * factors[:, None], self.b2 * factors.reshape(self.b2.shape)
+        return Cosine(self.W1, self.b1, w2, b2, self.omega0, self.edge)
+
     def optical_depth(self, pairs: Pairs) -> Tensor:
         """(M,) float64 integrals of sigma along chords: one (cos, sinc) pair per neuron, whatever their length."""
         prim = pairs.prim
@@ -128,6 +134,15 @@ class Opaque(Shaped):
         if isinstance(index, slice):
             return Opaque(lambda prim, *ray: self.line_integral(prim + (index.start or 0), *ray))
         return Opaque(lambda prim, *ray: self.line_integral(index[prim], *ray))
+
+    def scaled(self, factors: Tensor) -> Opaque:
+        """sigma times (N,) factors, at least 0."""
+
+        def line_integral(prim: Tensor, *ray: Tensor) -> Tensor:
+            found = self.line_integral(prim, *ray)
+            return found * factors.to(found)[prim]
+
+        return Opaque(line_integral)
 
     def optical_depth(self, pairs: Pairs) -> Tensor:
         """Integrals of sigma along chords as the code returns them, unchecked: see :meth:`~neuprim.core.model.primitives.Lowered.optical_depth`."""

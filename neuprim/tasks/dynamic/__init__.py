@@ -16,6 +16,7 @@ from neuprim.core.volumes.source import VolumeSource
 from neuprim.tasks.dynamic import judging
 from neuprim.tasks.dynamic.colour import FREQUENCIES, RENAMED, TimeHarmonics
 from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.dynamic.layers import LAYERS
 from neuprim.tasks.dynamic.time import parse_times
 
 __all__ = ["TASK"]
@@ -93,4 +94,5 @@ TASK = TaskSpec(
     mask=judging.mask,
     diagnose=judging.diagnose,
     clips=judging.clips,
+    layers=LAYERS,
 )

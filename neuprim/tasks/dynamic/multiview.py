@@ -25,11 +25,11 @@ import torch
 from neuprim.core.checked import Accepts, checked
 from neuprim.core.data import Dataset
 from neuprim.core.data.common import posed_images
-from neuprim.core.data.records import Record, read_json
 from neuprim.core.data.settings import EveryNth, FolderSettings, SplitName, data_folder
 from neuprim.core.data.transforms import read_frames, split_frames
 from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import DataError
+from neuprim.core.io.records import Record, read_json
 from neuprim.core.task import SceneContext
 from neuprim.tasks.dynamic.moving import moving_points
 

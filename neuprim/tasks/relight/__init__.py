@@ -17,7 +17,8 @@ from neuprim.tasks.relight.colour import FORMS, VISIBILITY, LightNetwork
 from neuprim.tasks.relight.data import lighting_of
 from neuprim.tasks.relight.environment import illuminate
 from neuprim.tasks.relight.harmonics import LightHarmonics
-from neuprim.tasks.relight.lights import parse_intensities, parse_lights, typical_light
+from neuprim.tasks.relight.layers import LAYERS
+from neuprim.tasks.relight.lights import orbit_in_frames, parse_intensities, parse_lights, typical_light
 
 __all__ = ["TASK"]
 
@@ -88,7 +89,7 @@ TASK = TaskSpec(
     check=_check,
     trade=_trade,
     conditions=(
-        ConditionSpec("light", (3,), "position, scene units", (-1e6, 1e6), parse_lights, sweep="orbit"),
+        ConditionSpec("light", (3,), "position, scene units", (-1e6, 1e6), parse_lights, sweep="orbit", in_frames=orbit_in_frames),
         ConditionSpec("light_intensity", (3,), "radiometric", (0.0, 1e6), parse_intensities),
     ),
     fields={"CosineDensity": CosineDensity, "LightNetwork": LightNetwork, "LightHarmonics": LightHarmonics},
@@ -100,4 +101,5 @@ TASK = TaskSpec(
     clips=judging.clips,
     facts=judging.facts,
     orbit=judging.orbit,
+    layers=LAYERS,
 )

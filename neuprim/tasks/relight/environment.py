@@ -21,8 +21,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.data.records import Record
 from neuprim.core.environment import Environment, Illumination
+from neuprim.core.io.records import Record
 
 __all__ = ["FAR", "illuminate", "summary"]
 

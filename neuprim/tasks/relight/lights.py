@@ -10,7 +10,7 @@ from torch import Tensor
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 
-__all__ = ["ORBIT", "parse_intensities", "parse_lights", "typical_light"]
+__all__ = ["ORBIT", "orbit_in_frames", "parse_intensities", "parse_lights", "typical_light"]
 
 ORBIT = (4.5, 40.0, 60)
 """Distance in scene units, polar angle in degrees and frames of ``--light orbit``."""
@@ -36,6 +36,14 @@ def parse_lights(text: str) -> list[Tensor]:
         turns = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / frames)
         return list(torch.stack([across * turns.cos(), across * turns.sin(), torch.full_like(turns, height)], -1).float())
     return [_numbers(text, "light", expected)]
+
+
+def orbit_in_frames(text: str, count: int) -> str | None:
+    """``"orbit:4"`` in 24 frames -> ``"orbit:4:40:24"``; None for what is no orbit, or says its frames."""
+    parts = text.split(":")
+    if parts[0] != "orbit" or len(parts) > 3:
+        return None
+    return ":".join([*parts, *(f"{x:g}" for x in ORBIT[len(parts) - 1 : 2]), str(count)])
 
 
 def parse_intensities(text: str) -> list[Tensor]:

@@ -41,11 +41,11 @@ from neuprim.core.cameras import Camera, opengl_to_viewmat
 from neuprim.core.checked import Range, checked
 from neuprim.core.data import Dataset
 from neuprim.core.data.common import IMAGE_SUFFIXES, every_nth, find_image, missing_files, posed_images, unique_names
-from neuprim.core.data.records import Record, read_json
 from neuprim.core.data.settings import Background, FolderSettings, HoldOut, SplitName, data_folder
 from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import ImageInfo, image_info
+from neuprim.core.io.records import Record, read_json
 from neuprim.core.task import SceneContext
 from neuprim.tasks.relight.data import Lighting, bright
 

@@ -24,24 +24,9 @@ from neuprim.tasks.dynamic.density import PARTS, TimeDensity
 from neuprim.tasks.dynamic.invisible import invisible_fraction
 from tests import scenes
 from tests.backends import BACKENDS, by
+from tests.timed_models import COUNT, model
 
 VARIANTS = ["none", *("+".join(c) for n in range(1, len(PARTS) + 1) for c in itertools.combinations(PARTS, n))]
-COUNT = 30
-
-
-def model(time: str, neurons: int = 4, count: int = COUNT, dtype: torch.dtype = torch.float64, divide_above: float = 0.0) -> Primitives:
-    """Random primitives whose every time parameter is at work."""
-    generator = torch.Generator().manual_seed(7)
-    t = scenes.tensors(count, neurons, seed=3, dtype=dtype)
-    density, colour = TimeDensity(neurons, time, divide_above), TimeHarmonics(1)
-    params = {k: v for k, v in t.items() if k != "colors"}
-    for spec in (*density.parameters(), *colour.parameters()):
-        if spec.name not in params:
-            params[spec.name] = 0.1 * torch.randn((count, *spec.shape), generator=generator, dtype=dtype)
-    if "window" in time:
-        params["window_center"] = torch.rand((count, 1), generator=generator, dtype=dtype)
-        params["log_window"] = (0.1 + 0.4 * torch.rand((count, 1), generator=generator, dtype=dtype)).log()
-    return Primitives(density, colour, {k: v.requires_grad_() for k, v in params.items()})
 
 
 def at(time: float) -> dict[str, Tensor]:

@@ -24,23 +24,9 @@ from neuprim.tasks.relight.harmonics import LightHarmonics, real_harmonics
 from neuprim.tasks.relight.lights import parse_intensities, parse_lights
 from neuprim.tasks.relight.visibility import BIAS, SOFTNESS, light_visibility
 from tests import scenes
+from tests.lit_models import COUNT, light, model
 
-COUNT = 12
 SETTINGS = RenderSettings()
-
-
-def light(x: float = 2.0, y: float = -1.0, z: float = 3.0, strength: float = 1.0) -> dict[str, Tensor]:
-    return {"light": torch.tensor([x, y, z]), "light_intensity": torch.full((3,), strength)}
-
-
-def model(colour: LightNetwork | LightHarmonics, dtype: torch.dtype = torch.float64, neurons: int = 3) -> Primitives:
-    generator = torch.Generator().manual_seed(5)
-    t = scenes.tensors(COUNT, neurons, seed=3, dtype=dtype)
-    params = {k: v for k, v in t.items() if k != "colors"}
-    for spec in colour.parameters():
-        params[spec.name] = 0.5 * torch.randn((COUNT, *spec.shape), generator=generator, dtype=dtype)
-    params["c_dc"] = params["c_dc"].abs()
-    return Primitives(CosineDensity(neurons), colour, {k: v.requires_grad_() for k, v in params.items()})
 
 
 def shade(form: RayNet, local: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from PIL import Image
 from neuprim.cli import main
 from neuprim.config import compose
 from neuprim.core.errors import ConfigError
-from neuprim.core.io.images import write_exr
+from neuprim.core.io.images import exr_channels, read_image, write_exr
 from neuprim.plugins.registry import load_task
 from neuprim.runs.draw import render_run
 from neuprim.runs.fit import make_trainer
@@ -83,6 +83,35 @@ def test_light_from_all_around(finished: Path, tmp_path: Path, capsys: pytest.Ca
     with Image.open(tmp_path / "film.webp") as film:
         assert getattr(film, "n_frames", 1) == 3
         assert np.asarray(film.convert("RGB")).std() > 5
+
+
+def test_layers_from_the_command_line(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["render", str(finished), "--camera", "test", "--size", "12x10", "--format", "exr", "--out"]
+    assert main([*words, str(tmp_path / "all")]) == 0
+    first = sorted((tmp_path / "all").glob("*.exr"))[0]
+    light = [f"unshadowed.{c}" for c in "BGR"]
+    assert list(exr_channels(first)) == ["A", "B", "G", "R", "density.Y", "depth.Z", *light, "visibility.Y"]
+    write_exr(tmp_path / "sky.exr", torch.ones(4, 8, 3), half=False)
+    sky = ["--environment", str(tmp_path / "sky.exr"), "--environment-samples", "3"]
+    assert main([*words, str(tmp_path / "sky"), *sky, "--layers", "beauty,alpha,lights", "--datatype", "half"]) == 0
+    apart = sorted((tmp_path / "sky").glob("*.exr"))[0]
+    assert set(exr_channels(apart)) == {*"RGBA", *(f"light_{i:03d}.{c}" for i in range(3) for c in "RGB")}
+    parts = sum(read_image(apart, channels=[f"light_{i:03d}.{c}" for c in "RGB"]).float() for i in range(3))
+    beauty = read_image(apart, channels="RGB")
+    assert beauty.dtype == torch.float16 and isinstance(parts, torch.Tensor) and beauty.max() > 0
+    assert (parts - beauty.float()).abs().max() < 2e-3 * beauty.max(), "as far as 16 bits go"
+    for more, message in (
+        (["--layers", "shadow"], "--layers shadow: no such layer; expected some of beauty, alpha, depth, density, unshadowed, visibility"),
+        (["--layers", "lights"], "--layers lights: no such layer"),
+        (
+            [*sky, "--layers", "visibility"],
+            "--layers visibility: no such layer; expected some of beauty, alpha, depth, density, unshadowed, lights",
+        ),
+    ):
+        assert main([*words, str(tmp_path / "no"), *more]) == 2
+        assert message in capsys.readouterr().err
+    assert main(["render", str(finished), "--camera", "test", "--format", "png", "--datatype", "half"]) == 2
+    assert "--datatype half: of OpenEXR files; expected --format exr, found png" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

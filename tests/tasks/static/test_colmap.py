@@ -13,9 +13,9 @@ import pytest
 import torch
 from PIL import Image
 
+from neuprim.core.cameras.colmap_files import check_binary_model
 from neuprim.core.errors import BackendUnavailable
 from neuprim.tasks.static.datasets.colmap import load
-from neuprim.tasks.static.datasets.colmap_files import check_binary_model
 
 W, H = 64, 50
 PARAMS = {

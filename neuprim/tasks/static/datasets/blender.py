@@ -18,11 +18,11 @@ from neuprim.core.cameras import Camera, opengl_to_viewmat
 from neuprim.core.checked import checked
 from neuprim.core.data import Dataset
 from neuprim.core.data.common import every_nth, find_image, missing_files, posed_images, unique_names
-from neuprim.core.data.records import read_json
 from neuprim.core.data.settings import FolderSettings, HoldOut, SplitName, data_folder
 from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import image_info
+from neuprim.core.io.records import read_json
 from neuprim.core.task import SceneContext
 
 __all__ = ["BlenderSettings", "load"]

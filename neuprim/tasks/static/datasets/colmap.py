@@ -18,20 +18,18 @@ import numpy as np
 import torch
 
 from neuprim.core.cameras import Camera
+from neuprim.core.cameras.colmap import PINHOLES, pinhole_of, pycolmap_package, read_model, viewmat_of
 from neuprim.core.checked import checked, text
 from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.common import every_nth, missing_files, posed_images, unique_names
 from neuprim.core.data.distortion import Distortion
 from neuprim.core.data.settings import EveryNth, FolderSettings, data_folder
 from neuprim.core.data.views import ImageFrame
-from neuprim.core.errors import BackendUnavailable, DataError
+from neuprim.core.errors import DataError
 from neuprim.core.io.images import ImageInfo, image_info
 from neuprim.core.task import SceneContext
-from neuprim.tasks.static.datasets.colmap_files import check_binary_model
 
 __all__ = ["ColmapSettings", "load"]
-
-_PINHOLE = ("SIMPLE_PINHOLE", "PINHOLE")
 
 
 @dataclass(frozen=True)
@@ -62,44 +60,12 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     asked = checked(ColmapSettings, settings, "scene")
     folder = data_folder(asked.path)
     model = folder / asked.model
-    reconstruction = _read_model(model)
+    reconstruction = read_model(model)
     frames = _read_frames(model, folder / asked.images, reconstruction, asked.skip_missing)
     train, test = every_nth(frames, asked.test_every)
     prefix = "" if asked.images == "images" else asked.images
     points = _read_points(reconstruction)
     return posed_images(str(model), folder.resolve().name, train, test, asked, context, points=points, prefix=prefix)
-
-
-def _pycolmap() -> Any:
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise BackendUnavailable(f"COLMAP scenes need the package pycolmap ({error}): pip install 'neuprim[colmap]'") from None
-    return pycolmap
-
-
-def _read_model(folder: Path) -> Any:
-    pycolmap = _pycolmap()
-    kind = next((s for s in (".bin", ".txt") if (folder / f"cameras{s}").is_file()), None)
-    if kind is None:
-        raise DataError(f"{folder}: no cameras.bin or cameras.txt; expected a COLMAP model (scene.model)")
-    absent = [name + kind for name in ("images", "points3D") if not (folder / (name + kind)).is_file()]
-    if absent:
-        raise missing_files(str(folder), absent)
-    if kind == ".bin":
-        check_binary_model(folder, _parameter_count)
-    try:
-        return pycolmap.Reconstruction(str(folder))
-    except Exception as error:  # pycolmap raises many types for inconsistent models
-        raise DataError(f"{folder}: not a readable COLMAP model ({type(error).__name__}: {error})") from None
-
-
-def _parameter_count(model: int) -> int:
-    pycolmap = _pycolmap()
-    try:
-        return len(pycolmap.Camera(model=pycolmap.CameraModelId(model), width=1, height=1).params_info.split(","))
-    except Exception:  # unknown numbers raise different types in different versions
-        return -1
 
 
 def _read_frames(model: Path, folder: Path, reconstruction: Any, skip_missing: bool) -> list[ImageFrame]:
@@ -119,7 +85,7 @@ def _read_frames(model: Path, folder: Path, reconstruction: Any, skip_missing: b
         where = f"{model}: camera {image.camera_id} of image {image.name}"
         camera = _camera(where, image, file, info)
         lens = reconstruction.cameras[image.camera_id]
-        distortion = None if lens.model_name in _PINHOLE else _Lens.of(lens, info)
+        distortion = None if lens.model_name in PINHOLES else _Lens.of(lens, info)
         frames.append(ImageFrame(name, file, camera.validate(where), info, None, distortion))
     return frames
 
@@ -132,16 +98,8 @@ def _camera(where: str, image: Any, file: Path, info: ImageInfo) -> Camera:
     scale = max(info.width / lens.width, info.height / lens.height)
     if abs(lens.width * scale - info.width) > 1.0 or abs(lens.height * scale - info.height) > 1.0:
         raise DataError(f"{file}: image is {info.width}x{info.height}; expected {lens.width}x{lens.height} ({where}) or a reduction of it")
-    # asking a panorama for its focal length ends the process, so the parameters are taken by their names
-    named: dict[str, float | None] = dict(zip((n.strip() for n in lens.params_info.split(",")), map(float, lens.params), strict=False))
-    named = {"fx": named.get("f"), "fy": named.get("f"), **named}
-    fx, fy, cx, cy = (named.get(key) for key in ("fx", "fy", "cx", "cy"))
-    if fx is None or fy is None or cx is None or cy is None:
-        raise DataError(f"{where}: model is {lens.model_name}; expected a model with focal lengths, which a pinhole can replace")
-    pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3] = torch.from_numpy(np.asarray(pose.matrix(), dtype=np.float64))
-    return Camera(viewmat, fx, fy, cx, cy, int(lens.width), int(lens.height)).resized(info.width, info.height)
+    fx, fy, cx, cy = pinhole_of(lens, where)
+    return Camera(viewmat_of(image), fx, fy, cx, cy, int(lens.width), int(lens.height)).resized(info.width, info.height)
 
 
 @dataclass(frozen=True)
@@ -160,7 +118,7 @@ class _Lens(Distortion):
         return _Lens(lens.model_name, int(lens.width), int(lens.height), tuple(map(float, lens.params)), scale)
 
     def project(self, points: np.ndarray, camera: Camera) -> np.ndarray:
-        lens = _pycolmap().Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
+        lens = pycolmap_package().Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
         rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
         return np.asarray(lens.img_from_cam(rays), dtype=np.float64) * self.scale
 

@@ -18,9 +18,9 @@ from neuprim.core.checked import checked
 from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.common import missing_files, posed_images
 from neuprim.core.data.points_file import read_points
-from neuprim.core.data.records import Record, read_json
 from neuprim.core.data.settings import EveryNth, FolderSettings, data_folder
 from neuprim.core.data.transforms import read_frames, split_frames
+from neuprim.core.io.records import Record, read_json
 from neuprim.core.task import SceneContext
 
 __all__ = ["NerfstudioSettings", "load"]

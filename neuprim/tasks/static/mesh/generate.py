@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from neuprim.core.checked import checked, text
 from neuprim.core.data import Dataset
-from neuprim.core.data.records import read_json
+from neuprim.core.io.records import read_json
 from neuprim.core.task import SceneContext
 from neuprim.scenes.image_set import Progress
 from neuprim.scenes.raycast import Scene

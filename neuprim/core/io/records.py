@@ -130,13 +130,18 @@ def _finite(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def read_json(path: Path) -> Record:
+def read_json(path: Path, most: float = math.inf) -> Record:
     """The JSON object in a file.
 
+    Args:
+        most: bytes, beyond which a file is not read.
+
     Raises:
-        DataError: missing or unreadable file, not UTF-8, not JSON, or not an object at top level.
+        DataError: missing, unreadable or larger file, not UTF-8, not JSON, or not an object at top level.
     """
     try:
+        if path.stat().st_size > most:
+            raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {most:.0f}")
         value = json.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise DataError(f"{path}: file not found; expected a JSON file of camera poses") from None

@@ -1,0 +1,144 @@
+"""COLMAP's sparse models, text or binary, by COLMAP's own package (the extra ``neuprim[colmap]``): its cameras, and poses of its images."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections import Counter
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras.colmap_files import check_binary_model
+from neuprim.core.cameras.pinhole import Camera
+from neuprim.core.errors import BackendUnavailable, DataError
+
+__all__ = ["PINHOLES", "is_model", "pinhole_of", "posed_cameras", "pycolmap_package", "read_model", "viewmat_of"]
+
+PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+"""COLMAP's camera models without distortion."""
+
+_DISTORTED = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")  # pinholes but for their distortion
+
+_PARTS = ("cameras", "images", "points3D", "rigs", "frames")
+
+
+def pycolmap_package() -> Any:
+    """The package; raises :class:`BackendUnavailable` where it is missing."""
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise BackendUnavailable(f"COLMAP scenes need the package pycolmap ({error}): pip install 'neuprim[colmap]'") from None
+    return pycolmap
+
+
+def _kind(folder: Path) -> str | None:
+    return next((s for s in (".bin", ".txt") if (folder / f"cameras{s}").is_file()), None)
+
+
+def read_model(folder: Path) -> Any:
+    """The ``pycolmap.Reconstruction`` in a folder, whose binary files are checked from end to end first.
+
+    Raises:
+        BackendUnavailable: pycolmap is not installed.
+        DataError: a file is missing or damaged.
+    """
+    pycolmap = pycolmap_package()
+    kind = _kind(folder)
+    if kind is None:
+        raise DataError(f"{folder}: no cameras.bin or cameras.txt; expected a COLMAP model (scene.model)")
+    absent = [name + kind for name in _PARTS[1:3] if not (folder / (name + kind)).is_file()]
+    if absent:
+        raise DataError(f"{folder}: {len(absent)} files not found: {', '.join(absent)}")
+    if kind == ".bin":
+        check_binary_model(folder, _parameter_count)
+    try:
+        return pycolmap.Reconstruction(str(folder))
+    except Exception as error:  # pycolmap raises many types for inconsistent models
+        raise DataError(f"{folder}: not a readable COLMAP model ({type(error).__name__}: {error})") from None
+
+
+def _parameter_count(model: int) -> int:
+    pycolmap = pycolmap_package()
+    try:
+        return len(pycolmap.Camera(model=pycolmap.CameraModelId(model), width=1, height=1).params_info.split(","))
+    except Exception:  # unknown numbers raise different types in different versions
+        return -1
+
+
+def pinhole_of(lens: Any, where: str) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy in pixels of a ``pycolmap.Camera``, whatever its distortion.
+
+    Raises:
+        DataError: a model without focal lengths.
+    """
+    # asking a panorama for its focal length ends the process, so the parameters are taken by their names
+    named: dict[str, float | None] = dict(zip((n.strip() for n in lens.params_info.split(",")), map(float, lens.params), strict=False))
+    named = {"fx": named.get("f"), "fy": named.get("f"), **named}
+    fx, fy, cx, cy = (named.get(key) for key in ("fx", "fy", "cx", "cy"))
+    if fx is None or fy is None or cx is None or cy is None:
+        raise DataError(f"{where}: model is {lens.model_name}; expected a model with focal lengths, which a pinhole can replace")
+    return fx, fy, cx, cy
+
+
+def viewmat_of(image: Any) -> Tensor:
+    """(4, 4) float64 world-to-camera matrix, OpenCV axes, of a ``pycolmap.Image``."""
+    pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3] = torch.from_numpy(np.asarray(pose.matrix(), dtype=np.float64))
+    return viewmat
+
+
+# ---------------------------------------------------------------- cameras alone
+
+
+def is_model(path: Path) -> Path | None:
+    """The folder of the model that a path means: itself, one of its files, or a project with ``sparse/0``; None for anything else."""
+    if path.is_dir():
+        return next((folder for folder in (path, path / "sparse" / "0", path / "sparse") if _kind(folder) is not None), None)
+    return path.parent if path.name in {f"{part}{kind}" for part in _PARTS for kind in (".txt", ".bin")} and _kind(path.parent) else None
+
+
+def posed_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
+    """Name, without its suffix, and camera of every image with a pose, by name, and lines for the user. Points need not be there.
+
+    Raises:
+        BackendUnavailable: pycolmap is not installed.
+        DataError: as :func:`read_model`; no poses, impossible cameras, lenses that no pinhole can stand in for.
+    """
+    reconstruction = _without_points(folder)
+    images = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
+    if not images:
+        raise DataError(f"{folder}: has no images with a pose; expected at least one")
+    found, bent = [], Counter[str]()
+    for image in images:
+        lens, where = reconstruction.cameras[image.camera_id], f"{folder}: camera {image.camera_id} of image {image.name}"
+        if lens.model_name not in (*PINHOLES, *_DISTORTED):
+            raise DataError(f"{where}: model is {lens.model_name}; expected one of {', '.join((*PINHOLES, *_DISTORTED))}")
+        names = [name.strip() for name in lens.params_info.split(",")]
+        if any(value for name, value in zip(names, lens.params, strict=True) if name not in ("f", "fx", "fy", "cx", "cy")):
+            bent[lens.model_name] += 1
+        camera = Camera(viewmat_of(image), *pinhole_of(lens, where), int(lens.width), int(lens.height))
+        found.append((str(PurePosixPath(image.name).with_suffix("")), camera.validate(where)))
+    notes = [f"the lens distortion of {count} of {len(found)} cameras ({model}) is left out" for model, count in sorted(bent.items())]
+    return found, notes
+
+
+def _without_points(folder: Path) -> Any:
+    """The model; where its points are missing, as if there were none."""
+    kind = _kind(folder)
+    if kind is None or (folder / f"points3D{kind}").is_file() or not (folder / f"images{kind}").is_file():
+        return read_model(folder)
+    with tempfile.TemporaryDirectory() as name:
+        copy = Path(name)
+        for part in _PARTS:
+            if (folder / f"{part}{kind}").is_file():
+                shutil.copyfile(folder / f"{part}{kind}", copy / f"{part}{kind}")
+        (copy / f"points3D{kind}").write_bytes(b"" if kind == ".txt" else bytes(8))
+        try:
+            return read_model(copy)
+        except DataError as error:
+            raise DataError(str(error).replace(name, str(folder))) from None

@@ -1,0 +1,134 @@
+"""Cameras in JSON: frames as NeRF-synthetic, instant-ngp, nerfstudio and Blender's script have them, and camera paths of nerfstudio's viewer."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from torch import Tensor
+
+from neuprim.core.cameras.intrinsics import COEFFICIENTS, MODELS, camera_of, is_fisheye
+from neuprim.core.cameras.pinhole import Camera, opengl_to_viewmat
+from neuprim.core.cameras.views import LARGEST, MOST, RATES, CameraViews
+from neuprim.core.errors import DataError
+from neuprim.core.io.records import Record, read_json
+
+__all__ = ["read_json_cameras"]
+
+_MAX_BYTES = 64 * 1024 * 1024
+
+_COMMON = (
+    "w",
+    "h",
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "camera_angle_x",
+    "camera_angle_y",
+    "camera_model",
+    "is_fisheye",
+    *COEFFICIENTS,
+    "transform_matrix",
+)
+"""What a frame may leave to its file."""
+
+
+def read_json_cameras(path: Path, size: tuple[int, int] | None = None) -> CameraViews:
+    """The cameras of a file with ``frames`` or ``camera_path``.
+
+    Args:
+        size: (width, height) where the file names none.
+
+    Raises:
+        DataError: names the file, the frame and the field that is missing or wrong.
+    """
+    document = read_json(path, _MAX_BYTES)
+    if document.has("camera_path"):
+        return _camera_path(document, size)
+    if not document.has("frames"):
+        raise document.fail("frames", "a non-empty list of objects (or camera_path, as nerfstudio's viewer writes it)")
+    return _frames(document, size)
+
+
+def _checked(document: Record, key: str) -> list[Record]:
+    records = list(document.objects(key))
+    if len(records) > MOST:
+        raise DataError(f"{document.where}: {key} has {len(records)} cameras; expected at most {MOST}")
+    return records
+
+
+def _size(record: Record, keys: tuple[str, str], size: tuple[int, int] | None) -> tuple[int, int]:
+    found = [record.count(key) if record.has(key) or size is None else fallback for key, fallback in zip(keys, size or (0, 0), strict=True)]
+    for key, value in zip(keys, found, strict=True):
+        if not 0 < value <= LARGEST:
+            raise DataError(f"{record.where}: {key} is {value}; expected 1 to {LARGEST} pixels")
+    return found[0], found[1]
+
+
+def _times(records: list[Record], key: str) -> tuple[float, ...] | None:
+    """The times of all cameras, where all have one."""
+    return tuple(r.number(key, "a time") for r in records) if all(r.has(key) for r in records) else None
+
+
+def _rate(document: Record, count: int) -> float | None:
+    """``fps``, else the ``count`` of frames over ``seconds``; None where the file says neither."""
+    for key, rate in (("fps", lambda value: value), ("seconds", lambda value: count / value)):
+        if document.has(key):
+            found = rate(document.number(key, "a number above 0", 0.0))
+            if not RATES[0] <= found <= RATES[1]:
+                raise document.fail(key, f"{RATES[0]:g} to {RATES[1]:g} frames per second")
+            return found
+    return None
+
+
+# ---------------------------------------------------------------- frames
+
+
+def _frames(document: Record, size: tuple[int, int] | None) -> CameraViews:
+    """``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``; a frame may override every intrinsic."""
+    records, found, bent = _checked(document, "frames"), [], 0
+    common = {key: document.values[key] for key in _COMMON if document.has(key)}  # not all of what a file may hold, for every frame
+    for i, record in enumerate(records):
+        merged = Record({**common, **{k: v for k, v in record.values.items() if v is not None}}, record.where)
+        if is_fisheye(merged, ()):
+            raise DataError(f"{merged.where}: the camera is a fisheye (camera_model, is_fisheye); expected one of {', '.join(MODELS)}")
+        bent += any(merged.number_or(key, 0.0) != 0.0 for key in COEFFICIENTS)
+        width, height = _size(merged, ("w", "h"), size)
+        found.append((f"camera_{i:03d}", camera_of(merged, width, height).validate(record.where)))
+    notes = (f"the lens distortion of {bent} of {len(found)} cameras is left out",) if bent else ()
+    return CameraViews(tuple(found), _times(records, "time"), _rate(document, len(found)), notes)
+
+
+# ---------------------------------------------------------------- nerfstudio's viewer
+
+
+def _camera_path(document: Record, size: tuple[int, int] | None) -> CameraViews:
+    """``{"render_width", "render_height", "fps", "seconds", "camera_path": [{"camera_to_world": 16 numbers, "fov": degrees}]}``: ``fov`` is vertical,
+    the middle of the image is the principal point, and axes are OpenGL's.
+    """
+    kind = document.values.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise document.fail("camera_type", "perspective; others are not drawn")
+    records = _checked(document, "camera_path")
+    width, height = _size(document, ("render_width", "render_height"), size)
+    found = []
+    for i, record in enumerate(records):
+        fov = record.number("fov", "a vertical field of view in degrees, between 0 and 180", 0.0, 180.0)
+        focal = 0.5 * height / math.tan(math.radians(fov) / 2)
+        view = opengl_to_viewmat(_flat_matrix(record, "camera_to_world"))
+        camera = Camera(view, focal, focal, 0.5 * width, 0.5 * height, width, height)
+        found.append((f"camera_{i:03d}", camera.validate(f"{record.where}.camera_to_world")))
+    note = "poses are taken as they are; nerfstudio's viewer has them in the frame that its dataparser moved and scaled the scene to"
+    return CameraViews(tuple(found), _times(records, "render_time"), _rate(document, len(found)), (note,))
+
+
+def _flat_matrix(record: Record, key: str) -> Tensor:
+    """(4, 4) of 16 numbers row by row, or of rows."""
+    value = record.values.get(key)
+    if isinstance(value, list) and len(value) == 16:
+        rows = [value[i : i + 4] for i in (0, 4, 8, 12)]
+        return Record({key: rows}, record.where).matrix(key)
+    if not isinstance(value, list) or len(value) not in (3, 4):
+        raise record.fail(key, "16 numbers, row by row")
+    return record.matrix(key)

@@ -1,0 +1,122 @@
+"""Cameras of USD stages (.usd, .usda, .usdc, .usdz), by Pixar's library (the extra ``neuprim[usd]``).
+
+The library is C++ that was not written for files of strangers, so a process of its own reads them (:mod:`neuprim.core.cameras.usd_stage`), with
+limits of time and memory, and what it prints is checked like any other file.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import usd_stage
+from neuprim.core.cameras.pinhole import Camera, opengl_to_viewmat
+from neuprim.core.cameras.views import LARGEST, MOST, RATES, CameraViews
+from neuprim.core.errors import BackendUnavailable, DataError
+from neuprim.core.io.records import Record
+
+__all__ = ["is_usd", "read_usd_cameras"]
+
+_MAGIC = (b"#usda ", b"PXR-USDC", b"PK\x03\x04")
+_MAX_BYTES = 1 << 30
+_SECONDS = 120.0
+_SCALED = 1e-3  # how unequal the axes of a pose may be
+
+
+def is_usd(path: Path) -> bool:
+    """Whether a file begins as one of USD's three formats does."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(8).startswith(_MAGIC)
+    except OSError:
+        return False
+
+
+def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = None) -> CameraViews:
+    """The camera of a stage, at every whole time code of its range where it moves.
+
+    Axes and units are those of the stage, and nothing is turned or scaled. The image shows the whole aperture: where its shape differs, it
+    shows more on two sides ("expandAperture" of UsdRender). Lens distortion, depth of field and exposure are not USD's pinhole.
+
+    Args:
+        prim: path of the camera in a stage with several.
+        size: (width, height) in pixels; None for that of the stage's render settings.
+
+    Raises:
+        BackendUnavailable: the package is missing.
+        DataError: a file that cannot be read, no or several cameras, an orthographic, sheared or mirrored one, no size.
+    """
+    if importlib.util.find_spec("pxr") is None:
+        raise BackendUnavailable(f"{path}: USD files need the package usd-core: pip install 'neuprim[usd]'")
+    stage = _stage(path, prim)
+    where = f"{path}: {stage.text('path')}"
+    wanted = size or _resolution(stage, path)
+    records = list(stage.objects("frames"))
+    cameras = [_camera(Record(r.values, where if len(records) == 1 else f"{where}, frame {i}"), wanted) for i, r in enumerate(records)]
+    note = f"{stage.text('up')} is up and a unit is {stage.number('meters', 'metres per unit', 0.0):g} m in this file; taken as the scene's own axes and units"
+    fps = stage.number("fps", "time codes per second above 0", 0.0) if len(cameras) > 1 else None
+    if fps is not None and not RATES[0] <= fps <= RATES[1]:  # some tools count in ticks
+        note, fps = f"{note}; timeCodesPerSecond {fps:g} is no rate of a film, --fps says another", None
+    return CameraViews(tuple((f"camera_{i:03d}", camera) for i, camera in enumerate(cameras)), None, fps, (note,))
+
+
+def _stage(path: Path, prim: str) -> Record:
+    """What the process printed."""
+    if path.stat().st_size > _MAX_BYTES:
+        raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {_MAX_BYTES}")
+    # -P: modules beside the script are none of pxr's
+    words = [sys.executable, "-P", str(Path(usd_stage.__file__)), str(path.resolve()), prim, str(MOST)]
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=_SECONDS)
+    except subprocess.TimeoutExpired:
+        raise DataError(f"{path}: not read after {_SECONDS:.0f} s; expected a USD file with a camera") from None
+    if done.returncode < 0:
+        raise DataError(f"{path}: not a readable USD file (its reader ended by {signal.Signals(-done.returncode).name})")
+    if done.returncode:
+        said = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+        raise DataError(f"{path}: {said[:300]}")
+    try:
+        return Record(json.loads(done.stdout.strip().splitlines()[-1]), str(path))
+    except (ValueError, IndexError) as error:
+        raise DataError(f"{path}: not a readable USD file ({error})") from None
+
+
+def _resolution(stage: Record, path: Path) -> tuple[int, int]:
+    if not stage.has("resolution"):
+        raise DataError(f"{path}: names no size of an image (renderSettingsPrimPath); give --size WxH")
+    width, height = (int(x) for x in stage.array("resolution", (2,), "width and height").tolist())
+    if not (0 < width <= LARGEST and 0 < height <= LARGEST):
+        raise DataError(f"{path}: resolution {width}x{height}; expected 1 to {LARGEST} pixels a side")
+    return width, height
+
+
+def _camera(record: Record, size: tuple[int, int]) -> Camera:
+    if record.text("projection") != "perspective":
+        raise record.fail("projection", "perspective; others are not drawn")
+    focal = record.number("focal", "a focal length above 0", 0.0)
+    (wide, high), (right, up) = (record.array(key, (2,), "two numbers").tolist() for key in ("aperture", "offset"))
+    if wide <= 0 or high <= 0:
+        raise DataError(f"{record.where}: aperture is {wide:g} x {high:g}; expected numbers above 0")
+    width, height = size
+    scale = min(width / wide, height / high)  # pixels per unit of the aperture; all of it is in the image
+    pose = opengl_to_viewmat(_rigid(record.matrix("transform_matrix"), record.where))
+    camera = Camera(pose, focal * scale, focal * scale, width / 2 - right * scale, height / 2 + up * scale, width, height)
+    return camera.validate(record.where)
+
+
+def _rigid(matrix: Tensor, where: str) -> Tensor:
+    """The pose without the one scale of all its axes, which a camera's image does not depend on."""
+    lengths = matrix[:3, :3].norm(dim=0)
+    mean = lengths.mean()
+    if not bool(mean > 0) or float((lengths / mean - 1).abs().max()) > _SCALED:
+        raise DataError(
+            f"{where}: its transform scales by {', '.join(f'{x:g}' for x in lengths.tolist())}; expected one scale for all axes"
+        )
+    return torch.cat([torch.cat([matrix[:3, :3] / lengths, matrix[:3, 3:]], 1), matrix[3:]])

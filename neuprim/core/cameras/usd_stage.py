@@ -1,0 +1,100 @@
+"""Reads the camera of a USD stage and prints it as JSON; run as a process of its own, so that a damaged file can end no other.
+
+It imports nothing of neuprim, and Pixar's ``pxr`` alone. USD's cameras look along -z with y up, as OpenGL's, and its matrices multiply row
+vectors. Arguments: file, path of the camera's prim or nothing, and the most frames; a line on standard error says what is wrong.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from typing import Any
+
+MEMORY = 4 << 30  # of the process: what a file may claim
+
+
+def main(path: str, wanted: str, most: int) -> dict[str, Any]:
+    """``{"frames": [...], ...}``; see :mod:`neuprim.core.cameras.usd`, which reads it."""
+    from pxr import Tf, Usd, UsdGeom
+
+    try:
+        stage = Usd.Stage.Open(path, Usd.Stage.LoadNone)  # payloads are not followed
+    except Tf.ErrorException as error:
+        reason = (
+            error.args[0].commentary.strip().splitlines()[0].removeprefix(f"{path}:")
+        )  # the first is why, the others what failed with it
+        raise SystemExit(f"not a readable USD file ({reason})") from None
+    cameras = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
+    paths = [str(prim.GetPath()) for prim in cameras]
+    if not paths:
+        raise SystemExit("has no camera; expected one (payloads are not read)")
+    listed = ", ".join(paths[:8]) + (", ..." if len(paths) > 8 else "")
+    if wanted and wanted not in paths:
+        raise SystemExit(f"has no camera {wanted}; expected one of {listed}")
+    if not wanted and len(paths) > 1:
+        raise SystemExit(f"has {len(paths)} cameras; expected #PATH after the file's name, with one of {listed}")
+    camera = UsdGeom.Camera(cameras[paths.index(wanted) if wanted else 0])
+    moments = times(stage, camera, most, Usd, UsdGeom)
+    return {
+        "path": str(camera.GetPath()),
+        "frames": [frame(camera, moment) for moment in moments],
+        "times": [None if math.isnan(moment.GetValue()) else moment.GetValue() for moment in moments],
+        "fps": stage.GetTimeCodesPerSecond(),
+        "up": str(UsdGeom.GetStageUpAxis(stage)),
+        "meters": UsdGeom.GetStageMetersPerUnit(stage),
+        "resolution": resolution(stage),
+    }
+
+
+def times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any) -> list[Any]:
+    """Every whole time code from start to end where anything of the camera moves; else the default, or the start."""
+    prim, moves = camera.GetPrim(), any(a.ValueMightBeTimeVarying() for a in camera.GetPrim().GetAttributes())
+    while not moves and prim and not prim.IsPseudoRoot():
+        moves, prim = UsdGeom.Xformable(prim).TransformMightBeTimeVarying() if UsdGeom.Xformable(prim) else False, prim.GetParent()
+    if not moves:
+        return [Usd.TimeCode(stage.GetStartTimeCode()) if stage.HasAuthoredTimeCodeRange() else Usd.TimeCode.EarliestTime()]
+    if not stage.HasAuthoredTimeCodeRange():
+        raise SystemExit("startTimeCode and endTimeCode are missing; expected them, as the camera moves")
+    first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    if not (math.isfinite(first) and math.isfinite(last) and 0 <= last - first < most):
+        raise SystemExit(f"startTimeCode {first:g} and endTimeCode {last:g}; expected a range of at most {most} codes")
+    return [Usd.TimeCode(first + i) for i in range(int(last - first + 1e-9) + 1)]
+
+
+def frame(camera: Any, moment: Any) -> dict[str, Any]:
+    """Pose (camera to world, column vectors), focal length and aperture, all three in one unit, at a time."""
+    found = camera.GetCamera(moment)
+    matrix = found.transform
+    return {
+        "projection": "perspective" if found.projection == found.Perspective else "orthographic",
+        "transform_matrix": [[matrix[column][row] for column in range(4)] for row in range(4)],
+        "focal": found.focalLength,
+        "aperture": [found.horizontalAperture, found.verticalAperture],
+        "offset": [found.horizontalApertureOffset, found.verticalApertureOffset],
+    }
+
+
+def resolution(stage: Any) -> list[int] | None:
+    """Of the stage's render settings, if it names any."""
+    from pxr import UsdRender
+
+    settings = UsdRender.Settings.GetStageRenderSettings(stage)
+    value = settings.GetResolutionAttr().Get() if settings else None
+    return None if value is None else [int(value[0]), int(value[1])]
+
+
+def limit_memory() -> None:
+    """At most :data:`MEMORY`, where the system knows such a thing."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    if hard == resource.RLIM_INFINITY or hard > MEMORY:
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, hard))
+
+
+if __name__ == "__main__":
+    limit_memory()
+    print(json.dumps(main(sys.argv[1], sys.argv[2], int(sys.argv[3]))))

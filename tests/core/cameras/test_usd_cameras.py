@@ -1,0 +1,219 @@
+"""Cameras of USD stages, against the matrices that Pixar's own library makes of them."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from neuprim.core.cameras import Camera
+from neuprim.core.cameras.file import read_camera_file
+from neuprim.core.cameras.usd import is_usd, read_usd_cameras
+from neuprim.core.errors import BackendUnavailable, DataError
+
+pytest.importorskip("pxr", reason="needs usd-core: pip install 'neuprim[usd]'")
+
+CAMERA = """
+    def Camera "Cam"
+    {
+        float focalLength = 35
+        float horizontalAperture = 36
+        float verticalAperture = 27
+        float horizontalApertureOffset = 3
+        float verticalApertureOffset = -2
+        matrix4d xformOp:transform = ( (1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0.5, -4, 0.25, 1) )
+        uniform token[] xformOpOrder = ["xformOp:transform"]
+    }
+"""
+MOVING = CAMERA.replace(
+    "matrix4d xformOp:transform = ( (1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0.5, -4, 0.25, 1) )",
+    "matrix4d xformOp:transform.timeSamples = { 1: ( (1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, -4, 0, 1) ),"
+    " 3: ( (1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (2, -4, 0, 1) ) }",
+).replace("focalLength = 35", "focalLength.timeSamples = { 1: 35, 3: 45 }")
+
+
+def usd(path: Path, body: str = CAMERA, head: str = 'upAxis = "Z"\n    metersPerUnit = 0.01') -> Path:
+    path.write_text(f'#usda 1.0\n(\n    {head}\n)\n\ndef Xform "World"\n{{{body}}}\n')
+    return path
+
+
+def projected(path: Path, prim: str, time: float, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """(N, 2) pixels by the library's own frustum."""
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(path))
+    frustum = UsdGeom.Camera(stage.GetPrimAtPath(prim)).GetCamera(time).frustum
+    clip = (
+        np.concatenate([points, np.ones((len(points), 1))], 1)
+        @ np.array(frustum.ComputeViewMatrix())
+        @ np.array(frustum.ComputeProjectionMatrix())
+    )
+    ndc = clip[:, :2] / clip[:, 3:]
+    return (ndc * (0.5, -0.5) + 0.5) * size
+
+
+POINTS = np.array([[0.5, 0.0, 0.25], [0.9, 1.0, 0.7], [0.1, 2.0, -0.4]])
+
+
+def close(camera: Camera, expected: np.ndarray) -> bool:
+    return bool(np.abs(camera.project(torch.from_numpy(POINTS))[0].numpy() - expected).max() < 1e-3)
+
+
+def test_a_camera_that_stands_still(tmp_path: Path) -> None:
+    path = usd(tmp_path / "a.usda")
+    found = read_camera_file(path, (640, 480))  # of the aperture's shape
+    ((_, camera),) = found.named
+    assert close(camera, projected(path, "/World/Cam", 0, POINTS, (640, 480)))
+    assert camera.fx == camera.fy == pytest.approx(35 / 36 * 640) and camera.cx < 320 and camera.cy < 240
+    assert found.notes == ("Z is up and a unit is 0.01 m in this file; taken as the scene's own axes and units",) and found.fps is None
+
+
+def test_all_formats_are_known_by_what_is_in_them(tmp_path: Path) -> None:
+    from pxr import Sdf, UsdUtils
+
+    text = usd(tmp_path / "a.usda")
+    Sdf.Layer.FindOrOpen(str(text)).Export(str(tmp_path / "b.usdc"))
+    UsdUtils.CreateNewUsdzPackage(str(tmp_path / "b.usdc"), str(tmp_path / "c.usdz"))
+    (tmp_path / "d.usd").write_bytes((tmp_path / "b.usdc").read_bytes())
+    expected = read_camera_file(text, (64, 48)).named[0][1]
+    for name in ("b.usdc", "c.usdz", "d.usd"):
+        assert is_usd(tmp_path / name)
+        camera = read_camera_file(tmp_path / name, (64, 48)).named[0][1]
+        assert torch.allclose(camera.viewmat, expected.viewmat) and (camera.fx, camera.cx, camera.cy) == (
+            expected.fx,
+            expected.cx,
+            expected.cy,
+        )
+
+
+def test_a_camera_that_moves_has_a_frame_per_time_code(tmp_path: Path) -> None:
+    path = usd(tmp_path / "a.usda", MOVING, "startTimeCode = 1\n    endTimeCode = 3\n    timeCodesPerSecond = 25")
+    found = read_camera_file(path, (640, 480))
+    assert len(found.named) == 3 and found.fps == 25 and found.notes[0].startswith("Y is up")
+    for i, (_, camera) in enumerate(found.named):
+        assert camera.position.tolist() == pytest.approx([i, -4, 0]) and camera.fx == pytest.approx((35 + 5 * i) / 36 * 640)
+        assert close(camera, projected(path, "/World/Cam", 1 + i, POINTS, (640, 480)))
+
+
+def test_a_rate_of_ticks_is_no_films(tmp_path: Path) -> None:
+    path = usd(tmp_path / "a.usda", MOVING, "startTimeCode = 1\n    endTimeCode = 3\n    timeCodesPerSecond = 6000")
+    found = read_camera_file(path, (64, 48))
+    assert found.fps is None and "timeCodesPerSecond 6000 is no rate of a film" in found.notes[0]
+
+
+@pytest.mark.parametrize("size", [(640, 300), (300, 480)])
+def test_another_shape_shows_the_whole_aperture_and_more(tmp_path: Path, size: tuple[int, int]) -> None:
+    path = usd(tmp_path / "a.usda")
+    camera = read_camera_file(path, size).named[0][1]
+    assert camera.fx == camera.fy == pytest.approx(35 * min(size[0] / 36, size[1] / 27))
+    left, right = (-18 + 3) / 35 * camera.fx + camera.cx, (18 + 3) / 35 * camera.fx + camera.cx
+    top, bottom = camera.cy - (13.5 - 2) / 35 * camera.fy, camera.cy + (13.5 + 2) / 35 * camera.fy
+    assert min(left, top) > -1e-3 and right < size[0] + 1e-3 and bottom < size[1] + 1e-3
+
+
+def test_render_settings_say_the_size(tmp_path: Path) -> None:
+    body = CAMERA + '    def RenderSettings "R" {\n uniform int2 resolution = (320, 240)\n }\n'
+    path = usd(tmp_path / "a.usda", body, 'renderSettingsPrimPath = "/World/R"')
+    assert (read_camera_file(path).named[0][1].width, read_camera_file(path).named[0][1].height) == (320, 240)
+    assert read_camera_file(path, (64, 48)).named[0][1].width == 64
+
+
+def test_one_of_several_by_its_path(tmp_path: Path) -> None:
+    path = usd(tmp_path / "a.usda", CAMERA + CAMERA.replace('"Cam"', '"Other"').replace("35", "70"))
+    with pytest.raises(DataError, match="has 2 cameras; expected #PATH after the file's name, with one of /World/Cam, /World/Other"):
+        read_camera_file(path, (64, 48))
+    assert read_camera_file(Path(f"{path}#/World/Other"), (64, 48)).named[0][1].fx == pytest.approx(70 / 36 * 64)
+    with pytest.raises(DataError, match="has no camera /World/None; expected one of /World/Cam, /World/Other"):
+        read_camera_file(Path(f"{path}#/World/None"), (64, 48))
+
+
+def test_a_scale_of_all_axes_does_not_matter(tmp_path: Path) -> None:
+    plain = read_camera_file(usd(tmp_path / "a.usda"), (64, 48)).named[0][1]
+    scaled = CAMERA.replace("(1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0)", "(100, 0, 0, 0), (0, 0, 100, 0), (0, -100, 0, 0)")
+    found = read_camera_file(usd(tmp_path / "b.usda", scaled), (64, 48)).named[0][1]
+    assert torch.allclose(found.viewmat, plain.viewmat) and found.fx == plain.fx
+
+
+BAD: list[tuple[str, Callable[[Path], Any], str]] = [
+    ("no size", lambda p: (usd(p), None), r"names no size of an image .* give --size WxH"),
+    ("no camera", lambda p: (usd(p, ""), (64, 48)), "has no camera; expected one"),
+    (
+        "orthographic",
+        lambda p: (usd(p, CAMERA.replace("float focalLength", 'token projection = "orthographic"\n float focalLength')), (64, 48)),
+        'projection is "orthographic"; expected perspective',
+    ),
+    ("focal zero", lambda p: (usd(p, CAMERA.replace("= 35", "= 0")), (64, 48)), "focal is 0.0; expected a focal length above 0"),
+    ("aperture zero", lambda p: (usd(p, CAMERA.replace("= 36", "= 0")), (64, 48)), "aperture is 0 x 27; expected numbers above 0"),
+    ("focal nan", lambda p: (usd(p, CAMERA.replace("= 35", "= nan")), (64, 48)), "focal is NaN; expected a focal length"),
+    (
+        "stretched",
+        lambda p: (usd(p, CAMERA.replace("(1, 0, 0, 0)", "(2, 0, 0, 0)")), (64, 48)),
+        "its transform scales by 2, 1, 1; expected one scale",
+    ),
+    ("mirrored", lambda p: (usd(p, CAMERA.replace("(1, 0, 0, 0)", "(-1, 0, 0, 0)")), (64, 48)), "mirrored"),
+    ("flat", lambda p: (usd(p, CAMERA.replace("(1, 0, 0, 0)", "(0, 0, 0, 0)")), (64, 48)), "its transform scales by 0, 1, 1"),
+    ("no range", lambda p: (usd(p, MOVING), (64, 48)), "startTimeCode and endTimeCode are missing"),
+    (
+        "endless",
+        lambda p: (usd(p, MOVING, "startTimeCode = 1\n    endTimeCode = 1e12"), (64, 48)),
+        "expected a range of at most 100000 codes",
+    ),
+    ("backwards", lambda p: (usd(p, MOVING, "startTimeCode = 3\n    endTimeCode = 1"), (64, 48)), "expected a range of at most"),
+    ("no syntax", lambda p: (usd(p, CAMERA.replace("{", "[", 1)), (64, 48)), "not a readable USD file"),
+    (
+        "not USD after all",
+        lambda p: (p, (64, 48)) if p.write_bytes(b"PXR-USDC" + bytes(range(256)) * 9) else None,
+        "not a readable USD file",
+    ),
+    ("cut", lambda p: (p, (64, 48)) if p.write_text("#usda 1.0\n(") else None, "not a readable USD file"),
+]
+
+
+@pytest.mark.parametrize(("make", "words"), [(m, w) for _, m, w in BAD], ids=[n for n, _, _ in BAD])
+def test_bad_stages_are_refused_in_one_line(tmp_path: Path, make: Callable[[Path], Any], words: str) -> None:
+    path, size = make(tmp_path / "a b.usda")
+    with pytest.raises(DataError, match=words) as caught:
+        read_camera_file(path, size)
+    assert "a b.usda" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_damaged_crate_ends_no_process_but_its_reader(tmp_path: Path) -> None:
+    from pxr import Sdf
+
+    Sdf.Layer.FindOrOpen(str(usd(tmp_path / "a.usda"))).Export(str(tmp_path / "b.usdc"))
+    whole, generator = (tmp_path / "b.usdc").read_bytes(), np.random.default_rng(0)
+    for i in range(6):
+        bytes_ = bytearray(whole if i % 2 else whole[: len(whole) // 2])
+        for at in generator.integers(8, len(bytes_), 40 if i % 2 else 0):
+            bytes_[at] = generator.integers(256)
+        (tmp_path / f"{i}.usdc").write_bytes(bytes(bytes_))
+        try:
+            read_usd_cameras(tmp_path / f"{i}.usdc", "", (64, 48))
+        except DataError as error:
+            assert f"{i}.usdc" in str(error)
+
+
+def test_a_reader_that_never_ends_or_dies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, script = usd(tmp_path / "a.usda"), tmp_path / "script.py"
+    monkeypatch.setattr("neuprim.core.cameras.usd._SECONDS", 1.0)
+    for text, words in (
+        ("import time; time.sleep(60)", "not read after 1 s"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "its reader ended by SIGKILL"),
+        ("print('hello')", "not a readable USD file"),
+        ("raise MemoryError", "MemoryError"),
+    ):
+        script.write_text(text)
+        monkeypatch.setattr("neuprim.core.cameras.usd.usd_stage.__file__", str(script))
+        with pytest.raises(DataError, match=words):
+            read_usd_cameras(path, "", (64, 48))
+
+
+def test_the_package_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(BackendUnavailable, match=r"pip install 'neuprim\[usd\]'"):
+        read_camera_file(usd(tmp_path / "a.usda"))

@@ -1,0 +1,60 @@
+"""Cameras of held-out views to jump to, with their truth beside what the model shows there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from neuprim.runs.live.poses import Pose
+from neuprim.runs.live.session import Session
+
+__all__ = ["HeldOutControls"]
+
+_NONE = "none"
+
+
+class HeldOutControls:
+    """A list of views; the truth and the model, each at the view's own size, and the PSNR between them."""
+
+    def __init__(self, session: Session, jumped: Callable[[], None]) -> None:
+        self.session, self._jumped = session, jumped
+        self._names = session.subject.view_names()
+        self._truth: Any = None
+        self._drawn: Any = None
+        gui = session.client.gui
+        if not self._names:
+            return
+        self._choice = gui.add_dropdown("held-out view", [_NONE, *self._names], _NONE)
+        self._choice.on_update(lambda _: self._chosen(self._choice.value))
+        self._folder = gui.add_folder("ground truth, and the model", visible=False)
+        session.watchers.append(self._again)
+
+    def _chosen(self, name: str) -> None:
+        if name == _NONE:
+            self._folder.visible = False
+            return
+        self.session.ask("jump", lambda: self._jump(name))
+
+    def _jump(self, name: str) -> None:
+        view = self.session.subject.view(name)
+        self.session.stand(Pose.of(view.camera))
+        self.session.set_conditions({key: value.float() for key, value in view.conditions.items()})
+        self._jumped()
+        self._compare(name)
+
+    def _again(self) -> None:
+        """The model may have grown."""
+        if self.session.grows and self._folder.visible and self._choice.value != _NONE:
+            self._compare(self._choice.value)
+
+    def _compare(self, name: str) -> None:
+        found = self.session.subject.compare(name)
+        if self._truth is None:
+            gui = self.session.client.gui
+            with self._folder:
+                self._truth = gui.add_image(found.truth, label="ground truth", format="jpeg", jpeg_quality=95)
+                self._drawn = gui.add_image(found.drawn, label="model", format="jpeg", jpeg_quality=95)
+                self._psnr = gui.add_text("PSNR", "", disabled=True)
+        self._truth.image, self._drawn.image = found.truth, found.drawn
+        self._psnr.value = f"{found.psnr:.2f} dB"
+        self._folder.visible = True

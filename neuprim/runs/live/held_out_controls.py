@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from neuprim.runs.live.poses import Pose
 from neuprim.runs.live.session import Session
 
 __all__ = ["HeldOutControls"]
 
 _NONE = "none"
+_WIDE = 320
+"""Pixels of a panel, about."""
 
 
 class HeldOutControls:
@@ -24,7 +28,7 @@ class HeldOutControls:
         gui = session.client.gui
         if not self._names:
             return
-        self._choice = gui.add_dropdown("held-out view", [_NONE, *self._names], _NONE)
+        self._choice = gui.add_dropdown("held-out view", [_NONE, *self._names], initial_value=_NONE)
         self._choice.on_update(lambda _: self._chosen(self._choice.value))
         self._folder = gui.add_folder("ground truth, and the model", visible=False)
         session.watchers.append(self._again)
@@ -52,9 +56,15 @@ class HeldOutControls:
         if self._truth is None:
             gui = self.session.client.gui
             with self._folder:
-                self._truth = gui.add_image(found.truth, label="ground truth", format="jpeg", jpeg_quality=95)
-                self._drawn = gui.add_image(found.drawn, label="model", format="jpeg", jpeg_quality=95)
+                self._truth = gui.add_image(_large(found.truth), label="ground truth", format="jpeg", jpeg_quality=95)
+                self._drawn = gui.add_image(_large(found.drawn), label="model", format="jpeg", jpeg_quality=95)
                 self._psnr = gui.add_text("PSNR", "", disabled=True)
-        self._truth.image, self._drawn.image = found.truth, found.drawn
+        self._truth.image, self._drawn.image = _large(found.truth), _large(found.drawn)
         self._psnr.value = f"{found.psnr:.2f} dB"
         self._folder.visible = True
+
+
+def _large(image: np.ndarray) -> np.ndarray:
+    """A small image with every pixel repeated, so that the panel shows it as wide as it can."""
+    times = max(_WIDE // image.shape[1], 1)
+    return image.repeat(times, 0).repeat(times, 1)

@@ -27,14 +27,14 @@ class PathControls:
         self.session, self.run_dir, self.path = session, run_dir, CameraPath()
         self._marks: list[Any] = []
         gui = session.client.gui
-        self._keys = gui.add_dropdown("key", [_NONE], _NONE)
+        self._keys = gui.add_dropdown("key", [_NONE], initial_value=_NONE)
         edit = gui.add_button_group("keys", ["add", "set", "remove", "clear"])
         order = gui.add_button_group("order", ["earlier", "later", "go to"])
         self._seconds = gui.add_number("seconds", self.path.seconds, min=0.1, max=600.0, step=0.1)
         self._fps = gui.add_number("frames per second", self.path.fps, min=1.0, max=120.0, step=1.0)
         self._play = gui.add_checkbox("preview", False)
         self._size = gui.add_vector2("size", (640, 360), min=(16, 16), max=(8192, 8192), step=1)
-        self._format = gui.add_dropdown("film", ["webp", "mp4", "gif", "png"], "webp")
+        self._format = gui.add_dropdown("film", ["webp", "mp4", "gif", "png"], initial_value="webp")
         write = gui.add_button_group("write", ["cameras", "film"])
         edit.on_click(
             lambda _: self._guarded({"add": self._add, "set": self._set, "remove": self._remove, "clear": self._clear}[edit.value])
@@ -143,9 +143,9 @@ class PathControls:
         self.path.write(file, self._size_asked())
         more = [word for name, text in texts.items() for word in (flag(name), text)]
         if any(len(word) > 80 for word in more):
-            self.session.say(f"{file}")
+            self.session.tell(f"{file}")
         else:
-            self.session.say(shlex.join(["neuprim", "render", str(self.run_dir), "--camera", str(file), *more]))
+            self.session.tell(shlex.join(["neuprim", "render", str(self.run_dir), "--camera", str(file), *more]))
         return file, texts
 
     def _write(self) -> None:
@@ -156,4 +156,4 @@ class PathControls:
         out = film(
             self.run_dir, file, texts, str(self._format.value), self.path.fps, lambda text, done: self.session.say(f"{text}, {done:.0%}")
         )
-        self.session.say(f"{out}")
+        self.session.tell(f"{out}")

@@ -25,7 +25,7 @@ class PrimitiveControls:
         self._ball = unit_sphere(1)
         self._drawn: list[Any] = []
         self._mark: Any = None
-        self._how = gui.add_dropdown("ellipsoids", [_NONE, _WIRE, _SOLID], _NONE)
+        self._how = gui.add_dropdown("ellipsoids", [_NONE, _WIRE, _SOLID], initial_value=_NONE)
         self._most = gui.add_slider("at most", 100, _MOST, 100, _FIRST, hint="those that absorb most")
         self._click = gui.add_checkbox("choose by a click", False, hint="the primitive that contributes most under the mouse")
         self._row = gui.add_number("primitive", -1, min=-1, step=1, hint="its number; -1 for none")

@@ -24,13 +24,13 @@ class RenderControls:
     def __init__(self, session: Session, words: bool) -> None:
         self.session = session
         gui = session.client.gui
-        shows = gui.add_dropdown("show", quantities(session.subject.channels), session.shows)
+        shows = gui.add_dropdown("show", quantities(session.subject.channels), initial_value=session.shows)
         shows.on_update(lambda _: self._show(shows.value))
         longest = gui.add_slider("pixels", 128, 2048, 32, LONGEST, hint="on the longer side of the full picture")
         longest.on_update(lambda _: self._pixels(int(longest.value)))
         with gui.add_folder("accuracy", expand_by_default=False):
             settings = session.settings
-            self._inputs: dict[str, Any] = {"sort": gui.add_dropdown("sort", list(get_args(SortOrder)), settings.sort)}
+            self._inputs: dict[str, Any] = {"sort": gui.add_dropdown("sort", list(get_args(SortOrder)), initial_value=settings.sort)}
             for name in _NUMBERS:
                 value = getattr(settings, name)
                 self._inputs[name] = gui.add_number(name, value, step=1 if isinstance(value, int) else 1e-6)
@@ -42,7 +42,7 @@ class RenderControls:
             front = session.subject.front.points if words else ()
             if front:
                 names = [_AS_SET, *(" ".join(point) for point, _ in front)]
-                chosen = gui.add_dropdown("measured", names, _AS_SET, hint="the front that `neuprim tradeoff` found")
+                chosen = gui.add_dropdown("measured", names, initial_value=_AS_SET, hint="the front that `neuprim tradeoff` found")
                 chosen.on_update(lambda _: self._choose("" if chosen.value == _AS_SET else chosen.value))
             for control in (*self._inputs.values(), *([self._words] if self._words is not None else [])):
                 control.on_update(lambda _: self._changed())
@@ -66,4 +66,4 @@ class RenderControls:
             words = tuple((self._words.value if self._words is not None else "").split())
             self.session.set_settings(replace(self.session.subject.settings, **values), words)
         except NeuprimError as error:
-            self.session.say(str(error))
+            self.session.failed(error)

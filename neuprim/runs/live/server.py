@@ -6,6 +6,7 @@ import contextlib
 import io
 import ipaddress
 import socket
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -51,6 +52,8 @@ class PageServer:
         """Raises :class:`ConfigError` where host or port are not to be had, :class:`BackendUnavailable` without viser."""
         viser = require_viser()
         gate = Gate()
+        # A page that is closed while something is sent to it is nothing that anybody must be told.
+        warnings.filterwarnings("ignore", message=r"Queued a \w+ on a closed connection")
         port = _free_port(settings.host, settings.port)
         with contextlib.redirect_stdout(io.StringIO()), gate.before_viser():
             self.viser = viser.ViserServer(host=settings.host, port=port, label=title, verbose=False)
@@ -62,6 +65,7 @@ class PageServer:
             )
         self._no_tunnels()
         self.viser.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="large")
+        self.viser.gui.main_panel.dock_right()  # beside the picture, not over it
         self.address = gate.address(settings.host, port)
 
     def _no_tunnels(self) -> None:

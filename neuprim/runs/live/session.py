@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from neuprim.core.data import View
@@ -78,12 +79,23 @@ class Session:
         if self._status is not None and not self.gone:
             self._status.value = text
 
+    def tell(self, text: str, colour: str = "blue") -> None:
+        """Something that stays until it is closed: what went wrong, where a file is."""
+        if not self.gone:
+            self.client.add_notification("neuprim", " ".join(text.split()), color=colour, with_close_button=True)
+
     def stand(self, pose: Pose) -> None:
-        """Move the page's camera."""
+        """Move the page's camera; a drag turns it around what of the scene's middle lies straight ahead."""
+        forward = pose.rotation.as_matrix()[:, 2]
+        ahead = max(
+            float(forward @ (self.subject.center - pose.position)), 1e-2 * float(np.linalg.norm(self.subject.center - pose.position)), 1e-6
+        )
+        camera = self.client.camera
         with self.client.atomic():
-            self.client.camera.position = pose.position
-            self.client.camera.wxyz = pose.wxyz
-            self.client.camera.fov = pose.fov
+            camera.position = pose.position
+            camera.wxyz = pose.wxyz
+            camera.look_at = pose.position + ahead * forward
+            camera.fov = pose.fov
 
     @property
     def pose(self) -> Pose:
@@ -113,7 +125,7 @@ class Session:
         Raises:
             ConfigError: the words do not fit the model.
         """
-        levels = Levels.of(self.subject.model(), settings, self.subject.front, self.say, words)
+        levels = Levels.of(self.subject.model(), settings, self.subject.front, self.tell, words)
         with self._lock:
             self.settings, self._levels = settings, levels
         self.changed()
@@ -130,9 +142,11 @@ class Session:
 
     def failed(self, error: Exception) -> None:
         """Say in the page what went wrong; a fault of neuprim's own leaves its traceback on the console, too."""
-        if not isinstance(error, NeuprimError):
+        if isinstance(error, NeuprimError | OSError):
+            self.tell(str(error), "red")
+        else:
             traceback.print_exception(error)
-        self.say(" ".join(f"{type(error).__name__}: {error}".split()) if not isinstance(error, NeuprimError) else str(error))
+            self.tell(f"{type(error).__name__}: {error}", "red")
 
     def draw(self, level: Level | None = None, pose: Pose | None = None) -> None:
         """Draw and send a picture at a level, by default the best one that is smooth; on the thread that has the model."""
@@ -151,7 +165,7 @@ class Session:
     def levels(self) -> Levels:
         """Ways of drawing with the settings of now."""
         if self._levels is None:
-            self._levels = Levels.of(self.subject.model(), self.settings, self.subject.front, self.say)
+            self._levels = Levels.of(self.subject.model(), self.settings, self.subject.front, self.tell)
         return self._levels
 
     def _coarse(self) -> None:

@@ -49,6 +49,7 @@ class Subject:
         settings: how the run draws.
         background: (C,) behind everything.
         up: (3,) upward in the scene.
+        center: (3,) its middle, which a camera turns around.
         dataset: for held-out views; None where its files are gone.
         front: of ``neuprim tradeoff``, where that was run.
     """
@@ -60,6 +61,7 @@ class Subject:
     settings: RenderSettings
     background: Tensor
     up: tuple[float, float, float]
+    center: np.ndarray
     dataset: Dataset | None = None
     front: Front = field(default_factory=Front)
     _kept: dict[tuple[object, ...], Primitives] = field(default_factory=dict)
@@ -111,6 +113,12 @@ class Subject:
         views = self.dataset.test
         return {views.view(i).name: i for i in range(len(views)) if isinstance(views.view(i).camera, Camera)}
 
+    @staticmethod
+    def middle_of(model: Primitives) -> np.ndarray:
+        """(3,) of a model whose scene's middle nobody says: the median of the stored centres."""
+        means = model.params["means"].detach().double().cpu()
+        return np.asarray(means.median(0).values.numpy()) if len(means) else np.zeros(3)
+
     def start(self) -> View:
         """Where a page begins: the held-out view in which most is to be seen, else all of the model from aside."""
         if self.dataset is not None:
@@ -120,10 +128,8 @@ class Subject:
         conditions = _floats(start_of(self.task.conditions, [], {}))
         with torch.no_grad():
             means = self.model().living(conditions).geometry.means.double().cpu()
-        if not len(means):
-            means = torch.zeros(1, 3, dtype=torch.float64)
-        middle = means.median(0).values
-        radius = max(float((means - middle).norm(dim=1).quantile(0.9)), 1e-6)
+        middle = torch.from_numpy(np.asarray(self.center, np.float64))
+        radius = max(float((means - middle).norm(dim=1).quantile(0.9)), 1e-6) if len(means) else 1.0
         up = torch.tensor(self.up, dtype=torch.float64)
         aside = torch.linalg.cross(up, up.roll(1) + torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64))
         eye = middle + 3.5 * radius * (aside / aside.norm() + 0.4 * up / up.norm())

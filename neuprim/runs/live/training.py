@@ -12,6 +12,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
+import numpy as np
+
 from neuprim.config import RunConfig
 from neuprim.config.viewer import ViewerSettings
 from neuprim.runs.events import Event, Events, Finishing, Note
@@ -72,7 +74,7 @@ class LiveTraining:
         self.events(event)
         if isinstance(event, Finishing):
             for controls in self._controls:
-                controls.session.say(f"the training has ended, {event.text}; afterwards `neuprim view {self.config.output_dir}` shows it")
+                controls.session.tell(f"the training has ended, {event.text}; afterwards `neuprim view {self.config.output_dir}` shows it")
 
     # ------------------------------------------------------------ what a page may order, from any thread
 
@@ -117,7 +119,7 @@ class LiveTraining:
             self._save = False
             save(fitted)
             for controls in self._controls:
-                controls.session.say(f"step {fitted.trainer.step} is saved in {self.config.output_dir}")
+                controls.session.tell(f"step {fitted.trainer.step} is saved in {self.config.output_dir}")
         if stop.is_set() or not self.paused:
             return False
         if self._steps:
@@ -140,5 +142,5 @@ class LiveTraining:
     def _subject(self, fitted: Fitted) -> Subject:
         dataset = fitted.dataset
         x, y, z = (float(value) for value in dataset.up)
-        own = (fitted.task, lambda: fitted.trainer.model, fitted.channels, fitted.trainer.renderer, dataset.background, (x, y, z), dataset)
-        return Subject(self.config.output_dir.name, *own)
+        own = (fitted.task, lambda: fitted.trainer.model, fitted.channels, fitted.trainer.renderer, dataset.background, (x, y, z))
+        return Subject(self.config.output_dir.name, *own, center=np.asarray(dataset.center.numpy()), dataset=dataset)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 
 from neuprim.config import suspects_of
@@ -51,17 +53,25 @@ def open_subject(
     def now() -> Primitives:
         return model
 
-    up = _up(header) if dataset is None else dataset.up
+    middle = torch.from_numpy(Subject.middle_of(model))
+    up, center = _fact(header, "up", torch.tensor([0.0, 0.0, 1.0])), _fact(header, "center", middle)
+    if dataset is not None:
+        up, center = dataset.up, dataset.center
     x, y, z = (float(value) for value in up)
-    return Subject(run_dir.resolve().name, task, now, channels, config.renderer, background, (x, y, z), dataset, read_front(run_dir, tell))
+    own = (task, now, channels, config.renderer, background, (x, y, z), np.asarray(center.double().numpy()))
+    return Subject(run_dir.resolve().name, *own, dataset=dataset, front=read_front(run_dir, tell))
 
 
-def _up(header: object) -> torch.Tensor:
-    """What the model's header says; +z where it says nothing."""
-    facts = header.get("data") if isinstance(header, dict) else None
-    if not isinstance(facts, dict) or "up" not in facts:
-        return torch.tensor([0.0, 0.0, 1.0])
-    return Record(facts, "the model's header: data").array("up", (3,), "3 numbers")
+def _fact(header: Mapping[str, Any], name: str, otherwise: torch.Tensor) -> torch.Tensor:
+    """(3,) what the model's header says of its scene, where it does.
+
+    Raises:
+        DataError: it is something else than three numbers.
+    """
+    facts = header.get("data")
+    if not isinstance(facts, dict) or name not in facts:
+        return otherwise
+    return Record(facts, "the model's header: data").array(name, (3,), "3 numbers")
 
 
 def view_run(

@@ -92,11 +92,11 @@ class ConditionControls:
         try:
             self._set(spec, self._read(spec, text)[0])
         except NeuprimError as error:
-            self.session.failed(error)
+            self.session.say(str(error))  # it may not be typed to its end yet
 
     def _read(self, spec: ConditionSpec, text: str) -> list[Tensor]:
         """Raises ConfigError as a command would."""
-        return [value.float() for value in read_conditions([spec], {spec.name: text}, self.session.tell)[spec.name]]
+        return [value.float() for value in read_conditions([spec], {spec.name: text}, self.session.say)[spec.name]]
 
     def _set(self, spec: ConditionSpec, value: Tensor) -> None:
         if not torch.equal(value, self._value(spec)):
@@ -110,6 +110,7 @@ class ConditionControls:
             if len(values) == 1:
                 values = self._read(spec, spec.sweep) if spec.sweep else values
         except NeuprimError as error:
+            box.value = False
             self.session.failed(error)
             return
         turn = 0

@@ -14,7 +14,7 @@ __all__ = ["HeldOutControls"]
 
 _NONE = "none"
 _WIDE = 320
-"""Pixels of a panel, about."""
+"""Pixels that half a panel has at least, on screens of twice the usual number."""
 
 
 class HeldOutControls:
@@ -23,14 +23,13 @@ class HeldOutControls:
     def __init__(self, session: Session, jumped: Callable[[], None]) -> None:
         self.session, self._jumped = session, jumped
         self._names = session.subject.view_names()
-        self._truth: Any = None
-        self._drawn: Any = None
+        self._image: Any = None
         gui = session.client.gui
         if not self._names:
             return
         self._choice = gui.add_dropdown("held-out view", [_NONE, *self._names], initial_value=_NONE)
         self._choice.on_update(lambda _: self._chosen(self._choice.value))
-        self._folder = gui.add_folder("ground truth, and the model", visible=False)
+        self._folder = gui.add_folder("held-out view", visible=False)
         session.watchers.append(self._again)
 
     def _chosen(self, name: str) -> None:
@@ -53,18 +52,17 @@ class HeldOutControls:
 
     def _compare(self, name: str) -> None:
         found = self.session.subject.compare(name)
-        if self._truth is None:
+        image = np.concatenate([_large(found.truth), _large(found.drawn)], axis=1)
+        if self._image is None:
             gui = self.session.client.gui
             with self._folder:
-                self._truth = gui.add_image(_large(found.truth), label="ground truth", format="jpeg", jpeg_quality=95)
-                self._drawn = gui.add_image(_large(found.drawn), label="model", format="jpeg", jpeg_quality=95)
+                self._image = gui.add_image(image, label="ground truth, and the model", format="jpeg", jpeg_quality=95)
                 self._psnr = gui.add_text("PSNR", "", disabled=True)
-        self._truth.image, self._drawn.image = _large(found.truth), _large(found.drawn)
-        self._psnr.value = f"{found.psnr:.2f} dB"
+        self._image.image, self._psnr.value = image, f"{found.psnr:.2f} dB"
         self._folder.visible = True
 
 
 def _large(image: np.ndarray) -> np.ndarray:
-    """A small image with every pixel repeated, so that the panel shows it as wide as it can."""
+    """A small image with every pixel repeated, so that half of the panel shows it as wide as it can."""
     times = max(_WIDE // image.shape[1], 1)
     return image.repeat(times, 0).repeat(times, 1)

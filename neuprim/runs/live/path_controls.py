@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from neuprim.core.conditions import flag
-from neuprim.core.errors import NeuprimError
+from neuprim.core.errors import ConfigError
 from neuprim.runs.live.film import film, free_name
 from neuprim.runs.live.path import CameraPath, Key, condition_texts
 from neuprim.runs.live.session import Session
@@ -26,6 +27,7 @@ class PathControls:
     def __init__(self, session: Session, run_dir: Path) -> None:
         self.session, self.run_dir, self.path = session, run_dir, CameraPath()
         self._marks: list[Any] = []
+        self._filming = threading.Lock()
         gui = session.client.gui
         self._keys = gui.add_dropdown("key", [_NONE], initial_value=_NONE)
         edit = gui.add_button_group("keys", ["add", "set", "remove", "clear"])
@@ -46,11 +48,11 @@ class PathControls:
         self._play.on_update(lambda _: self._guarded(self._preview) if self._play.value else None)
 
     def _guarded(self, do: Any) -> None:
-        """What the user may be told is told, and nothing else is swallowed."""
+        """What fails is said in the page."""
         try:
             self.path.seconds, self.path.fps = float(self._seconds.value), float(self._fps.value)
             do()
-        except (NeuprimError, OSError) as error:
+        except Exception as error:  # viser's thread would only print it
             self.session.failed(error)
 
     # ------------------------------------------------------------ keys
@@ -103,13 +105,17 @@ class PathControls:
         aspect = self._size.value[0] / self._size.value[1]
         self._marks = [
             scene.add_camera_frustum(
-                f"/path/{i}", key.pose.fov, aspect, size, color=(255, 160, 60), wxyz=key.pose.wxyz, position=key.pose.position
+                f"/path/{i}", key.pose.fov, aspect, scale=size, color=(255, 160, 60), wxyz=key.pose.wxyz, position=key.pose.position
             )
             for i, key in enumerate(keys)
         ]
         if len(keys) > 1:
             way = np.stack([pose.position for pose in self.path.poses(20 * len(keys))])
-            self._marks.append(scene.add_line_segments("/path/way", np.stack([way[:-1], way[1:]], 1), (255, 160, 60), line_width=2.0))
+            self._marks.append(
+                scene.add_line_segments(
+                    "/path/way", np.stack([way[:-1], way[1:]], 1), (255, 160, 60), thickness=2.0, thickness_units="screen"
+                )
+            )
 
     # ------------------------------------------------------------ what comes of them
 
@@ -152,6 +158,14 @@ class PathControls:
         self._written()
 
     def _film(self) -> None:
+        if not self._filming.acquire(blocking=False):
+            raise ConfigError("a film is being drawn; wait for it")
+        try:
+            self._draw_film()
+        finally:
+            self._filming.release()
+
+    def _draw_film(self) -> None:
         file, texts = self._written()
         out = film(
             self.run_dir, file, texts, str(self._format.value), self.path.fps, lambda text, done: self.session.say(f"{text}, {done:.0%}")

@@ -22,7 +22,7 @@ class PrimitiveControls:
     def __init__(self, session: Session) -> None:
         self.session = session
         gui, scene = session.client.gui, session.client.scene
-        self._ball = unit_sphere(1)
+        self._ball = unit_sphere(2)
         self._drawn: list[Any] = []
         self._mark: Any = None
         self._how = gui.add_dropdown("ellipsoids", [_NONE, _WIRE, _SOLID], initial_value=_NONE)

@@ -66,4 +66,4 @@ class RenderControls:
             words = tuple((self._words.value if self._words is not None else "").split())
             self.session.set_settings(replace(self.session.subject.settings, **values), words)
         except NeuprimError as error:
-            self.session.failed(error)
+            self.session.say(str(error))  # words may not be typed to their end yet

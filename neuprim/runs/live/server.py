@@ -65,6 +65,7 @@ class PageServer:
             )
         self._no_tunnels()
         self.viser.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="large")
+        self.viser.scene.configure_environment_map(hdri=None)  # ellipsoids in their own colours
         self.viser.gui.main_panel.dock_right()  # beside the picture, not over it
         self.address = gate.address(settings.host, port)
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, get_args
 
 from neuprim.core.errors import NeuprimError
-from neuprim.core.settings import RenderSettings, SortOrder
+from neuprim.core.settings import SortOrder
 from neuprim.runs.live.frame import quantities
 from neuprim.runs.live.session import LONGEST, Session
 
@@ -23,6 +23,7 @@ class RenderControls:
 
     def __init__(self, session: Session, words: bool) -> None:
         self.session = session
+        self._values: dict[str, Any] = {}
         gui = session.client.gui
         shows = gui.add_dropdown("show", quantities(session.subject.channels), initial_value=session.shows)
         shows.on_update(lambda _: self._show(shows.value))
@@ -44,8 +45,10 @@ class RenderControls:
                 names = [_AS_SET, *(" ".join(point) for point, _ in front)]
                 chosen = gui.add_dropdown("measured", names, initial_value=_AS_SET, hint="the front that `neuprim tradeoff` found")
                 chosen.on_update(lambda _: self._choose("" if chosen.value == _AS_SET else chosen.value))
-            for control in (*self._inputs.values(), *([self._words] if self._words is not None else [])):
-                control.on_update(lambda _: self._changed())
+            for name, control in self._inputs.items():
+                control.on_update(lambda event, name=name: self._set(name, event.target.value))
+            if self._words is not None:
+                self._words.on_update(lambda _: self._changed())
 
     def _show(self, quantity: str) -> None:
         self.session.shows = quantity
@@ -59,11 +62,14 @@ class RenderControls:
         assert self._words is not None
         self._words.value = words
 
+    def _set(self, name: str, value: Any) -> None:
+        """A setting; the others keep numbers that a page would have rounded."""
+        self._values[name] = type(getattr(self.session.subject.settings, name))(value)
+        self._changed()
+
     def _changed(self) -> None:
-        kinds = {field.name: type(getattr(RenderSettings(), field.name)) for field in fields(RenderSettings)}
-        values = {name: kinds[name](control.value) for name, control in self._inputs.items()}
         try:
             words = tuple((self._words.value if self._words is not None else "").split())
-            self.session.set_settings(replace(self.session.subject.settings, **values), words)
+            self.session.set_settings(replace(self.session.subject.settings, **self._values), words)
         except NeuprimError as error:
             self.session.say(str(error))  # words may not be typed to their end yet

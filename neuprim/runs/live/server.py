@@ -57,24 +57,27 @@ class PageServer:
         port = _free_port(settings.host, settings.port)
         with contextlib.redirect_stdout(io.StringIO()), gate.before_viser():
             self.viser = viser.ViserServer(host=settings.host, port=port, label=title, verbose=False)
-        if not gate.stands or self.viser.get_port() != port:
+        if not (gate.stands and self.viser.get_port() == port and self._tunnels_off()):
             self.close()
             raise BackendUnavailable(
                 f"viser {viser.__version__} did not start behind the check of its visitors, or not on port {port}; "
                 "pip install -c constraints.txt 'neuprim[viewer]' has a version that does"
             )
-        self._no_tunnels()
         self.viser.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="large")
         self.viser.scene.configure_environment_map(hdri=None)  # ellipsoids in their own colours
         self.viser.gui.main_panel.dock_right()  # beside the picture, not over it
         self.address = gate.address(settings.host, port)
 
-    def _no_tunnels(self) -> None:
-        """viser can be asked by a page to pass itself on through a server elsewhere; here it cannot."""
-        from viser import _messages
+    def _tunnels_off(self) -> bool:
+        """viser can be asked by a page to pass itself on through a server elsewhere; afterwards it cannot. Whether that is certain."""
+        try:
+            from viser import _messages
 
-        for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
-            self.viser._websock_server.unregister_handler(kind)
+            for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
+                self.viser._websock_server.unregister_handler(kind)
+        except (ImportError, AttributeError, AssertionError):  # another viser than those that are known
+            return False
+        return True
 
     def on_visit(self, come: Callable[[Any], None], gone: Callable[[Any], None]) -> None:
         """Be told of every page that is opened and closed, as a ``viser.ClientHandle``."""

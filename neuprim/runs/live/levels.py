@@ -103,11 +103,10 @@ class Levels:
         return self.all[0]
 
     def seconds(self, level: Level, pixels: int) -> float | None:
-        """What a picture will take, by its own pace or another level's; None where nothing was drawn yet."""
-        known = level if level.pace is not None else next((other for other in reversed(self.all) if other.pace is not None), None)
-        if known is None or known.pace is None:
-            return None
-        return known.pace * pixels * level.ratio / known.ratio
+        """What a picture will take: by its own pace where that is known, else the least that other levels' paces promise, as what a picture
+        takes whatever its level would count several times; None where nothing was drawn yet."""
+        known = [level] if level.pace is not None else [other for other in self.all if other.pace is not None]
+        return min((other.pace * pixels * level.ratio / other.ratio for other in known if other.pace is not None), default=None)
 
     def within(self, seconds: float, pixels: int) -> Level:
         """The best level whose picture of a window of so many pixels takes no longer, else the cheapest one."""

@@ -105,7 +105,15 @@ class PathControls:
         aspect = self._size.value[0] / self._size.value[1]
         self._marks = [
             scene.add_camera_frustum(
-                f"/path/{i}", key.pose.fov, aspect, scale=size, color=(255, 160, 60), wxyz=key.pose.wxyz, position=key.pose.position
+                f"/path/{i}",
+                key.pose.fov,
+                aspect,
+                scale=size,
+                thickness=2.0,
+                thickness_units="screen",
+                color=(255, 160, 60),
+                wxyz=key.pose.wxyz,
+                position=key.pose.position,
             )
             for i, key in enumerate(keys)
         ]

@@ -13,7 +13,7 @@ from neuprim.runs.live.session import Session
 __all__ = ["PrimitiveControls"]
 
 _NONE, _WIRE, _SOLID = "none", "wire", "solid"
-_MOST, _FIRST = 20_000, 2_000
+_MOST, _FIRST = 20_000, 1_000
 
 
 class PrimitiveControls:
@@ -22,7 +22,7 @@ class PrimitiveControls:
     def __init__(self, session: Session) -> None:
         self.session = session
         gui, scene = session.client.gui, session.client.scene
-        self._ball = unit_sphere(2)
+        self._balls = {False: unit_sphere(1), True: unit_sphere(2)}  # of many, and of one
         self._drawn: list[Any] = []
         self._mark: Any = None
         self._how = gui.add_dropdown("ellipsoids", [_NONE, _WIRE, _SOLID], initial_value=_NONE)
@@ -85,7 +85,7 @@ class PrimitiveControls:
             self._mark = self._add("/chosen", found, wire=True)
 
     def _add(self, name: str, found: Ellipsoids, wire: bool) -> Any:
-        points, faces = self._ball
+        points, faces = self._balls[len(found.rows) == 1]
         return self.session.client.scene.add_batched_meshes_simple(
             name,
             points.astype(np.float32),

@@ -64,7 +64,9 @@ class PageServer:
                 "pip install -c constraints.txt 'neuprim[viewer]' has a version that does"
             )
         self.viser.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="large")
-        self.viser.scene.configure_environment_map(hdri=None)  # ellipsoids in their own colours
+        self.viser.scene.configure_environment_map(hdri=None)  # ellipsoids nearly in their own colours, and not darker below
+        self.viser.scene.configure_default_lights(cast_shadow=False)
+        self.viser.scene.add_light_ambient("/light", intensity=1.0)
         self.viser.gui.main_panel.dock_right()  # beside the picture, not over it
         self.address = gate.address(settings.host, port)
 

@@ -79,6 +79,9 @@ def test_levels_without_a_front_are_resolutions(model: Primitives) -> None:
     assert levels.within(0.05, 100_000) is levels.all[-1], "the cheapest, where none is fast enough"
     levels.took(levels.full, 0.04, 1000)
     assert levels.within(0.05, 1000) is levels.full, "its own pace counts where it is known"
+    levels.took(levels.all[-1], 0.03, 1000)
+    levels.full.pace = 0.08 / 1000
+    assert levels.within(0.05, 1000) is levels.all[1], "a slow start of every picture does not rule out what lies between"
 
 
 def test_levels_are_the_front_that_was_measured(model: Primitives, tmp_path: Path) -> None:

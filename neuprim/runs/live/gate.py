@@ -21,11 +21,11 @@ __all__ = ["Gate"]
 _HOST = re.compile(r"[A-Za-z0-9.\-]+(:\d+)?|\[[0-9A-Fa-f:.]+\](:\d+)?")
 
 _POLICY = (
-    "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
+    "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
     "connect-src 'self' ws://{host} data: blob:; worker-src 'self' blob:; frame-ancestors 'none'; form-action 'none'; base-uri 'none'"
 )
-"""The page loads nothing from elsewhere and is in nobody's frame; viser's client is one inline script with WebAssembly in it; what it would run of a
-text, such as code in Markdown, does not run."""
+"""The page loads nothing from elsewhere and is in nobody's frame. viser's client is one inline script whose WebAssembly makes its functions of
+texts, which takes 'unsafe-eval'."""
 
 
 class Gate:

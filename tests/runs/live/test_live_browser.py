@@ -57,16 +57,12 @@ class Tab:
         self.page, self.faults, self.elsewhere = page, [], []
         own = address.partition("?")[0]
         page.on("pageerror", lambda error: self.faults.append(str(error)))
-        page.on("console", lambda message: self._console(message.text) if message.type == "error" else None)
+        page.on("console", lambda message: self.faults.append(message.text) if message.type == "error" else None)
         page.on("dialog", lambda dialog: self.faults.append(f"dialog: {dialog.message}"))
         page.on(
             "request", lambda asked: self.elsewhere.append(asked.url) if not asked.url.startswith((own, f"blob:{own}", "data:")) else None
         )
         page.goto(address)
-
-    def _console(self, text: str) -> None:
-        if "'unsafe-eval' is not an allowed source of script" not in text:  # viser's client tries, and does without where it may not
-            self.faults.append(text)
 
     def picture(self) -> np.ndarray:
         """(H, W, 3) int of the part of the window that no panel covers."""

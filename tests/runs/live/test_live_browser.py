@@ -151,11 +151,13 @@ def test_a_person_looks_at_a_run(address: str, chromium: Any) -> None:
         page.get_by_label("choose by a click").click()
         where = np.argwhere(np.abs(seen - seen[0, 0]).max(-1) > 60)  # something that is not background
         y, x = where[len(where) // 2]
-        page.mouse.click(int(x) + 20, int(y) + 160)
-        tab.until(
-            lambda: "semi-axes" in str(page.evaluate("[...document.querySelectorAll('textarea')].map(e => e.value).join()")),
-            "its parameters",
-        )
+
+        def described() -> bool:  # the page listens to clicks a moment after the box was ticked
+            page.mouse.click(int(x) + 20, int(y) + 160)
+            page.wait_for_timeout(500)
+            return "semi-axes" in str(page.evaluate("[...document.querySelectorAll('textarea')].map(e => e.value).join()"))
+
+        tab.until(described, "its parameters")
         assert page.evaluate("document.body.innerText").count(HOSTILE) == 1, "the run's name is text"
         assert tab.faults == [] and tab.elsewhere == []
 

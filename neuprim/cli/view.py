@@ -7,12 +7,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuprim.config.viewer import LOOPBACK, ViewerSettings
 from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from neuprim.cli.progress import RunProgress
     from neuprim.config import RunConfig
+    from neuprim.config.viewer import ViewerSettings
 
 __all__ = ["for_view", "run_viewed", "view"]
 
@@ -21,18 +21,17 @@ def for_view(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments."""
     parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
     parser.add_argument("--port", type=_port, default=8080, metavar="N", help="of the page's address; 0 for any (default: 8080)")
-    parser.add_argument(
-        "--host", default=LOOPBACK, metavar="ADDRESS", help=f"to listen on (default: {LOOPBACK}, which this machine alone reaches)"
-    )
+    parser.add_argument("--host", metavar="ADDRESS", help="to listen on (default: 127.0.0.1, which this machine alone reaches)")
 
 
 def view(args: argparse.Namespace) -> int:
     """Shows the run until Ctrl-C."""
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import LineProgress
+    from neuprim.config.viewer import ViewerSettings
     from neuprim.runs.live.view import view_run
 
-    settings = ViewerSettings(args.host, args.port)
+    settings = ViewerSettings(port=args.port) if args.host is None else ViewerSettings(args.host, args.port)
     _warn_of_others(settings)
     console = plain_console(stderr=True)
 
@@ -59,6 +58,7 @@ def run_viewed(config: RunConfig, events: RunProgress, settings: ViewerSettings)
 
 def _warn_of_others(settings: ViewerSettings) -> None:
     """A page that others can reach is worth a word."""
+    from neuprim.config.viewer import LOOPBACK
     from neuprim.runs.live.server import is_loopback
 
     if is_loopback(settings.host):

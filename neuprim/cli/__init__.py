@@ -22,12 +22,14 @@ from neuprim.cli.operating_words import DRAWN, OPERATING, operating_words
 from neuprim.cli.prune import for_prune, prune
 from neuprim.cli.run_help import COMMON_KEYS, EXAMPLES
 from neuprim.cli.tradeoff import FORMS, for_tradeoff, of_words, tradeoff
+from neuprim.cli.view import for_view, run_viewed, view
 from neuprim.core.errors import DISK, ConfigError, NeuprimError, nearest
 from neuprim.core.notices import warnings_as_lines
 from neuprim.version import __version__
 
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
+    from neuprim.config.viewer import ViewerSettings
     from neuprim.core.task import TaskSpec
 
 __all__ = ["main"]
@@ -153,6 +155,8 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
     )
     arguments.for_inspect(inspect)
 
+    for_view(command("view", _view, "look at a run in the browser: turn it, play it, move its light, edit a camera path"))
+
     vdb = command("vdb", _vdb, "look into OpenVDB files", "`info` lists grids: type, transform, bounds, active voxels, values, memory.")
     vdb.add_argument("action", choices=("info",), metavar="info", help="what to do")
     vdb.add_argument("path", type=Path, metavar="FILE|DIR", help="a .vdb file, or a folder of frames")
@@ -177,9 +181,13 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
 def _run(args: argparse.Namespace) -> int:
     from neuprim.config import compose, compose_all
     from neuprim.config.target import target_words
+    from neuprim.config.viewer import viewer_words
 
     check = not args.cfg
-    wanted, words = target_words(args.overrides)
+    viewer, words = viewer_words(args.overrides)
+    wanted, words = target_words(words)
+    if viewer is not None and (args.multirun or wanted is not None):
+        raise ConfigError(f"viewer=true: shows one run; expected no {'-m' if args.multirun else 'target'} beside it")
     if wanted is not None and args.multirun:
         raise ConfigError(f"{wanted[0]}: a target is for one run; expected no -m beside it")
     configs = compose_all(words, check) if args.multirun else [compose(words, check)]
@@ -193,7 +201,7 @@ def _run(args: argparse.Namespace) -> int:
 
         return fit_target(configs[0], *wanted, args.overrides)
     if len(configs) == 1:
-        print(_fit(configs[0], args.overrides))
+        print(_fit(configs[0], args.overrides, viewer))
         return 0
     failed = 0
     for number, config in enumerate(configs, 1):
@@ -206,7 +214,7 @@ def _run(args: argparse.Namespace) -> int:
     return 2 if failed else 0
 
 
-def _fit(config: RunConfig, words: list[str]) -> Path:
+def _fit(config: RunConfig, words: list[str], viewer: ViewerSettings | None = None) -> Path:
     """The run's directory; an interruption says where it is and what goes on with it, or with the sweep that ``words`` began."""
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import RunProgress
@@ -214,7 +222,7 @@ def _fit(config: RunConfig, words: list[str]) -> Path:
 
     try:
         with RunProgress(plain_console(stderr=True), f"{config.task}/{config.scene_name}") as events:
-            return run(config, events)
+            return run(config, events) if viewer is None else run_viewed(config, events, viewer)
     except KeyboardInterrupt:
         from neuprim.config.overrides import resuming
 
@@ -311,6 +319,11 @@ def _inspect(args: argparse.Namespace) -> int:
     for path in inspect_run(Request(run_dir, names or ["volume"], args.conditions, args.grid, box, **more), print_notes):
         print(path)
     return 0
+
+
+def _view(args: argparse.Namespace) -> int:
+    _run_directory(args.run_dir)
+    return view(args)
 
 
 def _vdb(args: argparse.Namespace) -> int:

@@ -16,6 +16,7 @@ commonest keys:
   renderer.backend=auto|NAME           `neuprim doctor` lists them
   renderer.sort=center|entry           renderer.samples=N (rays per pixel side) renderer.threads=N
   seed=N
+  viewer=true viewer.port=N            look at the model in the browser while it is trained; pause, step, save, stop
   target.psnr=DB budget=10m            the smallest model that has it, searched and trained in that time; also target.ssim=S,
                                        with target.megabytes=M and target.fps=F as limits, or these alone: the best within them
 `neuprim run task=NAME scene=NAME --cfg` shows every key with its value. A value that contains , = or brackets is quoted

@@ -6,7 +6,7 @@ import json
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
@@ -27,13 +27,26 @@ from neuprim.runs.curve import open_curve
 from neuprim.runs.events import Events, Note, Preparing, silent
 from neuprim.runs.fit import Fitted, compile_kernels, one_torch_thread, start, steps
 
-__all__ = ["COMPILING", "make_ready", "save", "train"]
+__all__ = ["COMPILING", "Between", "alone", "make_ready", "save", "train"]
+
+Between = Callable[[Fitted, threading.Event], None]
+"""Called on the training's thread before its first step and after every one, with what is trained and the event that ends the training as
+Ctrl-C does. It may look at the state, save it and wait, and must not change it."""
 
 COMPILING = "compiling kernels, once per installation (about a minute)"
 
 
+def alone(fitted: Fitted, stop: threading.Event) -> None:
+    """Nobody is there between two steps."""
+
+
 def train(
-    config: RunConfig, suspects: Suspects, events: Events = silent, dataset: Dataset | None = None, hold_out: int = 0
+    config: RunConfig,
+    suspects: Suspects,
+    events: Events = silent,
+    dataset: Dataset | None = None,
+    hold_out: int = 0,
+    between: Between = alone,
 ) -> tuple[Fitted, bool]:
     """Train until the budget is used or Ctrl-C, which finishes the step; leaves configuration, curve, checkpoint and model in the run's
     directory either way.
@@ -42,6 +55,7 @@ def train(
         suspects: of the configuration, who is watched for crashes around this call.
         dataset: the scene of the configuration, if it is loaded already.
         hold_out: n > 1: every n-th training view is a test view, and no other is; see :func:`~neuprim.core.data.held_out.held_out`.
+        between: called between steps, see :data:`Between`.
 
     Returns:
         what was trained, and whether Ctrl-C ended it.
@@ -59,7 +73,7 @@ def train(
         if kernels.running:
             events(Preparing(COMPILING))
             kernels.wait()
-        return fitted, _train(fitted, events)
+        return fitted, _train(fitted, events, between)
 
 
 def make_ready(trainer: Trainer, events: Events = silent) -> None:
@@ -87,7 +101,7 @@ def _resume(fitted: Fitted, events: Events) -> None:
     events(Note(f"resumed at step {fitted.trainer.step}"))
 
 
-def _train(fitted: Fitted, events: Events) -> bool:
+def _train(fitted: Fitted, events: Events, between: Between) -> bool:
     """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
     trainer, config = fitted.trainer, fitted.config
     make_ready(trainer, events)
@@ -95,6 +109,7 @@ def _train(fitted: Fitted, events: Events) -> bool:
     last_saved = time.monotonic()
     interrupted = False
     with _interruptible() as stop, curve, one_torch_thread():
+        between(fitted, stop)
         for report, held_out in steps(trainer, events):
             line: dict[str, Any] = {}
             if held_out is not None:
@@ -108,6 +123,7 @@ def _train(fitted: Fitted, events: Events) -> bool:
             if time.monotonic() - last_saved > config.train.checkpoint_every_seconds:
                 save(fitted)
                 last_saved = time.monotonic()
+            between(fitted, stop)
             if stop.is_set():
                 interrupted = True
                 break

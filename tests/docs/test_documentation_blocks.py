@@ -19,6 +19,7 @@ from neuprim.cli.operating_words import DRAWN, operating_words
 from neuprim.cli.tradeoff import of_words
 from neuprim.config import compose, compose_all
 from neuprim.config.target import target_words
+from neuprim.config.viewer import viewer_words
 from neuprim.core.cameras.file import read_cameras
 from neuprim.core.conditions import read_conditions, split_words
 from neuprim.core.data.check import check_dataset
@@ -193,6 +194,7 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
         rest += args.overrides
         settings = [word for word in rest if not word.startswith("-")]
         rest = [word for word in rest if word.startswith("-")]
+        _, settings = viewer_words(settings)
         _, settings = target_words(settings)
         (compose_all if args.multirun else compose)(settings, False)
     if args.command == "bench":
@@ -234,6 +236,7 @@ def test_commands(block: Block, conditions: list[ConditionSpec], tmp_path: Path,
         "neuprim run task=static scene=solid",
         "neuprim run -m task=static model.neurons=0,99",
         "neuprim run task=static --cgf",
+        "neuprim run task=static viewer.prot=80",
         "neuprim tradeoff task=static budget=5m model.primitive=3",
         "neuprim tradeoff task=static --seed 3",
         "neuprim render RUN_DIR --camera orbit --sise 3x3",

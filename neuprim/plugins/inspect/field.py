@@ -20,7 +20,7 @@ from neuprim.core.model.primitives import Living, Primitives
 from neuprim.core.volumes.grid import density_grid
 from neuprim.plugins.inspect.layers import Scale
 
-__all__ = ["FieldFrame", "ViewOptions"]
+__all__ = ["FieldFrame", "ViewOptions", "absorbed"]
 
 
 @dataclass(frozen=True)
@@ -147,15 +147,8 @@ class FieldFrame:
 
     @cached_property
     def masses(self) -> np.ndarray:
-        """(M,) float64 what each living primitive absorbs in all: its clamped extinction times its volume, from 33 points inside."""
-        geometry = self.geometry
-        every = torch.arange(geometry.count)
-        total = torch.zeros(len(every))
-        with torch.no_grad():
-            for u in _ball():
-                x = geometry.means + (geometry.rotations @ (geometry.scales * u)[..., None])[..., 0]
-                total += self.living.sigma(every, x).clamp_min(0)
-        return np.asarray((total / len(_ball()) * geometry.scales.prod(1) * 4.18879).double().numpy())
+        """(M,) float64 what each living primitive absorbs in all, see :func:`absorbed`."""
+        return absorbed(self.living)
 
     @cached_property
     def colours(self) -> np.ndarray:
@@ -190,6 +183,18 @@ class FieldFrame:
         if not len(found):
             raise ConfigError(f"--primitive {wanted}: it absorbs nothing at {self.title}; choose another one or another frame")
         return int(found[0])
+
+
+def absorbed(living: Living) -> np.ndarray:
+    """(M,) float64 what each living primitive absorbs in all: its clamped extinction times its volume, from 33 points inside."""
+    geometry = living.geometry
+    every = torch.arange(geometry.count)
+    total = torch.zeros(len(every))
+    with torch.no_grad():
+        for u in _ball():
+            x = geometry.means + (geometry.rotations @ (geometry.scales * u)[..., None])[..., 0]
+            total += living.sigma(every, x).clamp_min(0)
+    return np.asarray((total / len(_ball()) * geometry.scales.prod(1) * 4.18879).double().numpy())
 
 
 def _ball() -> Tensor:

@@ -1,0 +1,61 @@
+"""The words that ask for a viewer beside a training: ``viewer=true viewer.port=8080``.
+
+They say nothing about the run itself, so they are taken out of the words after ``neuprim run`` here and no file keeps them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+from neuprim.config.overrides import parse, swept_keys
+from neuprim.core.checked import Range, checked, converted, text
+from neuprim.core.errors import ConfigError, nearest
+
+__all__ = ["LOOPBACK", "ViewerSettings", "is_viewer_word", "viewer_words"]
+
+LOOPBACK = "127.0.0.1"
+
+
+@dataclass(frozen=True)
+class ViewerSettings:
+    """Where a viewer listens.
+
+    Attributes:
+        host: an address of this machine; the default is reached from this machine alone.
+        port: 0 for any that is free.
+    """
+
+    host: Annotated[str, text("an address of this machine")] = LOOPBACK
+    port: Annotated[int, Range(0, 65535, says="a port, 1 to 65535, or 0 for any")] = 8080
+
+
+def viewer_words(words: Sequence[str]) -> tuple[ViewerSettings | None, list[str]]:
+    """The viewer that is asked for, None for none, and the other words. A word about its host or port asks for it, too.
+
+    Raises:
+        ConfigError: no such setting, several values, or an impossible one.
+    """
+    own = [word for word in words if is_viewer_word(word)]
+    for key in swept_keys(own):
+        raise ConfigError(f"{key}: several values; expected one")
+    wanted, given = bool(own), {}
+    for assignment in parse(own):
+        head, dot, name = assignment.key.partition(".")
+        if not dot:
+            wanted = converted(assignment.value, bool, "viewer")
+        else:
+            names = [field.name for field in dataclasses.fields(ViewerSettings)]
+            if name not in names:
+                raise ConfigError(f"{assignment.key}: no such setting{nearest(name, names, prefix=f'{head}.')}")
+            given[name] = assignment.value
+    settings = checked(ViewerSettings, given, "viewer")
+    return (settings if wanted else None), [word for word in words if not is_viewer_word(word)]
+
+
+def is_viewer_word(word: str) -> bool:
+    """Whether a word is about the viewer."""
+    key = word.partition("=")[0].strip().lstrip("+")
+    return key == "viewer" or key.startswith("viewer.")

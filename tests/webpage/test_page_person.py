@@ -82,6 +82,31 @@ def test_turning_zooming_and_panning_move_the_picture(still_page: Path, chromium
         assert tab.faults == []
 
 
+def test_one_finger_turns_and_two_come_nearer(still_page: Path, chromium: Any) -> None:
+    with open_tab(chromium, still_page) as tab:
+        screen = tab.page.context.new_cdp_session(tab.page)
+
+        def touch(kind: str, *points: tuple[int, int]) -> None:
+            fingers = [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(points)]
+            screen.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": fingers})
+
+        def now() -> tuple[float, list[float]]:
+            tab.settled()
+            return tab.page.evaluate("[look.now.distance, look.now.R]")
+
+        away, turned = now()
+        touch("touchStart", (300, 250))
+        touch("touchMove", (360, 270))
+        touch("touchEnd")
+        assert now()[0] == away and now()[1] != turned
+        turned = now()[1]
+        touch("touchStart", (300, 250), (400, 250))
+        touch("touchMove", (250, 250), (450, 250))
+        touch("touchEnd")
+        assert now()[0] == pytest.approx(away / 2, rel=0.05) and now()[1] == turned, "twice as far apart, half as far away"
+        assert tab.faults == []
+
+
 def test_every_mode_shows_something_else(still_page: Path, chromium: Any) -> None:
     with open_tab(chromium, still_page) as tab:
         seen = []

@@ -22,7 +22,7 @@ from neuprim.cli.operating_words import DRAWN, OPERATING, operating_words
 from neuprim.cli.prune import for_prune, prune
 from neuprim.cli.run_help import COMMON_KEYS, EXAMPLES
 from neuprim.cli.tradeoff import FORMS, for_tradeoff, of_words, tradeoff
-from neuprim.core.errors import DISK, ConfigError, NeuprimError, nearest
+from neuprim.core.errors import ConfigError, NeuprimError, nearest, one_line
 from neuprim.core.notices import warnings_as_lines
 from neuprim.version import __version__
 
@@ -46,19 +46,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with warnings_as_lines():
             return _dispatch(words)
-    except NeuprimError as error:
-        print(f"neuprim: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt as stop:
         print(f"neuprim: interrupted{stop}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # `neuprim tasks | head`; the interpreter's own flush at exit must not fail either
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except OSError as error:
-        if error.errno not in DISK:
+    except (NeuprimError, OSError) as error:
+        line = one_line(error)
+        if line is None:
             raise
-        print(f"neuprim: error: {error.filename or 'writing'}: {error.strerror}", file=sys.stderr)
+        print(f"neuprim: error: {line}", file=sys.stderr)
         return 2
     except SystemExit as stop:  # argparse, after --help and --version
         return stop.code if isinstance(stop.code, int) else 0
@@ -176,10 +174,12 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
 
 def _run(args: argparse.Namespace) -> int:
     from neuprim.config import compose, compose_all
+    from neuprim.config.launcher import launcher_words
     from neuprim.config.target import target_words
 
     check = not args.cfg
-    wanted, words = target_words(args.overrides)
+    launcher, words = launcher_words(args.overrides)
+    wanted, words = target_words(words)
     if wanted is not None and args.multirun:
         raise ConfigError(f"{wanted[0]}: a target is for one run; expected no -m beside it")
     configs = compose_all(words, check) if args.multirun else [compose(words, check)]
@@ -192,22 +192,20 @@ def _run(args: argparse.Namespace) -> int:
         from neuprim.cli.target import fit_target
 
         return fit_target(configs[0], *wanted, args.overrides)
-    if len(configs) == 1:
-        print(_fit(configs[0], args.overrides))
-        return 0
-    failed = 0
-    for number, config in enumerate(configs, 1):
-        print(f"[{number}/{len(configs)}] {config.output_dir}", flush=True)
-        try:
-            print(_fit(config, args.overrides), flush=True)
-        except NeuprimError as error:  # the other combinations are still worth having
-            failed += 1
-            print(f"neuprim: error: {config.output_dir}: {' '.join(str(error).split())}", file=sys.stderr)
-    return 2 if failed else 0
+    if len(configs) > 1:
+        from neuprim.cli.sweep import sweep
+
+        return sweep(configs, words, launcher, args.overrides)
+    if launcher.given() != {"name": "inline"}:
+        from neuprim.cli.sweep import launch_one
+
+        return launch_one(configs[0], launcher, args.overrides)
+    print(_fit(configs[0], args.overrides))
+    return 0
 
 
 def _fit(config: RunConfig, words: list[str]) -> Path:
-    """The run's directory; an interruption says where it is and what goes on with it, or with the sweep that ``words`` began."""
+    """The run's directory; an interruption says where it is and what goes on with it."""
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import RunProgress
     from neuprim.runs.run import run

@@ -11,7 +11,7 @@ from typing import Any
 
 from neuprim.core.errors import ConfigError
 
-__all__ = ["Assignment", "assigned", "expand_sweep", "parse", "resuming", "sweep_names", "swept_keys", "word"]
+__all__ = ["Assignment", "assigned", "expand_sweep", "parse", "resuming", "sweep_names", "swept_keys", "without_place", "word"]
 
 NOT_SWEPT = ("output_dir", "resume")
 MAX_RUNS = 10_000
@@ -98,9 +98,18 @@ def word(key: str, value: Any) -> str:
 
 def resuming(overrides: Sequence[str], directory: Path) -> list[str]:
     """The words after ``neuprim run`` that go on with what ``overrides`` began: a run in ``directory``, or the sweep it is a part of."""
-    kept = [word for word in overrides if word.partition("=")[0].strip().lstrip("+") not in NOT_SWEPT]
     sweep = bool(swept_keys(overrides))
-    return [*(["-m"] if sweep else []), *kept, assigned("output_dir", str(directory.parent if sweep else directory)), "resume=true"]
+    return [
+        *(["-m"] if sweep else []),
+        *without_place(overrides),
+        assigned("output_dir", str(directory.parent if sweep else directory)),
+        "resume=true",
+    ]
+
+
+def without_place(overrides: Iterable[str]) -> list[str]:
+    """The words that say what is made, and not where or whether it goes on."""
+    return [word for word in overrides if word.partition("=")[0].strip().lstrip("+") not in NOT_SWEPT]
 
 
 def swept_keys(overrides: Iterable[str]) -> list[str]:

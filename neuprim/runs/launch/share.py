@@ -1,0 +1,28 @@
+"""How many runs at once, and how many threads each: cores are shared out, and never promised twice."""
+
+from __future__ import annotations
+
+from neuprim.config.launcher import LauncherSettings
+from neuprim.core.compute.threads import machine_cores
+from neuprim.core.errors import ConfigError
+
+__all__ = ["shared_out"]
+
+
+def shared_out(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
+    """(runs at once, threads of each) on this machine.
+
+    Raises:
+        ConfigError: together they would be more than the cores of this machine.
+    """
+    cores, workers, threads = machine_cores(), settings.workers, settings.threads
+    if workers is None:
+        workers = max(min(jobs, cores // (threads or 1)), 1)
+    if threads is None:
+        threads = max(cores // workers, 1)
+    if workers * threads > cores:
+        found = f"launcher.workers={workers}" + (f" with launcher.threads={threads}" if threads > 1 else "")
+        raise ConfigError(
+            f"{found}: more than the {cores} core{'s' * (cores > 1)} of this machine; expected {cores} threads together at most"
+        )
+    return workers, threads

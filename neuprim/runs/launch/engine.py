@@ -49,6 +49,9 @@ class Engine(Protocol):
     def result(self, handle: Any) -> Result:
         """Of a handle that is done. Raises WorkerDied."""
 
+    def cancel(self, handle: Any) -> None:
+        """Let go of a task that may not have begun yet; it is done soon."""
+
     def close(self, now: bool) -> None:
         """Let go of everything; ``now``: what still works is killed."""
 
@@ -79,6 +82,9 @@ def through(engine: Engine, jobs: Sequence[Job], folder: Path, retries: int, hea
                 if stopped.is_set() and not stop.exists():
                     stop.touch()
                     waiting.clear()
+                    for handle, task in working.values():
+                        if not task.status.exists():  # it waits in the engine's own queue
+                            engine.cancel(handle)
                 while waiting and len(working) < engine.workers:
                     number, task = waiting.popleft()
                     task.status.unlink(missing_ok=True)

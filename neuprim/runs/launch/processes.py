@@ -76,6 +76,9 @@ class Processes:
         self._idle.append(handle.pool)
         return result
 
+    def cancel(self, handle: _Handle) -> None:
+        """Every task has begun: it sees by itself that it shall stop."""
+
     def close(self, now: bool) -> None:
         for pool in self._busy if now else []:
             for process in list((pool.executor._processes or {}).values()):

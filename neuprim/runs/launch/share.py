@@ -21,8 +21,9 @@ def shared_out(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
     if threads is None:
         threads = max(cores // workers, 1)
     if workers * threads > cores:
-        found = f"launcher.workers={workers}" + (f" with launcher.threads={threads}" if threads > 1 else "")
+        said = {name: value for name, value in (("workers", settings.workers), ("threads", settings.threads)) if value is not None}
+        found = " with ".join(f"launcher.{name}={value}" for name, value in said.items())
         raise ConfigError(
-            f"{found}: more than the {cores} core{'s' * (cores > 1)} of this machine; expected {cores} threads together at most"
+            f"{found}: more than the {cores} core{'s' * (cores > 1)} of this machine; expected at most {cores} threads together"
         )
     return workers, threads

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from neuprim.config.launcher import LauncherSettings
-from neuprim.core.errors import BackendUnavailable
+from neuprim.core.errors import BackendUnavailable, NeuprimError
 from neuprim.runs.events import Events, silent
 from neuprim.runs.launch.engine import Engine, Hear, through
 from neuprim.runs.launch.inline import inline
@@ -99,4 +100,10 @@ def launch(
         return inline(jobs, settings.threads, hear, also)
     if not jobs:
         return []
-    return through(_ENGINES[settings.name].make(settings, len(jobs), folder), jobs, folder, settings.retries, hear)
+    try:
+        engine = _ENGINES[settings.name].make(settings, len(jobs), folder)
+    except NeuprimError:
+        with suppress(OSError):  # there is none
+            folder.rmdir()
+        raise
+    return through(engine, jobs, folder, settings.retries, hear)

@@ -56,7 +56,6 @@ def sweep_run(
     check_launcher(settings, len(todo))
     results: list[Result | None] = [Result("done", str(config.output_dir)) for config in configs]
     with held(folder, "sweep"):
-        record.write(folder)
         for number in set(range(len(configs))) - set(todo):
             hear(number, Status("done", "kept"))
         keeper = _Keeper(record, folder, [record.rows[n] for n in todo], lambda n, status: hear(todo[n], status))
@@ -78,8 +77,12 @@ class _Keeper:
 
     def __init__(self, record: SweepRecord, folder: Path, rows: Sequence[Row], hear: Callable[[int, Status], None]) -> None:
         self._record, self._folder, self._rows, self._hear = record, folder, rows, hear
+        self._written = False
 
     def __call__(self, number: int, status: Status) -> None:
+        if not self._written:  # with the first sign of life, so that a launcher that is refused leaves nothing
+            self._record.write(self._folder)
+            self._written = True
         if status.state in ENDED:
             row = replace(self._rows[number], state=status.state, line=status.text, seconds=status.seconds, attempts=status.attempt + 1)
             self._record = self._record.put(row)

@@ -28,6 +28,7 @@ from neuprim.version import __version__
 
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
+    from neuprim.config.overrides import Typed
     from neuprim.core.task import TaskSpec
 
 __all__ = ["main"]
@@ -105,6 +106,9 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
     run = command("run", _run, "fit a scene", "\n\n".join([COMMON_KEYS, *([_task_names()] if with_tasks else []), EXAMPLES]))
     run.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings, in Hydra's grammar")
     run.add_argument("-m", "--multirun", action="store_true", help="run every combination of values separated by commas")
+    run.add_argument(
+        "--config", type=Path, metavar="FILE", help="start with the settings of RUN_DIR/config.yaml; words beside it come first"
+    )
     run.add_argument("--cfg", action="store_true", help="print the resolved configuration and stop")
 
     evaluate = command("eval", _eval, "measure a run on its test views", OPERATING)
@@ -173,16 +177,18 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
 
 
 def _run(args: argparse.Namespace) -> int:
-    from neuprim.config import compose, compose_all
+    from neuprim.config import compose, compose_all, stored_config
     from neuprim.config.launcher import launcher_words
+    from neuprim.config.overrides import Typed
     from neuprim.config.target import target_words
 
-    check = not args.cfg
+    check, typed = not args.cfg, Typed(args.overrides, args.config)
     launcher, words = launcher_words(args.overrides)
     wanted, words = target_words(words)
     if wanted is not None and args.multirun:
         raise ConfigError(f"{wanted[0]}: a target is for one run; expected no -m beside it")
-    configs = compose_all(words, check) if args.multirun else [compose(words, check)]
+    stored = None if args.config is None else stored_config(args.config)
+    configs = compose_all(words, check, stored) if args.multirun else [compose(words, check, stored)]
     if args.cfg:
         if wanted is not None:
             print(f"# {wanted[0]} budget={wanted[1]:g}s; the search starts from")
@@ -191,20 +197,20 @@ def _run(args: argparse.Namespace) -> int:
     if wanted is not None:
         from neuprim.cli.target import fit_target
 
-        return fit_target(configs[0], *wanted, args.overrides)
+        return fit_target(configs[0], *wanted, typed)
     if len(configs) > 1:
         from neuprim.cli.sweep import sweep
 
-        return sweep(configs, words, launcher, args.overrides)
+        return sweep(configs, words, launcher, typed)
     if launcher.given() != {"name": "inline"}:
         from neuprim.cli.sweep import launch_one
 
-        return launch_one(configs[0], launcher, args.overrides)
-    print(_fit(configs[0], args.overrides))
+        return launch_one(configs[0], launcher, typed)
+    print(_fit(configs[0], typed))
     return 0
 
 
-def _fit(config: RunConfig, words: list[str]) -> Path:
+def _fit(config: RunConfig, typed: Typed) -> Path:
     """The run's directory; an interruption says where it is and what goes on with it."""
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import RunProgress
@@ -214,10 +220,8 @@ def _fit(config: RunConfig, words: list[str]) -> Path:
         with RunProgress(plain_console(stderr=True), f"{config.task}/{config.scene_name}") as events:
             return run(config, events)
     except KeyboardInterrupt:
-        from neuprim.config.overrides import resuming
-
         there = "has the run up to here" if (config.output_dir / "checkpoint.safetensors").exists() else "has no checkpoint yet"
-        command = shlex.join(["neuprim", "run", *resuming(words, config.output_dir)])
+        command = shlex.join(["neuprim", "run", *typed.resuming(config.output_dir)])
         raise KeyboardInterrupt(f"; {config.output_dir} {there}; to go on:\n  {command}") from None
 
 

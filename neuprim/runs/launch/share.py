@@ -6,7 +6,7 @@ from neuprim.config.launcher import LauncherSettings
 from neuprim.core.compute.threads import machine_cores
 from neuprim.core.errors import ConfigError
 
-__all__ = ["shared_out"]
+__all__ = ["at_once", "shared_out"]
 
 
 def shared_out(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
@@ -27,3 +27,15 @@ def shared_out(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
             f"{found}: more than the {cores} core{'s' * (cores > 1)} of this machine; expected at most {cores} threads together"
         )
     return workers, threads
+
+
+def at_once(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
+    """(runs at once, threads of each, 0 for all) that a search may count on; raises as :func:`shared_out`.
+
+    What a cluster has at a given time nobody knows: there it is what the user says, else as many as this machine has cores, with one thread.
+    """
+    if settings.name == "inline":
+        return 1, settings.threads or 0
+    if settings.name == "processes" or (settings.address in (None, "local") and settings.name != "slurm"):
+        return shared_out(settings, jobs)
+    return min(settings.workers or machine_cores(), jobs), settings.threads or 1

@@ -197,7 +197,7 @@ def _run(args: argparse.Namespace) -> int:
     if wanted is not None:
         from neuprim.cli.target import fit_target
 
-        return fit_target(configs[0], *wanted, typed)
+        return fit_target(configs[0], *wanted, launcher, typed)
     if len(configs) > 1:
         from neuprim.cli.sweep import sweep
 

@@ -10,6 +10,7 @@ from rich.console import Console
 from neuprim.cli.console import plain_console
 from neuprim.cli.progress import RunProgress
 from neuprim.config import RunConfig
+from neuprim.config.launcher import LauncherSettings
 from neuprim.config.overrides import Typed
 from neuprim.config.target import Target
 from neuprim.runs.events import Event, Note, Step
@@ -30,12 +31,12 @@ class _Searching(RunProgress):
             self._stage = ""
 
 
-def fit_target(config: RunConfig, target: Target, budget: float, typed: Typed) -> int:
+def fit_target(config: RunConfig, target: Target, budget: float, launcher: LauncherSettings, typed: Typed) -> int:
     """Search and train; prints what was achieved and the run's directory."""
     console = plain_console(stderr=True)
     try:
         with _Searching(console, f"{config.task}/{config.scene_name}") as events:
-            record = target_run(config, target, budget, events)
+            record = target_run(config, target, budget, events, launcher=launcher)
     except KeyboardInterrupt:
         command = shlex.join(["neuprim", "run", *typed.resuming(config.output_dir)])
         raise KeyboardInterrupt(f"; {config.output_dir} has the trials up to here; to go on:\n  {command}") from None

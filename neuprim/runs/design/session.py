@@ -138,7 +138,7 @@ class Session:
 
     def with_paces(self, wanted: Sequence[Variant]) -> list[Variant]:
         """Those whose pace could be found in time, and that are models of their own; the others are left out."""
-        with sharing(self._threads):  # as those who train will have
+        with sharing(self._threads):  # as the trainings will have
             return self._with_paces(wanted)
 
     def _with_paces(self, wanted: Sequence[Variant]) -> list[Variant]:

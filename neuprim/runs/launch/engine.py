@@ -14,10 +14,13 @@ from neuprim.runs.launch.jobs import Job, Result
 from neuprim.runs.launch.status import Status, read_status
 from neuprim.runs.launch.worker import Task, environment
 
-__all__ = ["Engine", "Hear", "WorkerDied", "finished", "through"]
+__all__ = ["Ended", "Engine", "Hear", "WorkerDied", "finished", "through"]
 
 Hear = Callable[[int, Status], None]
 """Told the number of a job and its status."""
+
+Ended = Callable[[int, Result], None]
+"""Told the number of a job and how it ended."""
 
 _EVERY = 0.1
 """Seconds between two looks at what is done."""
@@ -56,7 +59,7 @@ class Engine(Protocol):
         """Let go of everything; ``now``: what still works is killed."""
 
 
-def through(engine: Engine, jobs: Sequence[Job], folder: Path, retries: int, hear: Hear) -> list[Result | None]:
+def through(engine: Engine, jobs: Sequence[Job], folder: Path, retries: int, hear: Hear, ended: Ended) -> list[Result | None]:
     """Results in the order of the jobs; None of those that were not begun when Ctrl-C came.
 
     The first Ctrl-C has every run finish its step and write its checkpoint; the second ends their processes.
@@ -101,6 +104,7 @@ def through(engine: Engine, jobs: Sequence[Job], folder: Path, retries: int, hea
                         waiting.appendleft((number, outcome))
                         continue
                     results[number] = outcome
+                    ended(number, outcome)
                     watch.tell(number, finished(read_status(task.status) or Status(), outcome))
                 time.sleep(_EVERY)
         clean = True

@@ -25,7 +25,7 @@ class Job:
         name: unique among those launched together, and good as a file's name.
         call: ``module:function``, which is called with ``data``, the number of times that its worker died before, and a listener of events.
             From the second time on it should go on where it was left.
-        data: plain values: numbers, texts, lists, dictionaries, paths. Objects of plugins are named, not sent.
+        data: values that another process can have: numbers, texts, lists, dictionaries, paths. Objects of plugins are named, not sent.
     """
 
     name: str

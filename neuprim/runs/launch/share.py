@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
+
 from neuprim.config.launcher import LauncherSettings
-from neuprim.core.compute.threads import machine_cores
+from neuprim.core.compute.threads import machine_cores, sharing
 from neuprim.core.errors import ConfigError
 
-__all__ = ["at_once", "shared_out"]
+__all__ = ["at_once", "own_share", "shared_out"]
 
 
 def shared_out(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
@@ -36,6 +38,12 @@ def at_once(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
     """
     if settings.name == "inline":
         return 1, settings.threads or 0
-    if settings.name == "processes" or (settings.address in (None, "local") and settings.name != "slurm"):
+    here = {"processes": (None,), "ray": (None, "local"), "slurm": ("local",)}[settings.name]
+    if settings.address in here:
         return shared_out(settings, jobs)
     return min(settings.workers or machine_cores(), jobs), settings.threads or 1
+
+
+def own_share(settings: LauncherSettings) -> AbstractContextManager[None]:
+    """Inside, this process has the threads that runs in it shall have; all, where they work elsewhere."""
+    return sharing(settings.threads or 0) if settings.name == "inline" else nullcontext()

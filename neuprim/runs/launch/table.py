@@ -10,8 +10,7 @@ from pathlib import Path
 
 from neuprim.config.launcher import LauncherSettings
 from neuprim.core.errors import BackendUnavailable, NeuprimError
-from neuprim.runs.events import Events, silent
-from neuprim.runs.launch.engine import Engine, Hear, through
+from neuprim.runs.launch.engine import Ended, Engine, Hear, through
 from neuprim.runs.launch.inline import inline
 from neuprim.runs.launch.jobs import Job, Result
 from neuprim.runs.launch.processes import Processes
@@ -76,8 +75,12 @@ def nobody(number: int, status: Status) -> None:
     """Nobody listens."""
 
 
+def kept_for_later(number: int, result: Result) -> None:
+    """Results are looked at when all are there."""
+
+
 def launch(
-    jobs: Sequence[Job], settings: LauncherSettings, folder: Path, hear: Hear = nobody, also: Events = silent
+    jobs: Sequence[Job], settings: LauncherSettings, folder: Path, hear: Hear = nobody, ended: Ended = kept_for_later
 ) -> list[Result | None]:
     """Have every job done.
 
@@ -86,7 +89,7 @@ def launch(
     Args:
         folder: where launcher and workers meet; every worker sees it under this path. It is gone afterwards, unless workers printed something.
         hear: told (number of a job, its status) whenever there is something new.
-        also: told the events themselves, of jobs in this process.
+        ended: told (number of a job, its result) once it is over, before ``hear`` is.
 
     Returns:
         results in the order of the jobs; None of those that Ctrl-C came before.
@@ -97,7 +100,7 @@ def launch(
     """
     check_launcher(settings, len(jobs))
     if settings.name == "inline":
-        return inline(jobs, settings.threads, hear, also)
+        return inline(jobs, settings, hear, ended)
     if not jobs:
         return []
     try:
@@ -106,4 +109,4 @@ def launch(
         with suppress(OSError):  # there is none
             folder.rmdir()
         raise
-    return through(engine, jobs, folder, settings.retries, hear)
+    return through(engine, jobs, folder, settings.retries, hear, ended)

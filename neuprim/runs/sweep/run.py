@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,10 +11,9 @@ from neuprim.config import RunConfig
 from neuprim.config.launcher import LauncherSettings
 from neuprim.config.overrides import parse, swept_keys, without_place
 from neuprim.report.sweep import write_sweep
-from neuprim.runs.events import Events, silent
 from neuprim.runs.launch.engine import Hear
 from neuprim.runs.launch.jobs import Result
-from neuprim.runs.launch.status import ENDED, Status
+from neuprim.runs.launch.status import Status
 from neuprim.runs.launch.table import FOLDER, check_launcher, launch, nobody
 from neuprim.runs.lock import held
 from neuprim.runs.open import model_file
@@ -29,7 +29,6 @@ def sweep_run(
     words: Sequence[str],
     settings: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
     hear: Hear = nobody,
-    also: Events = silent,
 ) -> tuple[SweepRecord, list[Result | None]]:
     """Fit all configurations of a sweep, each in its own directory, and compare them.
 
@@ -39,7 +38,6 @@ def sweep_run(
         configs: as :func:`~neuprim.config.compose_all` gives them, all in one directory.
         words: what the sweep was asked for.
         hear: told (place in ``configs``, status) whenever there is something new; once of each run that is kept.
-        also: told the events themselves, of runs in this process.
 
     Returns:
         the record, and a result for each configuration; None of those that Ctrl-C came before.
@@ -58,13 +56,20 @@ def sweep_run(
     with held(folder, "sweep"):
         for number in set(range(len(configs))) - set(todo):
             hear(number, Status("done", "kept"))
-        keeper = _Keeper(record, folder, [record.rows[n] for n in todo], lambda n, status: hear(todo[n], status))
-        found = launch([job_of(configs[n]) for n in todo], settings, folder / FOLDER, keeper, also)
-        for number, result in zip(todo, found, strict=True):
-            results[number] = result
-            if result is not None:
-                row = record.rows[number]
-                record = record.put(replace(row, state=result.state, line=result.line, seconds=result.seconds, attempts=result.attempts))
+        keeper = _Keeper(record, folder)
+
+        def heard(number: int, status: Status) -> None:
+            keeper.begin()
+            hear(todo[number], status)
+
+        def ended(number: int, result: Result) -> None:
+            results[todo[number]] = result
+            keeper.put(todo[number], result)
+
+        for number in todo:
+            results[number] = None
+        launch([job_of(configs[n]) for n in todo], settings, folder / FOLDER, heard, ended)
+        record = keeper.record
         record.write(folder)
         rows = sweep_rows(folder, record)
         write_csv(folder / "sweep.csv", rows)
@@ -75,19 +80,21 @@ def sweep_run(
 class _Keeper:
     """Keeps the record on disk up to date as runs end, so that a launcher that is killed loses nothing."""
 
-    def __init__(self, record: SweepRecord, folder: Path, rows: Sequence[Row], hear: Callable[[int, Status], None]) -> None:
-        self._record, self._folder, self._rows, self._hear = record, folder, rows, hear
-        self._written = False
+    def __init__(self, record: SweepRecord, folder: Path) -> None:
+        self.record, self._folder, self._begun = record, folder, False
 
-    def __call__(self, number: int, status: Status) -> None:
-        if not self._written:  # with the first sign of life, so that a launcher that is refused leaves nothing
-            self._record.write(self._folder)
-            self._written = True
-        if status.state in ENDED:
-            row = replace(self._rows[number], state=status.state, line=status.text, seconds=status.seconds, attempts=status.attempt + 1)
-            self._record = self._record.put(row)
-            self._record.write(self._folder)
-        self._hear(number, status)
+    def begin(self) -> None:
+        """With the first sign of life: a launcher that is refused leaves nothing."""
+        if not self._begun:
+            self._begun = True
+            self.record.write(self._folder)
+
+    def put(self, number: int, result: Result) -> None:
+        """How a run ended."""
+        row = self.record.rows[number]
+        self.record = self.record.put(replace(row, state=result.state, line=result.line, seconds=result.seconds, attempts=result.attempts))
+        with suppress(OSError):  # a full disk must not end the other runs; it is written again at the end, where that is told
+            self.record.write(self._folder)
 
 
 def _row(config: RunConfig, words: Sequence[str]) -> Row:

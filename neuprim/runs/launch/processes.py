@@ -5,7 +5,6 @@ Every worker is a pool of its own with one process (concurrent.futures): when th
 
 from __future__ import annotations
 
-import _thread
 import itertools
 import multiprocessing
 import os
@@ -21,7 +20,7 @@ from pathlib import Path
 
 from neuprim.runs.launch.engine import WorkerDied
 from neuprim.runs.launch.jobs import Result
-from neuprim.runs.launch.worker import Task, at_work, environment
+from neuprim.runs.launch.worker import Task, at_work, environment, interrupt
 
 __all__ = ["Processes"]
 
@@ -124,7 +123,7 @@ def _orphaned() -> None:
     assert parent is not None
     parent.join()
     if at_work():
-        _thread.interrupt_main()
+        interrupt()
     late = time.monotonic() + _GRACE
     while at_work() and time.monotonic() < late:
         time.sleep(0.1)

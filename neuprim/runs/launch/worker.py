@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import _thread
 import os
+import signal
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from neuprim.runs.launch.jobs import Job, Result
     from neuprim.runs.launch.status import Listener
 
-__all__ = ["PASSED_ON", "THREADS", "Task", "at_work", "environment"]
+__all__ = ["PASSED_ON", "THREADS", "Task", "at_work", "environment", "interrupt"]
 
 PASSED_ON = ("NEUPRIM_CACHE_DIR", "NUMBA_CACHE_DIR")
 """Variables that a worker has from its launcher, as a cluster may not hand them on."""
@@ -39,6 +40,15 @@ _working = threading.Event()
 def at_work() -> bool:
     """Whether this process has a task."""
     return _working.is_set()
+
+
+def interrupt() -> None:
+    """As Ctrl-C in this process, called beside its main thread: a run finishes its step and writes a checkpoint."""
+    main = threading.main_thread().ident
+    if hasattr(signal, "pthread_kill") and main is not None:
+        signal.pthread_kill(main, signal.SIGINT)  # which also wakes it where it waits
+    else:
+        _thread.interrupt_main()
 
 
 def environment(threads: int) -> dict[str, str]:
@@ -122,4 +132,4 @@ class _Attendant:
             looks += 1
             if not asked and self._task.stop.exists():
                 asked = True
-                _thread.interrupt_main()  # as Ctrl-C there: a run finishes its step and writes a checkpoint
+                interrupt()

@@ -179,7 +179,7 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
 def _run(args: argparse.Namespace) -> int:
     from neuprim.config import compose, compose_all, stored_config
     from neuprim.config.launcher import launcher_words
-    from neuprim.config.overrides import Typed
+    from neuprim.config.overrides import Typed, without_place
     from neuprim.config.target import target_words
 
     check, typed = not args.cfg, Typed(args.overrides, args.config)
@@ -187,6 +187,10 @@ def _run(args: argparse.Namespace) -> int:
     wanted, words = target_words(words)
     if wanted is not None and args.multirun:
         raise ConfigError(f"{wanted[0]}: a target is for one run; expected no -m beside it")
+    if args.multirun and not without_place(words):
+        from neuprim.runs.sweep.record import begun_words
+
+        words = begun_words(words)
     stored = None if args.config is None else stored_config(args.config)
     configs = compose_all(words, check, stored) if args.multirun else [compose(words, check, stored)]
     if args.cfg:

@@ -7,10 +7,11 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from neuprim.config.overrides import parse
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.files import read_json, write_json
 
-__all__ = ["FILE", "Row", "SweepRecord", "read_sweep"]
+__all__ = ["FILE", "Row", "SweepRecord", "begun_words", "read_sweep"]
 
 FILE = "sweep.json"
 """Of a sweep's directory."""
@@ -96,6 +97,21 @@ def read_sweep(folder: Path) -> SweepRecord | None:
         return SweepRecord(_texts(data["words"]), tuple(_row(run) for run in data["runs"]))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{file}: not {_WHAT} ({type(error).__name__}: {error}); {_INSTEAD}") from error
+
+
+def begun_words(words: Sequence[str]) -> list[str]:
+    """The words that a sweep was begun with, and these, which say no more than its directory and that it goes on.
+
+    Raises:
+        ConfigError: there is no sweep.
+    """
+    given = {a.key: a.value for a in parse(words)}
+    where = given.get("output_dir")
+    before = None if where is None or given.get("resume") is not True else read_sweep(Path(str(where)).expanduser())
+    if before is None:
+        said = " ".join(words) or "nothing"
+        raise ConfigError(f"{said}: no values to sweep; expected KEY=A,B,C, or output_dir=DIR resume=true of a sweep ({FILE} in it)")
+    return [*before.words, *words]
 
 
 def _row(run: Mapping[str, Any]) -> Row:

@@ -64,7 +64,7 @@ def test_what_comes_back_and_what_stays(tmp_path: Path) -> None:
     log = Path(often.line.rpartition("it printed ")[2])
     assert log.parent == folder and "about to die" in log.read_text()
     assert {p.suffix for p in folder.iterdir()} == {".log"}, "nothing else is left"
-    last = {n: s for n, s in heard}
+    last = dict(heard)
     assert [last[n].state for n in range(7)] == states(results) and last[5].attempt == 1
 
 

@@ -18,6 +18,8 @@ from neuprim.cli import _parsers
 from neuprim.cli.operating_words import DRAWN, operating_words
 from neuprim.cli.tradeoff import of_words
 from neuprim.config import compose, compose_all
+from neuprim.config.launcher import launcher_words
+from neuprim.config.overrides import without_place
 from neuprim.config.target import target_words
 from neuprim.core.cameras.file import read_cameras
 from neuprim.core.conditions import read_conditions, split_words
@@ -193,7 +195,10 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
         rest += args.overrides
         settings = [word for word in rest if not word.startswith("-")]
         rest = [word for word in rest if word.startswith("-")]
+        _, settings = launcher_words(settings)
         _, settings = target_words(settings)
+        if (args.multirun and not without_place(settings)) or args.config is not None:
+            settings = ["task=static", *settings]  # the others are in a file
         (compose_all if args.multirun else compose)(settings, False)
     if args.command == "bench":
         rest += args.overrides
@@ -201,7 +206,7 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
         rest = [word for word in rest if word.startswith("-")]
     if args.command == "tradeoff" and of_words(args.run_dir):
         typed = [word for word in (args.run_dir, *rest) if not word.startswith(("-", "budget="))]
-        compose(typed, False)
+        compose(launcher_words(typed)[1], False)
         rest = [word for word in rest if word.startswith("-")]
     elif args.command in DRAWN:
         _, rest = operating_words(rest)

@@ -62,6 +62,14 @@ def doze(data: float, attempt: int, events: Events) -> float:
     return data
 
 
+def toil(data: float, attempt: int, events: Events) -> None:
+    """Busy for so many seconds, as a training is."""
+    events(Preparing("at it"))
+    late = time.monotonic() + data
+    while time.monotonic() < late:
+        time.sleep(0.01)
+
+
 def fit_and_die(data: Mapping[str, Any], attempt: int, events: Events) -> str:
     """A run whose worker is killed in a phase, the first time; without film."""
     neuprim.runs.finish._ORBIT_FRAMES = 2

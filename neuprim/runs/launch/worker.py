@@ -42,13 +42,24 @@ def at_work() -> bool:
     return _working.is_set()
 
 
-def interrupt() -> None:
-    """As Ctrl-C in this process, called beside its main thread: a run finishes its step and writes a checkpoint."""
+def interrupt(blocked: bool = False) -> None:
+    """As Ctrl-C in this process, called beside its main thread: a run finishes its step and writes a checkpoint.
+
+    Args:
+        blocked: whether the main thread lets no such signal through, as Ray has it; then what it waits for is waited for.
+    """
     main = threading.main_thread().ident
-    if hasattr(signal, "pthread_kill") and main is not None:
+    if hasattr(signal, "pthread_kill") and main is not None and not blocked:
         signal.pthread_kill(main, signal.SIGINT)  # which also wakes it where it waits
     else:
         _thread.interrupt_main()
+
+
+def _can_be_stopped() -> bool:
+    """In the main thread: whether it lets Ctrl-C through. A process whose parent ignored it, as in the background of a script, heeds it again."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    return not (hasattr(signal, "pthread_sigmask") and signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()))
 
 
 def environment(threads: int) -> dict[str, str]:
@@ -104,7 +115,7 @@ class _Attendant:
 
     def __init__(self, task: Task, listener: Listener) -> None:
         self._task, self._listener = task, listener
-        self._over = threading.Event()
+        self._over, self._blocked = threading.Event(), not _can_be_stopped()
         self._thread = threading.Thread(target=self._attend, name="attendant", daemon=True)
 
     def __enter__(self) -> Self:
@@ -132,4 +143,4 @@ class _Attendant:
             looks += 1
             if not asked and self._task.stop.exists():
                 asked = True
-                interrupt()
+                interrupt(self._blocked)

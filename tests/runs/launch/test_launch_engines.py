@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -71,6 +73,20 @@ def all_sorts(settings: LauncherSettings, folder: Path) -> None:
 def test_ray_does_all_sorts_of_jobs(ray: Any, tmp_path: Path) -> None:
     all_sorts(LauncherSettings("ray", workers=2), tmp_path / "launch")
     assert not (tmp_path / "launch").exists() and not ray.is_initialized()
+
+
+def test_ctrl_c_reaches_what_ray_has_at_work(ray: Any, tmp_path: Path) -> None:
+    begun = threading.Event()
+
+    def hear(number: int, status: Status) -> None:
+        if status.text == "at it" and not begun.is_set():
+            begun.set()
+            threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+
+    first, second = launch(
+        [job(str(n), launching.toil, 60.0) for n in range(2)], LauncherSettings("ray", workers=1), tmp_path / "launch", hear
+    )
+    assert first is not None and first.state == "interrupted" and second is None
 
 
 def test_ray_that_does_not_answer_is_said_within_seconds(tmp_path: Path) -> None:

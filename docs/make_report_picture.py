@@ -1,6 +1,7 @@
-"""A picture of the top of a run's report, for docs/getting_started.md. Needs Chromium or Chrome on the PATH.
+"""A picture of the top of a run's report, or of another page, for docs/getting_started.md and docs/launching.md. Needs Chromium or Chrome on the PATH.
 
 python docs/make_report_picture.py RUN_DIR docs/pictures/report.png [HEIGHT]
+python docs/make_report_picture.py SWEEP_DIR/sweep.html docs/pictures/sweep.png [HEIGHT]
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ def main(run: Path, target: Path, height: int = 1500) -> None:
     with tempfile.TemporaryDirectory() as folder:
         shot = Path(folder) / "shot.png"
         flags = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--window-size={WIDTH},{height}"]
-        address = (run / "report.html").resolve().as_uri()
+        address = (run if run.is_file() else run / "report.html").resolve().as_uri()
         subprocess.run(
             [browser, *flags, f"--user-data-dir={folder}/user", f"--screenshot={shot}", address], check=True, capture_output=True
         )

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +12,13 @@ from typing import Any
 import torch
 
 from neuprim.config import compose
+from neuprim.config.launcher import LauncherSettings
 from neuprim.core.checkpoint import save_model
 from neuprim.core.train.trainer import Trainer
+from neuprim.runs.events import Events
 from neuprim.runs.fit import Fitted, compile_kernels, complete, start
+from neuprim.runs.launch.jobs import Job, Result
+from neuprim.runs.launch.table import launch
 
 __all__ = ["Trial", "begin", "paces_of", "recorded", "run_all"]
 
@@ -109,15 +111,33 @@ def run_all(
     """Train what ``path`` does not have yet, ``jobs`` at a time, and write it after every one, with what stands ``beside`` the trials."""
     known = {row["trial"] for row in recorded(path)}
     waiting = [trial for trial in trials if trial.name not in known]
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        futures = {pool.submit(train, trial, wanted): trial for trial in waiting}
-        for future in as_completed(futures):
-            row = future.result()
-            path.parent.mkdir(parents=True, exist_ok=True)
-            whole = json.loads(path.read_text()) if path.exists() else {}
-            whole |= {**beside, "trials": sorted([*whole.get("trials", []), row], key=lambda r: r["trial"])}
-            path.write_text(json.dumps(whole, indent=1) + "\n")
-            print(f"{time.strftime('%H:%M')} {row['trial']}: {shown(row)}", flush=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+    def keep(number: int, result: Result) -> None:
+        if result.state != "done":
+            return
+        row, whole = result.value, json.loads(path.read_text()) if path.exists() else {}
+        whole |= {**beside, "trials": sorted([*whole.get("trials", []), row], key=lambda r: r["trial"])}
+        path.write_text(json.dumps(whole, indent=1) + "\n")
+        print(f"{time.strftime('%H:%M')} {row['trial']}: {shown(row)}", flush=True)
+
+    work = [Job(trial.name, f"{__name__}:train_one", (trial, wanted)) for trial in waiting]
+    settings = LauncherSettings("processes", workers=jobs, threads=1)
+    results = launch(work, settings, path.parent / f".{path.stem}-launch", ended=keep)
+    failed = [
+        f"{trial.name}: {result.trace or result.line}"
+        for trial, result in zip(waiting, results, strict=True)
+        if result and result.state == "failed"
+    ]
+    if failed:
+        raise SystemExit("\n".join(failed))
+    if any(result is None or result.state == "interrupted" for result in results):
+        raise KeyboardInterrupt
+
+
+def train_one(data: tuple[Trial, Wanted], attempt: int, events: Events) -> dict[str, Any]:
+    """The function of a job; after its worker died a trial begins anew."""
+    return train(*data)
 
 
 def paces_of(trainers: Mapping[str, Trainer], steps: int = 480) -> dict[str, float]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,14 +21,12 @@ from neuprim.cli.operating_words import DRAWN, OPERATING, operating_words
 from neuprim.cli.prune import for_prune, prune
 from neuprim.cli.run_help import COMMON_KEYS, EXAMPLES
 from neuprim.cli.tradeoff import FORMS, for_tradeoff, of_words, tradeoff
-from neuprim.cli.view import for_view, run_viewed, view
-from neuprim.core.errors import DISK, ConfigError, NeuprimError, nearest
+from neuprim.cli.view import for_view, view
+from neuprim.core.errors import ConfigError, NeuprimError, nearest, one_line
 from neuprim.core.notices import warnings_as_lines
 from neuprim.version import __version__
 
 if TYPE_CHECKING:
-    from neuprim.config import RunConfig
-    from neuprim.config.viewer import ViewerSettings
     from neuprim.core.task import TaskSpec
 
 __all__ = ["main"]
@@ -48,19 +45,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with warnings_as_lines():
             return _dispatch(words)
-    except NeuprimError as error:
-        print(f"neuprim: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt as stop:
         print(f"neuprim: interrupted{stop}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # `neuprim tasks | head`; the interpreter's own flush at exit must not fail either
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except OSError as error:
-        if error.errno not in DISK:
+    except (NeuprimError, OSError) as error:
+        line = one_line(error)
+        if line is None:
             raise
-        print(f"neuprim: error: {error.filename or 'writing'}: {error.strerror}", file=sys.stderr)
+        print(f"neuprim: error: {line}", file=sys.stderr)
         return 2
     except SystemExit as stop:  # argparse, after --help and --version
         return stop.code if isinstance(stop.code, int) else 0
@@ -109,6 +104,9 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
     run = command("run", _run, "fit a scene", "\n\n".join([COMMON_KEYS, *([_task_names()] if with_tasks else []), EXAMPLES]))
     run.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings, in Hydra's grammar")
     run.add_argument("-m", "--multirun", action="store_true", help="run every combination of values separated by commas")
+    run.add_argument(
+        "--config", type=Path, metavar="FILE", help="start with the settings of RUN_DIR/config.yaml; words beside it come first"
+    )
     run.add_argument("--cfg", action="store_true", help="print the resolved configuration and stop")
 
     evaluate = command("eval", _eval, "measure a run on its test views", OPERATING)
@@ -179,18 +177,27 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
 
 
 def _run(args: argparse.Namespace) -> int:
-    from neuprim.config import compose, compose_all
+    from neuprim.config import compose, compose_all, stored_config
+    from neuprim.config.launcher import launcher_words
+    from neuprim.config.overrides import Typed, without_place
     from neuprim.config.target import target_words
     from neuprim.config.viewer import viewer_words
 
-    check = not args.cfg
+    check, typed = not args.cfg, Typed(args.overrides, args.config)
     viewer, words = viewer_words(args.overrides)
+    launcher, words = launcher_words(words)
     wanted, words = target_words(words)
-    if viewer is not None and (args.multirun or wanted is not None):
-        raise ConfigError(f"viewer=true: shows one run; expected no {'-m' if args.multirun else 'target'} beside it")
+    beside = {"-m": args.multirun, "target": wanted is not None, "launcher": launcher.given() != {"name": "inline"}}
+    if viewer is not None and any(beside.values()):
+        raise ConfigError(f"viewer=true: shows one run; expected no {next(word for word, on in beside.items() if on)} beside it")
     if wanted is not None and args.multirun:
         raise ConfigError(f"{wanted[0]}: a target is for one run; expected no -m beside it")
-    configs = compose_all(words, check) if args.multirun else [compose(words, check)]
+    if args.multirun and not without_place(words):
+        from neuprim.runs.sweep.record import begun_words
+
+        words = begun_words(words)
+    stored = None if args.config is None else stored_config(args.config)
+    configs = compose_all(words, check, stored) if args.multirun else [compose(words, check, stored)]
     if args.cfg:
         if wanted is not None:
             print(f"# {wanted[0]} budget={wanted[1]:g}s; the search starts from")
@@ -199,36 +206,19 @@ def _run(args: argparse.Namespace) -> int:
     if wanted is not None:
         from neuprim.cli.target import fit_target
 
-        return fit_target(configs[0], *wanted, args.overrides)
-    if len(configs) == 1:
-        print(_fit(configs[0], args.overrides, viewer))
-        return 0
-    failed = 0
-    for number, config in enumerate(configs, 1):
-        print(f"[{number}/{len(configs)}] {config.output_dir}", flush=True)
-        try:
-            print(_fit(config, args.overrides), flush=True)
-        except NeuprimError as error:  # the other combinations are still worth having
-            failed += 1
-            print(f"neuprim: error: {config.output_dir}: {' '.join(str(error).split())}", file=sys.stderr)
-    return 2 if failed else 0
+        return fit_target(configs[0], *wanted, launcher, typed)
+    if len(configs) > 1:
+        from neuprim.cli.sweep import sweep
 
+        return sweep(configs, words, launcher, typed)
+    if launcher.given() != {"name": "inline"}:
+        from neuprim.cli.sweep import launch_one
 
-def _fit(config: RunConfig, words: list[str], viewer: ViewerSettings | None = None) -> Path:
-    """The run's directory; an interruption says where it is and what goes on with it, or with the sweep that ``words`` began."""
-    from neuprim.cli.console import plain_console
-    from neuprim.cli.progress import RunProgress
-    from neuprim.runs.run import run
+        return launch_one(configs[0], launcher, typed)
+    from neuprim.cli.one_run import one_run
 
-    try:
-        with RunProgress(plain_console(stderr=True), f"{config.task}/{config.scene_name}") as events:
-            return run(config, events) if viewer is None else run_viewed(config, events, viewer)
-    except KeyboardInterrupt:
-        from neuprim.config.overrides import resuming
-
-        there = "has the run up to here" if (config.output_dir / "checkpoint.safetensors").exists() else "has no checkpoint yet"
-        command = shlex.join(["neuprim", "run", *resuming(words, config.output_dir)])
-        raise KeyboardInterrupt(f"; {config.output_dir} {there}; to go on:\n  {command}") from None
+    print(one_run(configs[0], typed, viewer))
+    return 0
 
 
 def _eval(args: argparse.Namespace) -> int:
@@ -348,8 +338,9 @@ def _new_task(args: argparse.Namespace) -> int:
 
 def _bench(args: argparse.Namespace) -> int:
     from neuprim.cli.bench import bench
+    from neuprim.cli.one_run import one_run
 
-    return bench(args, _fit)
+    return bench(args, one_run)
 
 
 def _doctor(args: argparse.Namespace) -> int:

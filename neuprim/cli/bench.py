@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config import RunConfig
+from neuprim.config.overrides import Typed
 from neuprim.core.errors import ConfigError
 from neuprim.runs.open import read_metrics
 from neuprim.runs.paper import Planned, Table, compared, pace, plan, tables
@@ -19,7 +20,7 @@ __all__ = ["bench", "table_numbers"]
 _RULES = "PSNR of floats; SSIM and LPIPS by the rule of 3DGS's tools (ssim_3dgs, lpips_3dgs; metrics.lpips=FILE has your weights of VGG)"
 
 
-def bench(args: argparse.Namespace, fit: Callable[[RunConfig, list[str]], Path]) -> int:
+def bench(args: argparse.Namespace, fit: Callable[[RunConfig, Typed], Path]) -> int:
     """Lists the tables, or runs what stands for their rows.
 
     Args:
@@ -39,7 +40,7 @@ def bench(args: argparse.Namespace, fit: Callable[[RunConfig, list[str]], Path])
     results = []
     for number, one in enumerate(planned, 1):
         print(f"[{number}/{len(planned)}] {one.config.output_dir}", flush=True)
-        results.append((one, read_metrics(fit(one.config, one.config.overrides))))
+        results.append((one, read_metrics(fit(one.config, Typed(one.config.overrides)))))
         print(*_result(*results[-1]), sep="\n", flush=True)
     print(*_means(results), _RULES, sep="\n")
     return 0

@@ -19,6 +19,8 @@ commonest keys:
   viewer=true viewer.port=N            look at the model in the browser while it is trained; pause, step, save, stop
   target.psnr=DB budget=10m            the smallest model that has it, searched and trained in that time; also target.ssim=S,
                                        with target.megabytes=M and target.fps=F as limits, or these alone: the best within them
+  launcher=inline|processes|ray|slurm  where runs work; launcher.workers=N launcher.threads=N launcher.retries=N
+                                       launcher.address=... launcher.options.KEY=VALUE (docs/launching.md)
 `neuprim run task=NAME scene=NAME --cfg` shows every key with its value. A value that contains , = or brackets is quoted
 twice, for the shell and for the grammar: "scene.path='a=b, c'"."""
 
@@ -28,4 +30,5 @@ examples:
   neuprim run task=dynamic scene=vdb scene.vdb=DIR scene.frames=0:100:2
   neuprim run task=static scene=solids
   neuprim run task=static scene=blender scene.path=DIR preset=paper
-  neuprim run -m model.primitives=200,1000 train.max_seconds=60"""
+  neuprim run -m model.primitives=200,1000 train.max_seconds=60 launcher=processes
+  neuprim run --config RUN_DIR/config.yaml seed=1"""

@@ -10,7 +10,8 @@ from rich.console import Console
 from neuprim.cli.console import plain_console
 from neuprim.cli.progress import RunProgress
 from neuprim.config import RunConfig
-from neuprim.config.overrides import resuming
+from neuprim.config.launcher import LauncherSettings
+from neuprim.config.overrides import Typed
 from neuprim.config.target import Target
 from neuprim.runs.events import Event, Note, Step
 from neuprim.runs.target import Record, target_run
@@ -30,14 +31,14 @@ class _Searching(RunProgress):
             self._stage = ""
 
 
-def fit_target(config: RunConfig, target: Target, budget: float, words: list[str]) -> int:
+def fit_target(config: RunConfig, target: Target, budget: float, launcher: LauncherSettings, typed: Typed) -> int:
     """Search and train; prints what was achieved and the run's directory."""
     console = plain_console(stderr=True)
     try:
         with _Searching(console, f"{config.task}/{config.scene_name}") as events:
-            record = target_run(config, target, budget, events)
+            record = target_run(config, target, budget, events, launcher=launcher)
     except KeyboardInterrupt:
-        command = shlex.join(["neuprim", "run", *resuming(words, config.output_dir)])
+        command = shlex.join(["neuprim", "run", *typed.resuming(config.output_dir)])
         raise KeyboardInterrupt(f"; {config.output_dir} has the trials up to here; to go on:\n  {command}") from None
     print_record(record, console)
     print(record.achieved["run_dir"])

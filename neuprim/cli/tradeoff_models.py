@@ -22,6 +22,7 @@ def tradeoff_models(args: argparse.Namespace) -> int:
     """Trains, measures, writes the set's folder and prints the fronts."""
     from neuprim.cli.console import plain_console
     from neuprim.cli.progress import DrawProgress
+    from neuprim.config.launcher import launcher_words
     from neuprim.config.overrides import parse
     from neuprim.runs.design.record import Model, command
     from neuprim.runs.design.run import DesignRequest, design_run
@@ -29,11 +30,12 @@ def tradeoff_models(args: argparse.Namespace) -> int:
 
     words = [args.run_dir, *args.words, *(word for word in args.knobs if "=" in word)]  # after --knobs they look like names
     knobs = [word for word in args.knobs if "=" not in word]
+    launcher, words = launcher_words(words)
     said = [str(a.value) for a in parse(words) if a.key == "budget"]
     if said and args.budget is not None:
         raise ConfigError(f"budget={said[-1]} and --budget {args.budget}: expected one of them")
     budget = seconds_of(said[-1], "budget=") if said else seconds_of(args.budget or _BUDGET)
-    request = DesignRequest(words, budget, args.views, args.repeats, knobs, args.seeds or 1, args.lpips)
+    request = DesignRequest(words, budget, args.views, args.repeats, knobs, args.seeds or 1, args.lpips, launcher)
     try:
         with DrawProgress(plain_console(stderr=True)) as progress:
             folder, record = design_run(request, progress.note, progress.show)

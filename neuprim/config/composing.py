@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 from neuprim.config.declared import check_names, check_preset, check_typed, complete_options, options_of, unused
 from neuprim.config.effort import EFFORT, LEVELS, Level, chosen_level
+from neuprim.config.from_file import chosen_beside, settings_below
 from neuprim.config.groups import check_groups, check_scene, presets, task_choices
 from neuprim.config.outputs import output_directory
-from neuprim.config.overrides import Assignment, expand_sweep, parse, sweep_names, swept_keys
+from neuprim.config.overrides import Assignment, expand_sweep, parse, sweep_names, swept_keys, without_place
 from neuprim.config.record import RunConfig, RunSettings
 from neuprim.config.resuming import not_installed, units_as_begun
 from neuprim.config.schema import REQUIRED, defaults, is_free, like, setting_names
@@ -46,24 +47,27 @@ Files = dict[tuple[str, ...], Any]
 """Hydra's compositions by packages and group, so that a sweep reads each file once."""
 
 
-def compose(overrides: Sequence[str], check_output: bool = True) -> RunConfig:
+def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConfig | None = None) -> RunConfig:
     """The configuration of one run.
 
     Args:
         overrides: ``key=value`` words in Hydra's grammar.
         check_output: refuse an ``output_dir`` that already holds files (unless ``resume=true``).
+        stored: of an earlier run, whose settings stand under the overrides; in a directory of its own.
 
     Raises:
         ConfigError: one line that names the key, what was found and what was expected.
     """
-    return _compose(overrides, check_output, {})
+    return _compose(overrides, check_output, {}, stored)
 
 
-def _compose(overrides: Sequence[str], check_output: bool, files: Files) -> RunConfig:
+def _compose(overrides: Sequence[str], check_output: bool, files: Files, stored: RunConfig | None) -> RunConfig:
     assignments = parse(overrides)
     chosen = {key: _choice(assignments, key) for key in CHOICES}
+    if stored is not None:
+        chosen = chosen_beside(stored, chosen)
     try:
-        return _composed(overrides, assignments, chosen, check_output, files)
+        return _composed(overrides, assignments, chosen, check_output, files, stored)
     except UnknownPlugin as error:
         told = not_installed(assignments, chosen["task"] or DEFAULT_TASK, chosen["scene"])
         if told is None:
@@ -72,7 +76,12 @@ def _compose(overrides: Sequence[str], check_output: bool, files: Files) -> RunC
 
 
 def _composed(
-    overrides: Sequence[str], assignments: Sequence[Assignment], chosen: Mapping[str, str | None], check_output: bool, files: Files
+    overrides: Sequence[str],
+    assignments: Sequence[Assignment],
+    chosen: Mapping[str, str | None],
+    check_output: bool,
+    files: Files,
+    stored: RunConfig | None,
 ) -> RunConfig:
     values = [a for a in assignments if a.key not in CHOICES]
     task_word = chosen["task"] or DEFAULT_TASK
@@ -90,6 +99,8 @@ def _composed(
 
     base, declared_paths = _base(spec, scene_name, preset, own.options, files, package)
     below = () if level is None else level.settings
+    if stored is not None:
+        below = tuple(settings_below(stored, scene_word, values))
     for assignment in (*below, *values):
         _check_key(assignment, base, scene_name)
     plain, full = _merge(base, values, below)
@@ -125,31 +136,34 @@ def _composed(
         resume=settings.resume,
         options=options,
         unused=unused(spec, declared),
-        overrides=list(overrides),
+        overrides=[*([] if stored is None else without_place(stored.overrides)), *overrides],
         non_default={**changed, **_differences(_typed(plain), _typed(full, settings))},
         made_by=MadeBy(__version__, Maker.of(task_info), added, None if loss is None else Maker.of(loss[0])),
     )
 
 
-def compose_all(overrides: Sequence[str], check_output: bool = True) -> list[RunConfig]:
-    """The configurations of a sweep, each in its own sub-directory of one output directory; all are valid before one runs."""
+def compose_all(overrides: Sequence[str], check_output: bool = True, stored: RunConfig | None = None) -> list[RunConfig]:
+    """The configurations of a sweep, each in its own sub-directory of one output directory; all are valid before one runs.
+
+    Arguments and errors are those of :func:`compose`.
+    """
     swept = set(swept_keys(overrides))
     if not swept:
-        return [compose(overrides, check_output)]
+        return [compose(overrides, check_output, stored)]
     combinations = expand_sweep(overrides)
     files: Files = {}
-    configs = [_compose([*c, "output_dir=null"], False, files) for c in combinations]
+    configs = [_compose([*c, "output_dir=null"], False, files, stored) for c in combinations]
     first = configs[0]
     typed = parse(combinations[0])
     words = [(key, _choice(typed, key) or name) for key, name in (("task", first.task), ("scene", first.scene_name))]
     fixed = [_in_path(word) for key, word in words if not swept & {key, "task"}]
     asked = [a.value for a in typed if a.key == "output_dir"]
-    explicit = str(_compose(combinations[0], False, files).output_dir) if asked and asked[-1] is not None else None
+    explicit = str(_compose(combinations[0], False, files, stored).output_dir) if asked and asked[-1] is not None else None
     base = output_directory(explicit, "-".join([*fixed, "sweep"]), first.resume, check_output)
     names = sweep_names(overrides, combinations)
     return [
-        dataclasses.replace(config, output_dir=base / name, overrides=list(combination))
-        for config, name, combination in zip(configs, names, combinations, strict=True)
+        dataclasses.replace(config, output_dir=base / name, overrides=config.overrides[:-1])
+        for config, name in zip(configs, names, strict=True)
     ]
 
 
@@ -256,7 +270,7 @@ def _merge(
         OmegaConf.update(tree, "model.density", {}, merge=False)
     for a in (*below, *values):
         try:
-            OmegaConf.update(tree, a.key, a.value, merge=True, force_add=True)
+            OmegaConf.update(tree, a.key, a.value, merge=not a.whole, force_add=True)
         except (OmegaConfBaseException, ValueError, TypeError, AssertionError) as error:
             raise ConfigError(f"{a.text}: {' '.join(str(error).split())}") from error
     seconds = _said(values, "max_seconds")

@@ -11,7 +11,7 @@ from typing import Any
 
 from neuprim.core.errors import ConfigError
 
-__all__ = ["Assignment", "assigned", "expand_sweep", "parse", "resuming", "sweep_names", "swept_keys", "word"]
+__all__ = ["Assignment", "Typed", "assigned", "expand_sweep", "parse", "sweep_names", "swept_keys", "without_place", "word"]
 
 NOT_SWEPT = ("output_dir", "resume")
 MAX_RUNS = 10_000
@@ -19,11 +19,12 @@ MAX_RUNS = 10_000
 
 @dataclass(frozen=True)
 class Assignment:
-    """One ``key=value``; ``key`` is dotted, ``text`` is what was typed."""
+    """One ``key=value``; ``key`` is dotted, ``text`` is what was typed. ``whole``: a mapping takes the place of what was there, instead of entries of it."""
 
     key: str
     value: Any
     text: str
+    whole: bool = False
 
 
 def parse(overrides: Sequence[str]) -> list[Assignment]:
@@ -96,11 +97,23 @@ def word(key: str, value: Any) -> str:
     return f"{key}={str(value).lower() if isinstance(value, bool) else repr(value)}"
 
 
-def resuming(overrides: Sequence[str], directory: Path) -> list[str]:
-    """The words after ``neuprim run`` that go on with what ``overrides`` began: a run in ``directory``, or the sweep it is a part of."""
-    kept = [word for word in overrides if word.partition("=")[0].strip().lstrip("+") not in NOT_SWEPT]
-    sweep = bool(swept_keys(overrides))
-    return [*(["-m"] if sweep else []), *kept, assigned("output_dir", str(directory.parent if sweep else directory)), "resume=true"]
+@dataclass(frozen=True)
+class Typed:
+    """What was typed after ``neuprim run``: words, and the file of ``--config``."""
+
+    words: Sequence[str]
+    file: Path | None = None
+
+    def resuming(self, directory: Path) -> list[str]:
+        """The words that go on with what these began: a run in ``directory``, or the sweep it is a part of."""
+        sweep = bool(swept_keys(self.words))
+        flags = [*(["-m"] if sweep else []), *([] if self.file is None else ["--config", str(self.file)])]
+        return [*flags, *without_place(self.words), assigned("output_dir", str(directory.parent if sweep else directory)), "resume=true"]
+
+
+def without_place(overrides: Iterable[str]) -> list[str]:
+    """The words that say what is made, and not where or whether it goes on."""
+    return [word for word in overrides if word.partition("=")[0].strip().lstrip("+") not in NOT_SWEPT]
 
 
 def swept_keys(overrides: Iterable[str]) -> list[str]:

@@ -120,12 +120,17 @@ class RunConfig:
             raise CheckpointError(f"{path}: no such run directory")
         data = _read(file)
         try:
-            return cls._from_dict(data)
+            return cls.from_dict(data)
         except ConfigError as error:
             raise ConfigError(f"{file}: {error}") from error
 
     @classmethod
-    def _from_dict(cls, data: Mapping[str, Any]) -> RunConfig:
+    def from_dict(cls, data: Mapping[str, Any]) -> RunConfig:
+        """What :meth:`to_dict` gave.
+
+        Raises:
+            ConfigError: a setting in it does not exist or has an impossible value.
+        """
         known = ["task", "scene", "preset", *(f.name for f in dataclasses.fields(RunSettings)), "overrides", "non_default", "made_by"]
         refuse_unknown(data, known, "")
         task, scene = _node(data, "task"), _node(data, "scene")

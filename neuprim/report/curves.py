@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.ticker import Locator
 
-__all__ = ["GRID", "HELD_OUT", "INK", "TRAINING", "Series", "curve", "dots", "look", "series", "short_number", "svg"]
+__all__ = ["GRID", "HELD_OUT", "INK", "TRAINING", "Series", "curve", "dots", "look", "series", "short_number", "svg", "together"]
 
 # Colours no chart uses otherwise: matplotlib draws with them, and the page's CSS variables take their place in the SVG.
 INK, GRID, TRAINING, HELD_OUT = "#010203", "#010204", "#010205", "#010206"
@@ -28,6 +28,9 @@ VARIABLES = {INK: "var(--muted)", GRID: "var(--line)", TRAINING: "var(--training
 
 WIDTH, HEIGHT = 360, 210
 """Size of a chart in points. Panels are about as wide in CSS pixels, so text keeps its size."""
+
+WIDTH_TOGETHER, HEIGHT_TOGETHER = 540, 300
+"""The same of a chart with the curves of several runs."""
 
 BUCKETS = 120
 """A series of more points than twice this is drawn as medians of so many groups, inside a band from the least to the greatest."""
@@ -74,6 +77,23 @@ def curve(training: Series, held_out: Series | None, x: str, label: str, log: bo
         axes.set_xlabel(unit)
         right = max(float(s[0].max()) for s in drawn) / divisor
         axes.set_xlim(0, right * 1.02 if right > 0 else 1)
+        return svg(figure, label)
+
+
+def together(lines: Sequence[tuple[Series, str]], x: str, label: str) -> str | None:
+    """Curves of several runs in one chart over ``x`` ("seconds" or "step"), each with its own colour; None where there is nothing to draw."""
+    drawn = [(one, colour) for one, colour in lines if one[0].size]
+    if not drawn:
+        return None
+    right = max(float(one[0].max()) for one, _ in drawn)
+    unit, divisor = _time_unit(right) if x == "seconds" else (UNITS[x], 1.0)
+    with look():
+        figure, axes = _axes(WIDTH_TOGETHER, HEIGHT_TOGETHER)
+        for one, colour in drawn:
+            size = 3 if one[0].size <= 40 else 0
+            axes.plot(one[0] / divisor, one[1], color=colour, linewidth=1.4, marker="o", markersize=size, markeredgewidth=0, zorder=3)
+        axes.set_xlabel(unit)
+        axes.set_xlim(0, right / divisor * 1.02 if right > 0 else 1)
         return svg(figure, label)
 
 
@@ -176,12 +196,13 @@ def look() -> AbstractContextManager[None]:
     return matplotlib.rc_context(settings)
 
 
-def _axes() -> tuple[Figure, Axes]:
+def _axes(width: float = WIDTH, height: float = HEIGHT) -> tuple[Figure, Axes]:
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter
 
-    figure = Figure(figsize=(WIDTH / 72, HEIGHT / 72))
-    axes = figure.add_axes((0.115, 0.2, 0.865, 0.76))
+    figure = Figure(figsize=(width / 72, height / 72))
+    left, bottom = 41.4 / width, 42 / height  # room for the labels
+    axes = figure.add_axes((left, bottom, 0.98 - left, 0.96 - bottom))
     for axis, most in ((axes.xaxis, 6), (axes.yaxis, 5)):
         axis.set_major_formatter(FuncFormatter(lambda value, _: short_number(value)))
         axis.set_major_locator(_ticks(most))

@@ -14,7 +14,7 @@ from neuprim.report import sections
 from neuprim.report.record import RunRecord, read_run
 from neuprim.report.text import escape
 
-__all__ = ["LIMIT", "Viewer", "render_page", "write_report"]
+__all__ = ["LIMIT", "Viewer", "render_page", "style", "write_report"]
 
 LIMIT = 4_000_000
 """Bytes of a report with a viewer in it; of a larger one the viewer is a page beside it."""
@@ -75,3 +75,9 @@ def render_page(run: RunRecord, conditions: Sequence[ConditionSpec] = (), viewer
         commands=sections.commands(run, conditions),
         config=sections.config(run),
     )
+
+
+def style() -> str:
+    """The style sheet of a run's report, for other pages."""
+    text = files("neuprim.report").joinpath("template.html").read_text(encoding="utf-8")
+    return text.partition("<style>")[2].partition("</style>")[0]

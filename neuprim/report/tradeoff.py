@@ -17,6 +17,7 @@ from torch import Tensor
 from neuprim.core.io.files import write_text
 from neuprim.core.io.images import write_png
 from neuprim.core.metrics import from_json
+from neuprim.report.page import style
 from neuprim.report.pictures import Inlined, color_bar, error_map, inline
 from neuprim.report.scatter import Chart, Dot, chart_svg, write_charts
 from neuprim.report.text import byte_size, count, decimal, escape
@@ -62,13 +63,7 @@ def write_page(folder: Path, page: Page) -> None:
     title = f"{page.record['task']} / {page.record['scene']}"
     sections = {name: getattr(page, name)() for name in ("heading", "headline", "charts", "speed", "size", "table", "left_out", "facts")}
     write_charts(folder / "front.png", page.fronts())
-    write_text(folder / "tradeoff.html", template.substitute(title=escape(title), style=_style(), **sections))
-
-
-def _style() -> str:
-    """The style sheet of a run's report."""
-    text = files("neuprim.report").joinpath("template.html").read_text(encoding="utf-8")
-    return text.partition("<style>")[2].partition("</style>")[0]
+    write_text(folder / "tradeoff.html", template.substitute(title=escape(title), style=style(), **sections))
 
 
 class Page:

@@ -7,6 +7,7 @@ from pathlib import Path
 from neuprim.config import RunConfig, suspects_of
 from neuprim.runs.events import Events, Finishing, silent
 from neuprim.runs.finish import finish
+from neuprim.runs.lock import held
 from neuprim.runs.open import LOGS
 from neuprim.runs.training import Between, alone, train
 
@@ -23,11 +24,12 @@ def run(config: RunConfig, events: Events = silent, between: Between = alone) ->
         between: called between training steps, see :data:`~neuprim.runs.training.Between`.
 
     Raises:
-        NeuprimError: the input's fault, or numbers that left the finite; whatever was on disk before is intact.
+        NeuprimError: the input's fault, another process that is at work there, or numbers that left the finite; whatever was on disk before
+            is intact.
     """
     directory = config.output_dir
     suspects = suspects_of(config)
-    with suspects.watch(directory / LOGS):
+    with held(directory), suspects.watch(directory / LOGS):
         fitted, interrupted = train(config, suspects, events, between=between)
         events(Finishing("measuring held-out views"))
         finish(fitted, directory)

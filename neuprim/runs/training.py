@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from types import FrameType
+from collections.abc import Callable
 from typing import Any
 
 from neuprim.config import RunConfig
@@ -26,6 +23,7 @@ from neuprim.runs.compile import compiled, compiling, mark_compiled, variant
 from neuprim.runs.curve import open_curve
 from neuprim.runs.events import Events, Note, Preparing, silent
 from neuprim.runs.fit import Fitted, compile_kernels, one_torch_thread, start, steps
+from neuprim.runs.interrupt import interruptible
 
 __all__ = ["COMPILING", "Between", "alone", "make_ready", "save", "train"]
 
@@ -108,7 +106,7 @@ def _train(fitted: Fitted, events: Events, between: Between) -> bool:
     curve = open_curve(config.output_dir / "metrics.jsonl", trainer.step)
     last_saved = time.monotonic()
     interrupted = False
-    with _interruptible() as stop, curve, one_torch_thread():
+    with interruptible() as stop, curve, one_torch_thread():
         between(fitted, stop)
         for report, held_out in steps(trainer, events):
             line: dict[str, Any] = {}
@@ -148,24 +146,3 @@ def save(fitted: Fitted) -> None:
     if dataset.placement is not None:
         extra["world"] = dataset.placement.to_json()
     checkpoint.save_model(config.output_dir / "model.safetensors", trainer.model, config.task, extra, without_zeros=bool(trainer.zeros))
-
-
-@contextmanager
-def _interruptible() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; the second interrupts at once. Outside the main thread Ctrl-C is not ours."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    previous = signal.getsignal(signal.SIGINT)
-
-    def handler(number: int, frame: FrameType | None) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-
-    signal.signal(signal.SIGINT, handler)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, previous)

@@ -24,6 +24,7 @@ from neuprim.core.metrics import from_json, psnr, ssim, to_json
 from neuprim.runs.curve import read_curve
 from neuprim.runs.events import Events, Finishing, Note, silent
 from neuprim.runs.fit import Fitted
+from neuprim.runs.lock import held
 from neuprim.runs.measure import draw
 from neuprim.runs.open import LOGS
 from neuprim.runs.training import train
@@ -115,6 +116,11 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = sil
         DataError: the folder holds a run that is no trial, or a damaged ``trial.json``.
         NeuprimError: as :func:`neuprim.runs.run.run`.
     """
+    with held(trial.config.output_dir, "trial"):
+        return _run_trial(trial, dataset, events)
+
+
+def _run_trial(trial: Trial, dataset: Dataset | None, events: Events) -> Outcome:
     folder = trial.config.output_dir
     asked = _asked(trial)
     before = _read(folder / FILE)

@@ -176,23 +176,23 @@ def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
     monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", stop)
     nasty = "it's a=b, $c"
     quoted = "output_dir='it\\'s a=b, $c'"
-    for words, where, there in (
+    for words, where, said in (
         (
             ["task=toy", "seed=3", "train.rates={means: 1e-3, other: 2}", "task.options.gain=2.5"],
             "outputs/toy-ball",
-            "has the run up to here",
+            "outputs/toy-ball has the run up to here",
         ),
-        (["task=toy", "seed=4", quoted], nasty, "has no checkpoint yet"),
-        (["task=toy", "seed=3", "resume=false", "output_dir=o"], "o", "has the run up to here"),
+        (["task=toy", "seed=4", quoted], nasty, f"{nasty} has no checkpoint yet"),
+        (["task=toy", "seed=3", "resume=false", "output_dir=o"], "o", "o has the run up to here"),
         (
             ["-m", "task=toy", "seed=3,4", "model.primitives=2,3"],
             "outputs/toy-ball-sweep/seed-3_model.primitives-2",
-            "has the run up to here",
+            "outputs/toy-ball-sweep has 0 of 4 runs, and 1 of the others up to here",
         ),
     ):
         assert main(["run", *words]) == 130
         first, second = capsys.readouterr().err.splitlines()
-        assert first == f"neuprim: interrupted; {where} {there}; to go on:"
+        assert first == f"neuprim: interrupted; {said}; to go on:"
         assert second.startswith("  neuprim run ")
         assert main(shlex.split(second)[1:]) == 130
         assert capsys.readouterr().err.splitlines()[1] == second, "the same words again"

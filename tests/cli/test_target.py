@@ -63,7 +63,7 @@ def test_a_search_prints_what_it_tried_and_what_came_of_it(
 
 
 def test_an_interruption_says_what_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*args: Any) -> None:
+    def interrupted(*args: Any, **where: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("neuprim.cli.target.target_run", interrupted)

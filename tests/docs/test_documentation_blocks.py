@@ -18,6 +18,8 @@ from neuprim.cli import _parsers
 from neuprim.cli.operating_words import DRAWN, operating_words
 from neuprim.cli.tradeoff import of_words
 from neuprim.config import compose, compose_all
+from neuprim.config.launcher import launcher_words
+from neuprim.config.overrides import without_place
 from neuprim.config.target import target_words
 from neuprim.config.viewer import viewer_words
 from neuprim.core.cameras.file import read_cameras
@@ -195,7 +197,10 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
         settings = [word for word in rest if not word.startswith("-")]
         rest = [word for word in rest if word.startswith("-")]
         _, settings = viewer_words(settings)
+        _, settings = launcher_words(settings)
         _, settings = target_words(settings)
+        if (args.multirun and not without_place(settings)) or args.config is not None:
+            settings = ["task=static", *settings]  # the others are in a file
         (compose_all if args.multirun else compose)(settings, False)
     if args.command == "bench":
         rest += args.overrides
@@ -203,7 +208,7 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
         rest = [word for word in rest if word.startswith("-")]
     if args.command == "tradeoff" and of_words(args.run_dir):
         typed = [word for word in (args.run_dir, *rest) if not word.startswith(("-", "budget="))]
-        compose(typed, False)
+        compose(launcher_words(typed)[1], False)
         rest = [word for word in rest if word.startswith("-")]
     elif args.command in DRAWN:
         _, rest = operating_words(rest)

@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from neuprim.config.launcher import LauncherSettings
+
 __all__ = ["DesignRequest", "Progress", "Tell"]
 
 Progress = Callable[[str, float], None]
@@ -27,6 +29,7 @@ class DesignRequest:
         knobs: names of those to turn; empty for all.
         seeds: trainings of every variant.
         lpips: weights for LPIPS; without, those that the words name.
+        launcher: where models are trained; they are measured here.
     """
 
     words: Sequence[str]
@@ -36,3 +39,4 @@ class DesignRequest:
     knobs: Sequence[str] = ()
     seeds: int = 1
     lpips: Path | None = None
+    launcher: LauncherSettings = LauncherSettings()  # noqa: RUF009 (frozen)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 from neuprim.config import suspects_of, task_of
@@ -19,6 +20,8 @@ from neuprim.runs.design.request import DesignRequest, Progress, Tell
 from neuprim.runs.design.session import Session
 from neuprim.runs.design.variants import CENTRE, Variant, check_knobs, in_turn, singles
 from neuprim.runs.fit import one_torch_thread
+from neuprim.runs.launch.share import own_share
+from neuprim.runs.lock import held
 from neuprim.runs.open import LOGS, load_dataset
 from neuprim.runs.tradeoff.knobs import LeftOut
 from neuprim.runs.tradeoff.memory import UNKNOWN
@@ -50,12 +53,14 @@ def design_run(
     begun = time.monotonic()
     words, folder, centre = centre_of(request)
     task = task_of(centre)
-    with suspects_of(centre).watch(folder / LOGS), one_torch_thread():
+    with one_torch_thread(), own_share(request.launcher), ExitStack() as stack:
+        stack.enter_context(suspects_of(centre).watch(folder / LOGS))
         ladders = singles(centre, task)
         check_knobs(request.knobs, ladders, task.name)
         ladders = {name: ladder for name, ladder in ladders.items() if not request.knobs or name in request.knobs}
         before = read_record(folder / "tradeoff.json", Model)
         check_folder(folder, before, centre, request)
+        stack.enter_context(held(folder, "set"))
         plan = old_plan(folder, before)
         dataset = load_dataset(centre, task, progress)
         check_dataset(dataset, task.conditions)

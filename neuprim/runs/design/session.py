@@ -11,6 +11,7 @@ import numpy as np
 
 from neuprim.config import RunConfig, compose
 from neuprim.config.overrides import assigned, parse, word
+from neuprim.core.compute.threads import sharing
 from neuprim.core.data import Dataset
 from neuprim.core.errors import NeuprimError
 from neuprim.runs.design.combine import combinations
@@ -22,8 +23,10 @@ from neuprim.runs.design.request import DesignRequest, Progress, Tell
 from neuprim.runs.design.side_by_side import SideBySide
 from neuprim.runs.design.variants import CENTRE, COMBINED, Variant, merged
 from neuprim.runs.events import Event, Note, Preparing, Step
+from neuprim.runs.launch.share import at_once
 from neuprim.runs.tradeoff.knobs import LeftOut
 from neuprim.runs.tradeoff.record import Record
+from neuprim.runs.trial_jobs import launched_trials
 from neuprim.runs.trials import Outcome, Trial, run_trial
 from neuprim.runs.truths import truths_of
 
@@ -47,6 +50,12 @@ _MOST = 200.0
 
 _COMBINATIONS = 12
 """Of those at most."""
+
+_ROUNDS = 4
+"""Of trainings begun together elsewhere, at most: between two of them the time is looked at."""
+
+_MANY = 1000
+"""More trainings than any machine has cores."""
 
 
 class Session:
@@ -86,6 +95,7 @@ class Session:
         self._paces: Paces | None = None
         self._known: dict[str, Pace] = {}
         self._late = 1.0
+        self._workers, self._threads = at_once(request.launcher, _MANY)
 
     @property
     def models(self) -> list[Model]:
@@ -128,6 +138,10 @@ class Session:
 
     def with_paces(self, wanted: Sequence[Variant]) -> list[Variant]:
         """Those whose pace could be found in time, and that are models of their own; the others are left out."""
+        with sharing(self._threads):  # as the trainings will have
+            return self._with_paces(wanted)
+
+    def _with_paces(self, wanted: Sequence[Variant]) -> list[Variant]:
         kept, begun = list[Variant](), self.spent
         latest = begun + _PACED * (self.request.budget - begun)
         for number, variant in enumerate(wanted):
@@ -181,7 +195,7 @@ class Session:
         if self.plan is None:
             lengths = [variant.length for variant in wanted for _ in range(self.request.seeds)]
             starting = sum(self._known[variant.name].starting for variant in wanted) / len(wanted)
-            self.plan = planned(self.centre, self._all_paces().seconds, _TRAINED * self.remaining, lengths, starting)
+            self.plan = planned(self.centre, self._all_paces().seconds, _TRAINED * self.remaining * self._workers, lengths, starting)
             for variant in wanted:
                 self.plan = self.plan.knowing(variant, self._known[variant.name].ratio)
         self.write()
@@ -192,34 +206,80 @@ class Session:
         """Train what is not there yet and ends by that part of what remained, and look at its images. What an earlier session has begun is
         ended in any case, and so is the centre, without which nothing can be said."""
         assert self.plan is not None
-        for number, variant in enumerate(wanted):
-            if any(model.variant == variant for model in self.models):
-                continue
-            lasts = self._late * self.plan.seconds * variant.length * self.request.seeds
-            paid = variant.name == CENTRE or (self._run_dir(variant, 0) / "checkpoint.safetensors").exists()
-            if not paid and lasts > self.left(part):
-                self.leave_out(variant, self._no_time())
-                continue
-            self.record.left_out = [one for one in self.record.left_out if one.words != self._said(variant)]
-            try:
-                self._make(variant, f"training {number + 1} of {len(wanted)}, {variant.name}")
-            except NeuprimError as error:
-                if variant.name == CENTRE:
-                    raise
-                self.leave_out(variant, str(error))
+        todo = [variant for variant in wanted if not any(model.variant == variant for model in self.models)]
+        while todo:
+            several = self._fitting(todo, part)
+            batch, todo = todo[:several], todo[several:]
+            fits: list[Variant] = []
+            for variant in batch:
+                paid = variant.name == CENTRE or (self._run_dir(variant, 0) / "checkpoint.safetensors").exists()
+                if not paid and self._late * self._lasts([*fits, variant]) > self.left(part):
+                    self.leave_out(variant, self._no_time())
+                    continue
+                self.record.left_out = [one for one in self.record.left_out if one.words != self._said(variant)]
+                fits.append(variant)
+            if fits:
+                first = wanted.index(fits[0]) + 1
+                names = fits[0].name if len(fits) == 1 else f"{fits[0].name} to {fits[-1].name}"
+                self._make(fits, f"training {first} of {len(wanted)}, {names}")
 
-    def _make(self, variant: Variant, text: str) -> None:
+    def _fitting(self, todo: Sequence[Variant], part: float) -> int:
+        """How many of them to begin together: one in this process; elsewhere as many as are at work at once, some rounds of them where there is
+        time, as workers take a while to begin."""
+        if self._workers == 1:
+            return 1
+        most = max(self._workers // self.request.seeds, 1)
+        rounds = self.left(part) / max(self._late * self._lasts(todo[:most]), 1e-9)
+        return most * int(min(max(rounds, 1), _ROUNDS))
+
+    def _lasts(self, variants: Sequence[Variant]) -> float:
+        """Seconds from the begin to the end of training them together."""
         assert self.plan is not None
-        words = self.plan.words_of(variant, self.words, self.centre)
-        quiet = [] if any(a.key == "train.eval_every" for a in parse(words)) else ["train.eval_every=0"]
-        outcomes: list[Outcome] = []
+        rounds = -(-len(variants) * self.request.seeds // self._workers)
+        return self.plan.seconds * max(variant.length for variant in variants) * rounds
+
+    def _make(self, variants: Sequence[Variant], text: str) -> None:
+        """Train variants and look at their images; those that cannot be trained are left out."""
         begun = time.monotonic()
-        for seed in range(self.request.seeds):
-            own = [word("seed", self.centre.seed + seed), assigned("output_dir", str(self._run_dir(variant, seed)))]
-            config = compose(merged(words, [*quiet, *own]), check_output=False)
-            outcomes.append(run_trial(Trial(config, views=self.request.views), self.dataset, self._hear(text)))
-        took = max(time.monotonic() - begun, sum(outcome.seconds for outcome in outcomes))
-        self._late = 0.5 * (self._late + took / max(self.plan.seconds * variant.length * self.request.seeds, 1e-9))
+        made = self._trained(variants, text)
+        took = time.monotonic() - begun
+        for variant, outcomes in zip(variants, made, strict=True):
+            if isinstance(outcomes, NeuprimError):
+                if variant.name == CENTRE:
+                    raise outcomes
+                self.leave_out(variant, str(outcomes))
+                continue
+            if self._workers == 1:
+                took = max(took, sum(outcome.seconds for outcome in outcomes))
+            self._late = 0.5 * (self._late + took / max(self._lasts(variants), 1e-9))
+            self._look(variant, outcomes)
+
+    def _trained(self, variants: Sequence[Variant], text: str) -> list[list[Outcome] | NeuprimError]:
+        """Outcomes of every seed of each variant, or why there are none."""
+        trials = [[self._trial(variant, seed) for seed in range(self.request.seeds)] for variant in variants]
+        made: list[list[Outcome] | NeuprimError] = []
+        if self.request.launcher.name != "inline":
+            return launched_trials(trials, self.request.launcher, self.folder, lambda fraction: self.progress(text, fraction))
+        for several in trials:
+            try:
+                made.append([run_trial(trial, self.dataset, self._hear(text)) for trial in several])
+            except NeuprimError as error:
+                made.append(error)
+        return made
+
+    def _words_of(self, variant: Variant) -> list[str]:
+        assert self.plan is not None
+        return self.plan.words_of(variant, self.words, self.centre)
+
+    def _trial(self, variant: Variant, seed: int) -> Trial:
+        words = self._words_of(variant)
+        quiet = [] if any(a.key == "train.eval_every" for a in parse(words)) else ["train.eval_every=0"]
+        own = [word("seed", self.centre.seed + seed), assigned("output_dir", str(self._run_dir(variant, seed)))]
+        return Trial(compose(merged(words, [*quiet, *own]), check_output=False), views=self.request.views)
+
+    def _look(self, variant: Variant, outcomes: Sequence[Outcome]) -> None:
+        """Measure what was trained, into the record."""
+        assert self.plan is not None
         first, run_dir = outcomes[0], self._run_dir(variant, 0)
         measured, exact = self.measuring.look(run_dir, variant.knob, _EXACT * self.remaining / _ABOUT, self._float64)
         self.record.facts.setdefault("exact", exact)
@@ -228,7 +288,7 @@ class Session:
         self.record.points.append(
             Model(
                 knob=variant.knob,
-                words=tuple(words),
+                words=tuple(self._words_of(variant)),
                 quality={**measured.quality, **means},
                 bytes=measured.bytes,
                 peak_bytes=measured.peak_bytes,
@@ -279,7 +339,7 @@ class Session:
         """Those of an earlier session, and as many more as there is time for."""
         assert self.plan is not None
         old = [model.variant for model in self.models if model.knob == COMBINED]
-        seconds = min(_TOGETHER * self.remaining, self.left(part))
+        seconds = self._workers * min(_TOGETHER * self.remaining, self.left(part))
         most = min(int(seconds / max(self._late * self.plan.seconds * self.request.seeds, 1e-9)), _COMBINATIONS - len(old))
         found = combinations(self.models, most)
         return [*old, *(variant for variant in found if self._allowed(variant))]

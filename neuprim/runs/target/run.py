@@ -8,11 +8,14 @@ from collections.abc import Callable
 from typing import Any
 
 from neuprim.config import RunConfig, suspects_of, task_of
+from neuprim.config.launcher import LauncherSettings
 from neuprim.config.target import Target
 from neuprim.core.data import Dataset
 from neuprim.core.data.check import check_dataset
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.runs.events import Events, Preparing, silent
+from neuprim.runs.launch.share import own_share
+from neuprim.runs.lock import held
 from neuprim.runs.open import LOGS, load_dataset
 from neuprim.runs.target.record import Record, read_record
 from neuprim.runs.target.searching import Search
@@ -23,7 +26,12 @@ __all__ = ["target_run"]
 
 
 def target_run(
-    config: RunConfig, target: Target, budget: float, events: Events = silent, clock: Callable[[], float] = time.monotonic
+    config: RunConfig,
+    target: Target,
+    budget: float,
+    events: Events = silent,
+    clock: Callable[[], float] = time.monotonic,
+    launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
 ) -> Record:
     """Find and train the smallest model that meets a target; leaves a run directory with ``target.json`` and ``model.neuprim``.
 
@@ -34,6 +42,7 @@ def target_run(
         budget: seconds of search, training and measuring.
         events: told what happens; a line of each trial and decision is a Note.
         clock: seconds, monotonic.
+        launcher: where trainings work; each of them has the same number of threads, so that their paces compare.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C; the same call with ``resume`` goes on.
@@ -46,13 +55,13 @@ def target_run(
         return record
     suspects = suspects_of(config)
     begun = clock()
-    with suspects.watch(config.output_dir / LOGS):
+    with held(config.output_dir, "search"), suspects.watch(config.output_dir / LOGS), own_share(launcher):
         task = task_of(config)
         dataset = load_dataset(config, task, lambda text, fraction: events(Preparing(text, fraction)))
         suspects.know(dataset)
         check_dataset(dataset, task.conditions)
         record.hold_out = _hold_out(dataset)
-        trying = Trying(config, dataset, record, events, clock)
+        trying = Trying(config, dataset, record, events, clock, launcher)
         trying.begun = begun - record.spent
         try:
             search = Search(config, target, dataset, record, trying)

@@ -130,15 +130,14 @@ class Search:
     def probe(self, primitives: int) -> None:
         """A size at two lengths, so that what more steps bring is known."""
         words = self.record.words
-        for steps in (self.record.length // 2, self.record.length):
-            self.told(Attempt("size", words, primitives, steps))
+        self.told(*(Attempt("size", words, primitives, steps) for steps in (self.record.length // 2, self.record.length)))
 
-    def told(self, attempt: Attempt) -> Attempt:
-        known = self.trying.known(attempt)
-        done = self.trying.run(attempt)
-        if not known:
-            self.trying.tell(described(done, self.judge.predicted(done.count)))
-        return done
+    def told(self, *attempts: Attempt) -> None:
+        for several in [attempts] if self.trying.together else [(attempt,) for attempt in attempts]:
+            known = [self.trying.known(attempt) for attempt in several]
+            for before, done in zip(known, self.trying.run_all(several), strict=True):
+                if not before:
+                    self.trying.tell(described(done, self.judge.predicted(done.count)))
 
     def sizes(self) -> None:
         """Sizes, until the one that meets the target is known, the budget's share is used or the target is out of reach."""

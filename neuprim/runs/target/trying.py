@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from neuprim.config import RunConfig, task_of
+from neuprim.config.launcher import LauncherSettings
 from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compressed import USUAL_LEVEL, bit_table
 from neuprim.core.data import Dataset
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.settings import PopulationSettings
-from neuprim.runs.events import Events, Note
+from neuprim.runs.events import Events, Note, Preparing
+from neuprim.runs.launch.jobs import Job
+from neuprim.runs.launch.share import at_once
+from neuprim.runs.launch.status import ENDED, Status
 from neuprim.runs.target.pace import Stopwatch, linear
 from neuprim.runs.target.record import Attempt, Record
-from neuprim.runs.trials import Trial, run_trial
+from neuprim.runs.trial_jobs import TrialFailed, do_trial, launch_jobs, words_of
+from neuprim.runs.trials import Outcome, Trial, run_trial
 
 __all__ = ["FOLDER", "VIEWS", "Trying", "changed", "packed_bytes"]
 
@@ -27,6 +32,9 @@ FOLDER = "target"
 
 VIEWS = 16
 """Views held out that are measured, at most."""
+
+TOGETHER = 2
+"""Trainings that a search asks for at once: the two lengths of a size."""
 
 _EVERY = 5
 """Steps between two interventions, at least: fewer tell nothing about who is used."""
@@ -64,6 +72,7 @@ class Trying:
         config: what the search starts from.
         dataset: its scene, whole.
         clock: seconds, monotonic.
+        launcher: where trainings work.
     """
 
     config: RunConfig
@@ -71,6 +80,7 @@ class Trying:
     record: Record
     events: Events
     clock: Callable[[], float] = time.monotonic
+    launcher: LauncherSettings = LauncherSettings()  # noqa: RUF009 (frozen)
     begun: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -79,6 +89,11 @@ class Trying:
     @property
     def folder(self) -> Path:
         return self.config.output_dir
+
+    @property
+    def together(self) -> bool:
+        """Whether several trainings asked for at once are made so."""
+        return self.launcher.name != "inline"
 
     @property
     def spent(self) -> float:
@@ -120,30 +135,67 @@ class Trying:
 
         KeyboardInterrupt leaves it unfinished in the record; it goes on from its checkpoint.
         """
-        known = self._find(attempt)
-        attempt = known or attempt
-        if attempt.outcome is not None:
-            return attempt
-        if known is None:
-            self.record.attempts.append(attempt)
-        self.write()
+        return self.run_all([attempt])[0]
+
+    def run_all(self, wanted: Sequence[Attempt]) -> list[Attempt]:
+        """Several attempts as :meth:`run` has one: one after the other in this process, together where the launcher has them elsewhere."""
+        attempts = [self._find(attempt) or attempt for attempt in wanted]
+        todo = [attempt for attempt in attempts if attempt.outcome is None]
+        for attempt in todo:
+            if self._find(attempt) is None:
+                self.record.attempts.append(attempt)
+        if todo:
+            self.write()
+        if self.together and todo:
+            self._elsewhere(todo)
+        else:
+            for attempt in todo:
+                self._here(attempt)
+        return attempts
+
+    def _here(self, attempt: Attempt) -> None:
         watch, start = Stopwatch(self.clock, self.events), self.clock()
-        config = self.config_of(attempt)
         try:
-            outcome = run_trial(Trial(config, self.record.hold_out, VIEWS), self.dataset, watch)
+            outcome = run_trial(self._trial(attempt), self.dataset, watch)
         finally:
             self.begun += watch.compiling
             attempt.seconds += self.clock() - start - watch.compiling
             attempt.pace = watch.pace or attempt.pace
             self.write()
+        self._keep(attempt, outcome)
+
+    def _elsewhere(self, attempts: Sequence[Attempt]) -> None:
+        jobs = [Job(attempt.folder, f"{__name__}:{do_attempt.__name__}", words_of(self._trial(attempt))) for attempt in attempts]
+        threads = at_once(self.launcher, TOGETHER)[1]  # the same whether one works or several: paces must compare
+        done = [0.0] * len(jobs)
+
+        def hear(number: int, status: Status) -> None:
+            done[number] = 1.0 if status.state in ENDED else status.progress
+            self.events(Preparing(f"{len(jobs)} training{'s' * (len(jobs) > 1)} at work", sum(done) / len(done)))
+
+        results = launch_jobs(jobs, replace(self.launcher, threads=threads), self.folder / FOLDER, hear)
+        self.begun += max((result.value.compiling for result in results if result.value is not None), default=0.0)
+        for attempt, result in zip(attempts, results, strict=True):
+            if result.value is not None:
+                attempt.seconds += result.value.seconds
+                attempt.pace = result.value.pace or attempt.pace
+                self._keep(attempt, result.value.outcome)
+        for result in results:
+            if result.state == "failed":
+                raise TrialFailed(result.line)
+
+    def _trial(self, attempt: Attempt) -> Trial:
+        return Trial(self.config_of(attempt), self.record.hold_out, VIEWS)
+
+    def _keep(self, attempt: Attempt, outcome: Outcome) -> None:
         found = {k: v for k, v in dataclasses.asdict(outcome).items() if k != "curve"}
         attempt.outcome = {**found, "psnr": min(outcome.psnr, _PSNR_MAX)}
         if attempt.pace is None:  # read back, or two steps at most
             attempt.pace = outcome.seconds / max(outcome.steps, 1)
         if attempt.purpose != "pace":
+            config = self.config_of(attempt)
             attempt.packed = packed_bytes(config.output_dir, task_of(config))
         self.write()
-        return attempt
 
     def known(self, attempt: Attempt) -> bool:
         """Whether an equal attempt is done already."""
@@ -170,6 +222,28 @@ class Trying:
     def cost(self, primitives: int, steps: float) -> float:
         """Seconds that a trial will take."""
         return self.pace(primitives) * steps + max(self.overhead(), 0.0)
+
+
+@dataclass(frozen=True)
+class Attempted:
+    """What comes back from where an attempt was made.
+
+    Attributes:
+        pace: seconds of a step. compiling: seconds of compiling kernels. seconds: of all but that.
+    """
+
+    outcome: Outcome
+    pace: float | None
+    compiling: float
+    seconds: float
+
+
+def do_attempt(data: Mapping[str, Any], attempt: int, events: Events) -> Attempted:
+    """The function of a job."""
+    start = time.monotonic()
+    watch = Stopwatch(time.monotonic, events)
+    outcome = do_trial(data, attempt, watch)
+    return Attempted(outcome, watch.pace, watch.compiling, time.monotonic() - start - watch.compiling)
 
 
 def packed_bytes(folder: Path, task: TaskSpec) -> int:

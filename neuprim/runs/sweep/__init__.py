@@ -1,0 +1,1 @@
+"""``neuprim run -m``: every combination of some words, launched together and compared."""

@@ -1,0 +1,95 @@
+"""The page of a sweep: what it says without scripts, and how it is sorted with them."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from neuprim.report.record import read_run
+from neuprim.report.sweep import COLOURS, Compared, better, write_sweep
+from tests.browsers import browser
+
+
+def run(folder: Path, psnr: float, size: int, **more: object) -> None:
+    (folder / "renders").mkdir(parents=True)
+    metrics = {"task": "static", "scene": "solids", "psnr": psnr, "ssim": 0.9, "model_bytes": size, "iterations": 10, "seed": 1, **more}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    lines = [{"step": s, "seconds": s / 10, "eval_psnr": psnr - 10 + s} for s in (5, 10)]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (folder / "report.html").touch()
+    for name, colour in (("test_000_r_0", "red"), ("test_000_r_0_truth", "blue")):
+        Image.new("RGB", (8, 8), colour).save(folder / "renders" / f"{name}.png")
+
+
+def sweep(folder: Path) -> Path:
+    numbers = {"a&b": (20.0, 3000), "<best>": (30.0, 5000), "small": (10.0, 1000)}
+    runs = []
+    for name, (psnr, size) in numbers.items():
+        run(folder / name, psnr, size, lpips=None if name == "small" else 0.1 + psnr / 100)
+        runs.append(Compared(name, {"model.primitives": str(size)}, "done", "", 2.0, 2 if name == "small" else 1, read_run(folder / name)))
+    runs.append(Compared("gone", {"model.primitives": "7"}, "failed", "no <images>", 0.1, 1, None))
+    return write_sweep(folder, runs, ["task=static", "model.primitives=1,2"])
+
+
+def test_it_stands_without_scripts_in_the_order_of_psnr(tmp_path: Path) -> None:
+    text = sweep(tmp_path).read_text()
+    names = ["&lt;best&gt;", "a&amp;b", "small", "gone"]
+    places = [text.index(f'data-run="{name}"') for name in names]
+    assert places == sorted(places)
+    assert '<td class="best" data-value="30.0">30.00 dB</td>' in text and '<td class="best" data-value="1000.0">1 kB</td>' in text
+    assert "neuprim run -m task=static model.primitives=1,2" in text and "<strong>gone failed:</strong> no &lt;images&gt;" in text
+    assert 'href="%3Cbest%3E/report.html"' in text and "started 2 times" in text
+    assert text.count("<figure data-run=") == 3 and text.count("ground truth</figcaption>") == 1
+    assert all(text.count(colour) >= 3 for colour in COLOURS[:3]), "in the table, the key and both charts"
+    assert "http" not in text.replace("http-equiv", "").replace("http://www.w3.org", ""), "nothing is loaded"
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        *(("psnr", "more"), ("psnr_mask", "more"), ("lpips_3dgs", "less"), ("model_bytes", "less"), ("render_fps", "more")),
+        *(("parameters_per_primitive", None), ("iterations", None), ("glow", None), ("psnrx", None)),
+    ],
+)
+def test_what_is_better_is_said_where_it_is_known(name: str, expected: str | None) -> None:
+    assert better(name) == expected
+
+
+def test_of_many_runs_each_has_its_colour_and_infinite_numbers_sort(tmp_path: Path) -> None:
+    runs = []
+    for n in range(14):
+        run(tmp_path / str(n), 10.0 + n, 100, psnr_infinite=n == 3)
+        runs.append(Compared(str(n), {}, "done", "", 1.0, 1, read_run(tmp_path / str(n))))
+    text = write_sweep(tmp_path, runs, []).read_text()
+    assert runs[3].numbers["psnr"] == math.inf and 'data-value="Infinity">∞' in text
+    assert len(set(__import__("re").findall(r'class="chip" style="background: (#\w+)"', text))) == 14
+    assert "8 of 14 runs, those with the best PSNR" in text
+
+
+def test_a_browser_sorts_and_ranks(tmp_path: Path) -> None:
+    file = sweep(tmp_path)
+    with browser() as found:
+        page, faults = found.new_page(), []
+        page.on("console", lambda message: faults.append(message.text))
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        page.goto(file.as_uri())
+
+        def order(selector: str) -> list[str]:
+            return [str(x) for x in page.eval_on_selector_all(selector, "found => found.map(x => x.dataset.run)")]
+
+        assert order("table.runs tbody tr") == ["<best>", "a&b", "small", "gone"]
+        assert page.inner_text("#best") == "<best>: 30.00 dB"
+        page.select_option("#metric", "model_bytes")
+        assert order("table.runs tbody tr") == ["small", "a&b", "<best>", "gone"] and page.inner_text("#best") == "small: 1 kB"
+        assert order(".pictures figure[data-run]") == ["small", "a&b", "<best>"]
+        page.select_option("#metric", "lpips")
+        assert order("table.runs tbody tr")[:2] == ["a&b", "<best>"], "less is better; those without come last"
+        page.click("table.runs thead th:first-child button")
+        assert order("table.runs tbody tr") in (["<best>", "a&b", "gone", "small"], ["a&b", "<best>", "gone", "small"])
+        page.click("table.runs thead th:first-child button")
+        assert order("table.runs tbody tr")[:2] == ["small", "gone"]
+        assert faults == []

@@ -1,0 +1,151 @@
+"""Real Ray on this machine, and real submitit with its local executor: the same jobs as in processes, where the packages are installed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from neuprim.config.launcher import LauncherSettings
+from neuprim.core.errors import BackendUnavailable, ConfigError, NeuprimError
+from neuprim.runs.launch.status import Status
+from neuprim.runs.launch.table import check_launcher, launch
+from tests.runs import launching
+from tests.runs.launching import job
+from tests.systems import posix
+
+ROOT = Path(__file__).parents[3]
+
+pytestmark = posix
+
+
+@pytest.fixture(autouse=True)
+def found_by_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The functions of the jobs; and whatever machine this is, it has two cores."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    for place in ("share", "ray"):
+        if place == "share" or _has("ray"):
+            monkeypatch.setattr(f"neuprim.runs.launch.{place}.machine_cores", lambda: 2)
+
+
+def _has(package: str) -> bool:
+    try:
+        __import__(package)
+    except ImportError:
+        return False
+    return True
+
+
+@pytest.fixture
+def ray() -> Iterator[Any]:
+    module = pytest.importorskip("ray")
+    yield module
+    module.shutdown()
+
+
+def all_sorts(settings: LauncherSettings, folder: Path) -> None:
+    """Done, refused, a bug, its threads, and one whose worker is killed once."""
+    heard: list[tuple[int, Status]] = []
+    jobs = [
+        job("double", launching.double, 21),
+        job("refused", launching.refuse, "no images"),
+        job("bug", launching.bug),
+        job("share", launching.share),
+        job("once", launching.die, 1),
+    ]
+    results = launch(jobs, settings, folder, lambda n, s: heard.append((n, s)))
+    assert all(result is not None for result in results)
+    double, refused, bug, share, once = (result for result in results if result is not None)
+    assert double.value == 42 and refused.line == "no images" and not refused.trace
+    assert bug.line == "ZeroDivisionError: a bug" and "in bug" in bug.trace
+    assert share.value == (1, "1", 1)
+    assert (once.state, once.value, once.attempts) == ("done", 1, 2), once.line
+    assert dict(heard)[4].attempt == 1
+
+
+def test_ray_does_all_sorts_of_jobs(ray: Any, tmp_path: Path) -> None:
+    all_sorts(LauncherSettings("ray", workers=2), tmp_path / "launch")
+    assert not (tmp_path / "launch").exists() and not ray.is_initialized()
+
+
+def test_ctrl_c_reaches_what_ray_has_at_work(ray: Any, tmp_path: Path) -> None:
+    begun = threading.Event()
+
+    def hear(number: int, status: Status) -> None:
+        if status.text == "at it" and not begun.is_set():
+            begun.set()
+            threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+
+    first, second = launch(
+        [job(str(n), launching.toil, 60.0) for n in range(2)], LauncherSettings("ray", workers=1), tmp_path / "launch", hear
+    )
+    assert first is not None and first.state == "interrupted" and second is None
+
+
+def test_ray_that_does_not_answer_is_said_within_seconds(tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # and does not listen
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        start = time.monotonic()
+        with pytest.raises(BackendUnavailable) as error:
+            launch([job("x", launching.double, 1)], LauncherSettings("ray", address=address), tmp_path / "launch")
+    assert str(error.value).startswith(f"launcher.address={address}: nothing answers there") and time.monotonic() - start < 20
+    assert not (tmp_path / "launch").exists()
+
+
+@pytest.mark.parametrize("address", ["moon", "http://", "ray://x:y"])
+def test_an_address_that_is_none(address: str, tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    with pytest.raises(ConfigError, match=r"expected auto, HOST:PORT or ray://HOST:PORT"):
+        launch([job("x", launching.double, 1)], LauncherSettings("ray", address=address), tmp_path / "launch")
+
+
+def test_submitit_does_jobs(tmp_path: Path) -> None:
+    pytest.importorskip("submitit")
+    settings = LauncherSettings("slurm", workers=2, address="local")
+    double, refused = launch(
+        [job("double", launching.double, 21), job("refused", launching.refuse, "no images")], settings, tmp_path / "launch"
+    )
+    assert double is not None and double.value == 42
+    assert refused is not None and (refused.state, refused.line) == ("failed", "no images")
+    assert not (tmp_path / "launch").exists()
+
+
+@pytest.mark.slow
+def test_submitit_does_all_sorts_of_jobs(tmp_path: Path) -> None:
+    """It waits fifteen seconds for the result of a process that was killed."""
+    pytest.importorskip("submitit")
+    all_sorts(LauncherSettings("slurm", workers=2, address="local"), tmp_path / "launch")
+
+
+def test_submitit_queues_again_with_what_goes_on(tmp_path: Path) -> None:
+    """What submitit asks for before a machine is taken away: a task that knows that it was begun."""
+    pytest.importorskip("submitit")
+    from neuprim.runs.launch.slurm import _Requeued
+    from neuprim.runs.launch.worker import Task
+
+    again = _Requeued(Task(job("once", launching.die, 1), 1, tmp_path / "0.json", tmp_path / "stop", tmp_path)).checkpoint()
+    assert again.function.task.attempt == 1
+
+
+def test_without_slurm_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("submitit")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(BackendUnavailable, match=r"launcher=slurm: .*srun.*; launcher.address=local does without a cluster"):
+        launch([job("x", launching.double, 1)], LauncherSettings("slurm"), tmp_path / "launch")
+    assert not (tmp_path / "launch").exists()
+
+
+@pytest.mark.parametrize(("name", "package"), [("ray", "ray"), ("slurm", "submitit")])
+def test_a_package_that_is_missing_is_named(name: Any, package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, package, None)
+    with pytest.raises(NeuprimError, match=rf"launcher={name} needs the package {package} .*: pip install 'neuprim\[{name}\]'"):
+        check_launcher(LauncherSettings(name), 1)

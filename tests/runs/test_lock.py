@@ -1,0 +1,68 @@
+"""One process at a time in a directory, and nothing to clear up after a kill."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from neuprim.core.errors import ConfigError
+from neuprim.runs.lock import FILE, held
+from tests.runs.launching import wait_for
+from tests.systems import posix
+
+HOLD = "import sys, time; from pathlib import Path; from neuprim.runs.lock import held\nwith held(Path(sys.argv[1])): time.sleep(600)"
+
+
+def test_a_second_one_is_refused_by_name_and_the_first_is_left_alone(tmp_path: Path) -> None:
+    with held(tmp_path / "run"):
+        for _ in range(2):
+            with pytest.raises(ConfigError) as error, held(tmp_path / "run", "sweep"):
+                pytest.fail("two at once")
+            found = f"{tmp_path / 'run'}: process {os.getpid()} on {socket.gethostname()} (since "
+            assert str(error.value).startswith(found) and "is at work on this sweep; expected that to end first" in str(error.value)
+        refused: list[str] = []
+
+        def other() -> None:
+            try:
+                with held(tmp_path / "run"):
+                    pass
+            except ConfigError as error:
+                refused.append(str(error))
+
+        thread = threading.Thread(target=other)
+        thread.start()
+        thread.join()
+        assert len(refused) == 1 and (tmp_path / "run" / FILE).exists()
+    assert not (tmp_path / "run").exists(), "nothing was put into it"
+
+
+def test_what_was_there_stays(tmp_path: Path) -> None:
+    with held(tmp_path / "run"):
+        (tmp_path / "run" / "x").touch()
+    assert [p.name for p in (tmp_path / "run").iterdir()] == ["x"]
+    (tmp_path / "empty").mkdir()
+    with held(tmp_path / "empty"):
+        pass
+    assert (tmp_path / "empty").is_dir()
+
+
+@posix
+def test_a_killed_process_lets_go(tmp_path: Path) -> None:
+    other = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)])
+    try:
+        wait_for(tmp_path / FILE)
+        while not (tmp_path / FILE).read_text():
+            pass
+        with pytest.raises(ConfigError, match=f"process {other.pid} on"), held(tmp_path):
+            pass
+    finally:
+        other.kill()
+        other.wait()
+    with held(tmp_path):
+        assert f'"pid": {os.getpid()}' in (tmp_path / FILE).read_text()

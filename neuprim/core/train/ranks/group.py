@@ -1,0 +1,214 @@
+"""Several ranks that train one model: what they tell each other in a step, and what happens when one of them is gone.
+
+Every rank draws all random numbers of a step, looks at its own views, and adds up the gradients of all of them in their order
+(:mod:`~neuprim.core.train.ranks.bucket`). From there all ranks compute alike, population and learning rates included, so nothing else is sent.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.core.errors import RankError
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render.output import Tally
+from neuprim.core.train.ranks.alone import Alone, Seen, StepViews
+from neuprim.core.train.ranks.bucket import Bucket
+from neuprim.core.train.ranks.place import Place
+from neuprim.core.train.ranks.pulse import Pulse
+
+__all__ = ["Group"]
+
+_LETTER = 2048
+"""Bytes of what a rank tells the others at once; more takes a second exchange."""
+
+_HEAD = 4
+
+
+class Group(Alone):
+    """This process as one of several.
+
+    Args:
+        place: which.
+        wire: the way to the others: ``swap``, ``store``, ``hosted`` and ``close`` of :class:`~neuprim.core.train.ranks.wire.Wire`.
+
+    Attributes:
+        sent: bytes that this rank sent in steps.
+    """
+
+    def __init__(self, place: Place, wire: Any) -> None:
+        super().__init__()
+        self.place, self.wire = place, wire
+        self.rank, self.size = place.rank, place.size
+        self.sent = 0
+        self._bucket: Bucket | None = None
+        self._stopping = False
+        self._clock = 0.0
+        self._told_at: float | None = None
+        self._tail = 0.0
+        self.pulse = Pulse(wire.store.clone(), self.rank, self.size)
+
+    # ------------------------------------------------------------ a step
+
+    @property
+    def stopping(self) -> bool:
+        return self._stopping
+
+    def step(self, model: Primitives, elapsed: float, start: float) -> StepViews:
+        return _GroupViews(self, model, elapsed, start)
+
+    def spent(self, elapsed: float, start: float) -> float:
+        """The first rank's clock as it told it in this step; what it spends afterwards counts in the next."""
+        assert self._told_at is not None
+        self._tail = time.perf_counter() - self._told_at
+        return self._clock
+
+    def bucket(self, model: Primitives) -> Bucket:
+        """The buffer for the model as it is now."""
+        if self._bucket is None or not self._bucket.fits(model.params):
+            self._bucket = Bucket(model.params, self.size)
+        return self._bucket
+
+    def time(self, elapsed: float, start: float) -> float:
+        """Seconds of training up to now, by this rank's clock, which only the first rank's counts of."""
+        self._told_at = time.perf_counter()
+        return elapsed + self._tail + self._told_at - start
+
+    def heard(self, letters: list[dict[str, Any]]) -> None:
+        """Take over what the ranks decide together."""
+        self._clock = float(letters[0]["clock"])
+        self._stopping = any(letter["stop"] for letter in letters)
+
+    # ------------------------------------------------------------ talking
+
+    def swap(self, rows: Tensor) -> Tensor:
+        """(R, n) rows, one for each rank -> (R, n) rows, one from each.
+
+        Raises:
+            RankError: a rank failed or is gone; names it.
+        """
+        self.sent += rows[0].numel() * rows.element_size() * (self.size - 1)
+        try:
+            return torch.as_tensor(self.wire.swap(rows))
+        except RankError as error:
+            raise self._cause(error) from error
+
+    def tell(self, letter: dict[str, Any]) -> list[dict[str, Any]]:
+        """Tell all ranks the same; returns what each of them told, by rank. It must be what JSON can say."""
+        text = json.dumps(letter).encode()
+        whole = len(text).to_bytes(_HEAD, "little") + text
+        first = self._all_get(whole[:_LETTER].ljust(_LETTER, b"\0"))
+        lengths = [_HEAD + int.from_bytes(part[:_HEAD], "little") for part in first]
+        rest = max(lengths) - _LETTER
+        if rest > 0:
+            second = self._all_get(whole[_LETTER:].ljust(rest, b"\0"))
+            first = [a + b for a, b in zip(first, second, strict=True)]
+        return [json.loads(part[_HEAD:length]) for part, length in zip(first, lengths, strict=True)]
+
+    def _all_get(self, text: bytes) -> list[bytes]:
+        row = torch.frombuffer(bytearray(text), dtype=torch.uint8)
+        return [part.numpy().tobytes() for part in self.swap(row.expand(self.size, -1))]
+
+    def agree(self, what: str, facts: dict[str, Any]) -> None:
+        letters = self.tell(facts)
+        for rank, letter in enumerate(letters):
+            for name, value in letters[0].items():
+                if letter.get(name) != value:
+                    raise RankError(f"rank {rank} has other {name} than rank 0: {letter.get(name)!r}, not {value!r}; {what}")
+
+    @contextmanager
+    def in_turn(self) -> Iterator[None]:
+        """The first rank of all goes first, then the first of each other machine, then the rest."""
+        for rank in sorted({0, self.place.local_first} - {self.rank}):
+            self._wait_for(rank)
+        yield
+        self.wire.store.set(f"through/{self.rank}", "1")
+
+    def _wait_for(self, rank: int) -> None:
+        """Until a rank is through, however long it works."""
+        store, looks = self.wire.store, 0
+        try:
+            while not store.check([f"through/{rank}"]):
+                looks += 1
+                if store.check(["failed"]) or (looks % 25 == 0 and rank in self.pulse.gone(store)):
+                    raise self._cause(RankError(f"rank {rank} is gone"))
+                time.sleep(0.2)
+        except RuntimeError as error:
+            raise self._cause(RankError("the store that ranks meet in is gone")) from error
+
+    # ------------------------------------------------------------ faults
+
+    def fail(self, text: str) -> bool:
+        """Leave a word for the others that the training ends and why; whether it is this rank's to tell the user, being the first."""
+        own = json.dumps({"rank": self.rank, "text": text[:4000]})
+        try:
+            return bool(self.wire.store.compare_set("failed", "", own).decode() == own)
+        except RuntimeError:
+            return True
+
+    def _cause(self, found: RankError) -> RankError:
+        """What is behind a broken connection."""
+        store = self.wire.store
+        try:
+            if store.check(["failed"]):
+                return _told(store.get("failed"))
+            gone = self.pulse.gone(store)
+            if store.check(["failed"]):
+                return _told(store.get("failed"))
+        except RuntimeError:
+            gone = [0] if self.wire.hosted and self.rank else []
+        if not gone:
+            return found
+        names = ", ".join(map(str, gone))
+        return RankError(f"rank {names} died" if len(gone) == 1 else f"ranks {names} died")
+
+    def close(self, failed: bool = False) -> None:
+        """Leave the others."""
+        if failed and self.wire.hosted and self.first:
+            time.sleep(4.0)  # the others look into the store for the cause, and it goes with this process
+        self.pulse.stop()
+        self.wire.close()
+
+
+def _told(text: bytes) -> RankError:
+    word = json.loads(text)
+    return RankError(f"rank {word['rank']}: {word['text']}", told=True)
+
+
+class _GroupViews(StepViews):
+    """The views of a step: this rank's in their rounds, a view of each rank in a round."""
+
+    def __init__(self, group: Group, model: Primitives, elapsed: float, start: float) -> None:
+        super().__init__(model)
+        self._group, self._bucket, self._when = group, group.bucket(model), (elapsed, start)
+        self._there = dict.fromkeys(model.params, False)
+        # of all bits of all positions: a rank that computes otherwise is found before its gradients count
+        self._mark = int(model.params["means"].detach().view(torch.int32).sum())
+
+    def add(self, seen: Seen, tally: Tally) -> None:
+        group = self._group
+        there = self._bucket.take(self.model.params, tally)
+        letters = group.tell(
+            {"mark": self._mark, "clock": group.time(*self._when), "stop": group.asked(), "there": there, "seen": asdict(seen)}
+        )
+        for rank, letter in enumerate(letters):
+            if letter["mark"] != letters[0]["mark"]:
+                raise RankError(
+                    f"rank {rank} does not compute as rank 0 does: its positions differ; expected processors or cards of one kind"
+                )
+            for name, has in zip(self.model.params, letter["there"], strict=True):
+                self._there[name] |= has
+            self.seen.append(Seen(**letter["seen"]))
+        group.heard(letters)
+        self._bucket.add(group.swap)
+
+    def close(self) -> Tally:
+        self._bucket.spread(self._group.swap)
+        return self._bucket.give(self.model.params, self._there)

@@ -22,7 +22,7 @@ from neuprim.cli.operating_words import DRAWN, OPERATING, operating_words
 from neuprim.cli.prune import for_prune, prune
 from neuprim.cli.run_help import COMMON_KEYS, EXAMPLES
 from neuprim.cli.tradeoff import FORMS, for_tradeoff, of_words, tradeoff
-from neuprim.core.errors import DISK, ConfigError, NeuprimError, nearest
+from neuprim.core.errors import ConfigError, NeuprimError, nearest, one_line
 from neuprim.core.notices import warnings_as_lines
 from neuprim.version import __version__
 
@@ -46,19 +46,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with warnings_as_lines():
             return _dispatch(words)
-    except NeuprimError as error:
-        print(f"neuprim: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt as stop:
         print(f"neuprim: interrupted{stop}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # `neuprim tasks | head`; the interpreter's own flush at exit must not fail either
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except OSError as error:
-        if error.errno not in DISK:
+    except (NeuprimError, OSError) as error:
+        line = one_line(error)
+        if line is None:
             raise
-        print(f"neuprim: error: {error.filename or 'writing'}: {error.strerror}", file=sys.stderr)
+        print(f"neuprim: error: {line}", file=sys.stderr)
         return 2
     except SystemExit as stop:  # argparse, after --help and --version
         return stop.code if isinstance(stop.code, int) else 0
@@ -177,7 +175,13 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
 def _run(args: argparse.Namespace) -> int:
     from neuprim.config import compose, compose_all
     from neuprim.config.target import target_words
+    from neuprim.core.train.ranks.place import place_of
 
+    place = place_of()
+    if place is not None:
+        from neuprim.cli.ranks import run_as_rank
+
+        return run_as_rank(place, args.overrides, args.multirun or args.cfg)
     check = not args.cfg
     wanted, words = target_words(args.overrides)
     if wanted is not None and args.multirun:

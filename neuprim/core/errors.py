@@ -21,6 +21,7 @@ __all__ = [
     "NonFiniteError",
     "RankError",
     "nearest",
+    "one_line",
 ]
 
 DISK = (
@@ -84,3 +85,12 @@ def nearest(name: str, choices: Iterable[str], limit: int = 3, prefix: str = "")
     if close:
         return "; did you mean " + " or ".join(repr(prefix + c) for c in close) + "?"
     return "; valid: " + ", ".join(prefix + o for o in options) if options else ""
+
+
+def one_line(error: BaseException) -> str | None:
+    """What is said of an error that a user can act on, in one line; None of a bug, which keeps its traceback."""
+    if isinstance(error, NeuprimError):
+        return " ".join(str(error).split())
+    if isinstance(error, OSError) and error.errno in DISK:
+        return f"{error.filename or 'writing'}: {error.strerror}"
+    return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from neuprim.config import RunConfig, suspects_of
+from neuprim.core.train.ranks import ALONE, Alone
 from neuprim.runs.events import Events, Finishing, silent
 from neuprim.runs.finish import finish
 from neuprim.runs.open import LOGS
@@ -13,23 +14,26 @@ from neuprim.runs.training import train
 __all__ = ["run"]
 
 
-def run(config: RunConfig, events: Events = silent) -> Path:
+def run(config: RunConfig, events: Events = silent, ranks: Alone = ALONE) -> Path:
     """Fit, measure and report; returns the run directory.
 
     Ctrl-C finishes the step, writes a checkpoint and a report, and raises KeyboardInterrupt; a second one stops at once.
 
     Args:
         events: told what happens.
+        ranks: the processes that train this model, each of which calls this with the same configuration; the first one alone writes files.
 
     Raises:
         NeuprimError: the input's fault, or numbers that left the finite; whatever was on disk before is intact.
+        RankError: another rank is gone; what was trained is in the checkpoint.
     """
     directory = config.output_dir
     suspects = suspects_of(config)
     with suspects.watch(directory / LOGS):
-        fitted, interrupted = train(config, suspects, events)
-        events(Finishing("measuring held-out views"))
-        finish(fitted, directory)
+        fitted, interrupted = train(config, suspects, events, ranks=ranks)
+        if ranks.first:
+            events(Finishing("measuring held-out views"))
+            finish(fitted, directory)
     if interrupted:
         raise KeyboardInterrupt
     return directory

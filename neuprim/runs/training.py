@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import json
-import signal
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType
 from typing import Any
 
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint
 from neuprim.core.data import Dataset
-from neuprim.core.errors import CheckpointError
+from neuprim.core.errors import CheckpointError, RankError
 from neuprim.core.io.files import write_text
 from neuprim.core.model.edge import EDGES
 from neuprim.core.render.backends import choose, compiled_ahead
+from neuprim.core.train.ranks import ALONE, Alone
+from neuprim.core.train.ranks.beginning import beginning
 from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.blame import Suspects
 from neuprim.plugins.judging import facts_of
@@ -26,6 +25,7 @@ from neuprim.runs.compile import compiled, compiling, mark_compiled, variant
 from neuprim.runs.curve import open_curve
 from neuprim.runs.events import Events, Note, Preparing, silent
 from neuprim.runs.fit import Fitted, compile_kernels, one_torch_thread, start, steps
+from neuprim.runs.interrupt import interruptible
 
 __all__ = ["COMPILING", "make_ready", "save", "train"]
 
@@ -33,10 +33,15 @@ COMPILING = "compiling kernels, once per installation (about a minute)"
 
 
 def train(
-    config: RunConfig, suspects: Suspects, events: Events = silent, dataset: Dataset | None = None, hold_out: int = 0
+    config: RunConfig,
+    suspects: Suspects,
+    events: Events = silent,
+    dataset: Dataset | None = None,
+    hold_out: int = 0,
+    ranks: Alone = ALONE,
 ) -> tuple[Fitted, bool]:
     """Train until the budget is used or Ctrl-C, which finishes the step; leaves configuration, curve, checkpoint and model in the run's
-    directory either way.
+    directory either way. Of several ranks the first one writes them.
 
     Args:
         suspects: of the configuration, who is watched for crashes around this call.
@@ -48,18 +53,24 @@ def train(
 
     Raises:
         NeuprimError: the input's fault, or numbers that left the finite; whatever was on disk before is intact.
+        RankError: another rank is gone; the first one, if it is there, has written a checkpoint of the last whole step.
     """
     ahead = compiled_ahead(config.renderer) if dataset is None else None  # beside loading; of data that are there nothing is waited for
     edge = config.model.density.get("edge", 0)  # of a density of ours; of another's, whatever the word means there
-    with compiling(None if ahead is None else ahead.name, edge if edge in EDGES else 0) as kernels:
+    with ranks.in_turn(), compiling(None if ahead is None else ahead.name, edge if edge in EDGES else 0) as kernels:
         fitted = start(config, events, dataset, suspects, hold_out)
+        fitted.trainer.join(ranks)
         _resume(fitted, events)
-        config.output_dir.mkdir(parents=True, exist_ok=True)
-        write_text(config.output_dir / "config.yaml", fitted.config.to_yaml())
+        if ranks.first:
+            config.output_dir.mkdir(parents=True, exist_ok=True)
+            write_text(config.output_dir / "config.yaml", fitted.config.to_yaml())
         if kernels.running:
             events(Preparing(COMPILING))
             kernels.wait()
-        return fitted, _train(fitted, events)
+        make_ready(fitted.trainer, events)
+    if ranks.size > 1:
+        ranks.agree("expected the same words, data and output directory on all ranks", beginning(fitted.trainer))
+    return fitted, _train(fitted, events) if ranks.first else _follow(fitted)
 
 
 def make_ready(trainer: Trainer, events: Events = silent) -> None:
@@ -90,11 +101,11 @@ def _resume(fitted: Fitted, events: Events) -> None:
 def _train(fitted: Fitted, events: Events) -> bool:
     """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
     trainer, config = fitted.trainer, fitted.config
-    make_ready(trainer, events)
     curve = open_curve(config.output_dir / "metrics.jsonl", trainer.step)
     last_saved = time.monotonic()
     interrupted = False
-    with _interruptible() as stop, curve, one_torch_thread():
+    with interruptible(terminated=trainer.ranks.size > 1) as stop, curve, one_torch_thread(), _kept(fitted):
+        last = trainer.ranks.last(stop.is_set)
         for report, held_out in steps(trainer, events):
             line: dict[str, Any] = {}
             if held_out is not None:
@@ -108,11 +119,28 @@ def _train(fitted: Fitted, events: Events) -> bool:
             if time.monotonic() - last_saved > config.train.checkpoint_every_seconds:
                 save(fitted)
                 last_saved = time.monotonic()
-            if stop.is_set():
+            if last():
                 interrupted = True
                 break
     save(fitted)
     return interrupted
+
+
+def _follow(fitted: Fitted) -> bool:
+    """The same on a rank that writes nothing."""
+    with interruptible(terminated=True) as stop, one_torch_thread():
+        last = fitted.trainer.ranks.last(stop.is_set)
+        return any(last() for _ in steps(fitted.trainer))
+
+
+@contextmanager
+def _kept(fitted: Fitted) -> Iterator[None]:
+    """A rank that is gone costs no step: what the others have is saved."""
+    try:
+        yield
+    except RankError:
+        save(fitted)
+        raise
 
 
 def save(fitted: Fitted) -> None:
@@ -132,24 +160,3 @@ def save(fitted: Fitted) -> None:
     if dataset.placement is not None:
         extra["world"] = dataset.placement.to_json()
     checkpoint.save_model(config.output_dir / "model.safetensors", trainer.model, config.task, extra, without_zeros=bool(trainer.zeros))
-
-
-@contextmanager
-def _interruptible() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; the second interrupts at once. Outside the main thread Ctrl-C is not ours."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    previous = signal.getsignal(signal.SIGINT)
-
-    def handler(number: int, frame: FrameType | None) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-
-    signal.signal(signal.SIGINT, handler)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, previous)

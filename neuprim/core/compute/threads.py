@@ -11,19 +11,36 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
 
-__all__ = ["core_count", "limited", "parallel_for"]
+__all__ = ["core_count", "limited", "machine_cores", "parallel_for", "sharing"]
 
 _limit: ContextVar[int] = ContextVar("threads", default=0)
 _pools: dict[int, ThreadPoolExecutor] = {}
 _lock = threading.Lock()
+_share = 0
 
 
-def core_count() -> int:
-    """Cores this process may use."""
+def machine_cores() -> int:
+    """Cores that the system lets this process have."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on every platform
         return os.cpu_count() or 1
+
+
+def core_count() -> int:
+    """Cores this process may use: its share, where it has one."""
+    return min(machine_cores(), _share or machine_cores())
+
+
+@contextmanager
+def sharing(threads: int) -> Iterator[None]:
+    """Inside, the whole process has a share of the cores, as there are others that work beside it; 0: all. One at a time."""
+    global _share
+    before, _share = _share, threads
+    try:
+        yield
+    finally:
+        _share = before
 
 
 @contextmanager

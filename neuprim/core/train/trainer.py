@@ -154,11 +154,11 @@ class Trainer:
         try:
             with limited(self.renderer.threads):
                 return self._train_step()
-        except RankError:  # the step is not done: what it drew is drawn again, by whoever goes on from this state
+        except RankError as error:  # the step is not done: what it drew is drawn again, by whoever goes on from this state
             self.order = drawn[0]
             if drawn[1] is not None:
                 self.generator.set_state(drawn[1])
-            raise
+            raise RankError(f"{error}, in step {self.step + 1}", error.told) from error
         except torch.OutOfMemoryError as error:
             camera = self.dataset.train.view(0).camera
             size = f"{camera.width} x {camera.height} pixels"

@@ -63,24 +63,20 @@ class Alone:
 
     Attributes:
         rank, size: its number, and how many there are.
-        asked: whether this process was asked to stop.
     """
 
     rank = 0
     size = 1
-
-    def __init__(self) -> None:
-        self.asked: Callable[[], bool] = lambda: False
 
     @property
     def first(self) -> bool:
         """Whether this is the rank that writes and speaks."""
         return self.rank == 0
 
-    @property
-    def stopping(self) -> bool:
-        """Whether the step that is done is to be the last, because a rank was asked to stop; the same on all of them."""
-        return self.asked()
+    def last(self, asked: Callable[[], bool]) -> Callable[[], bool]:
+        """``asked`` says whether this process was asked to stop; what is returned, whether the step just done is the last one as any rank was,
+        which is the same on all of them."""
+        return asked
 
     def step(self, model: Primitives, elapsed: float, start: float) -> StepViews:
         """What collects the views of a step that began at ``start`` (seconds of ``time.perf_counter``) after ``elapsed`` seconds of training."""
@@ -104,4 +100,4 @@ class Alone:
 
 
 ALONE = Alone()
-"""The process of a run that nobody launched in several. It is never asked to stop."""
+"""The process of a run that nobody launched in several."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
@@ -40,15 +40,16 @@ class Group(Alone):
         wire: the way to the others: ``swap``, ``store``, ``hosted`` and ``close`` of :class:`~neuprim.core.train.ranks.wire.Wire`.
 
     Attributes:
-        sent: bytes that this rank sent in steps.
+        sent: bytes that this rank sent.
+        asked: whether this process was asked to stop.
     """
 
     def __init__(self, place: Place, wire: Any) -> None:
-        super().__init__()
         self.place, self.wire = place, wire
         self.rank, self.size = place.rank, place.size
         self.sent = 0
         self._bucket: Bucket | None = None
+        self.asked: Callable[[], bool] = lambda: False
         self._stopping = False
         self._clock = 0.0
         self._told_at: float | None = None
@@ -57,9 +58,9 @@ class Group(Alone):
 
     # ------------------------------------------------------------ a step
 
-    @property
-    def stopping(self) -> bool:
-        return self._stopping
+    def last(self, asked: Callable[[], bool]) -> Callable[[], bool]:
+        self.asked = asked
+        return lambda: self._stopping
 
     def step(self, model: Primitives, elapsed: float, start: float) -> StepViews:
         return _GroupViews(self, model, elapsed, start)

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from neuprim.core.data import Dataset
-from neuprim.core.errors import ConfigError, NonFiniteError, RankError
 from neuprim.core.train.step import StepReport
 from neuprim.core.train.trainer import Trainer
 from tests.core import tiny

@@ -56,6 +56,10 @@ class _Wire:
         self._threads.hang_up()
 
 
+class Killed(Exception):
+    """Ends a rank as a signal would: it says nothing."""
+
+
 def together(size: int, work: Callable[[Group], T]) -> list[T | Exception]:
     """What ``work`` returns or raises on each of ``size`` ranks; one that raises leaves, as a process would."""
     threads = Threads(size)
@@ -65,7 +69,8 @@ def together(size: int, work: Callable[[Group], T]) -> list[T | Exception]:
         try:
             found = work(group)
         except Exception as error:
-            group.fail(str(error))
+            if not isinstance(error, Killed):
+                group.fail(str(error), isinstance(error, RankError))
             group.close(failed=True)
             return error
         group.pulse.stop()
@@ -73,3 +78,11 @@ def together(size: int, work: Callable[[Group], T]) -> list[T | Exception]:
 
     with ThreadPoolExecutor(size) as pool:
         return list(pool.map(one, range(size)))
+
+
+def done(found: list[T | Exception]) -> list[T]:
+    """The same where no rank may have raised."""
+    for each in found:
+        if isinstance(each, Exception):
+            raise each
+    return found  # type: ignore[return-value]

@@ -45,14 +45,14 @@ def run_as_rank(place: Place, words: list[str], more: bool) -> int:
         raise
     except Exception as error:
         line = one_line(error)
-        told = isinstance(error, RankError) and error.told
         if line is None:
             group.fail(f"{type(error).__name__}: {error}")
             print(f"neuprim: rank {group.rank} failed:", file=sys.stderr)
             raise
-        if not told and group.fail(line):
-            by = "" if group.first or isinstance(error, RankError) else f"rank {group.rank}: "
-            print(f"neuprim: error: {by}{line}", file=sys.stderr, flush=True)
+        if not (isinstance(error, RankError) and error.told):
+            said = group.fail(line, isinstance(error, RankError))
+            if said is not None:
+                print(f"neuprim: error: {said}", file=sys.stderr, flush=True)
         return 2
     finally:
         group.close(failed)
@@ -63,7 +63,7 @@ def _composed(words: list[str], more: bool, group: Group) -> RunConfig:
     from neuprim.config import compose
     from neuprim.config.target import target_words
 
-    if more or target_words(words)[0] is not None:
+    if group.first and (more or target_words(words)[0] is not None):
         raise ConfigError(f"{group.size} processes of torchrun fit one scene together; expected neither -m, nor --cfg, nor a target")
     config = compose(words) if group.first else None
     directory = group.tell({"output_dir": "" if config is None else str(config.output_dir)})[0]["output_dir"]

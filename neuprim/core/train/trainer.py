@@ -158,7 +158,7 @@ class Trainer:
             self.order = drawn[0]
             if drawn[1] is not None:
                 self.generator.set_state(drawn[1])
-            raise RankError(f"{error}, in step {self.step + 1}", error.told) from error
+            raise error if error.told else RankError(f"{error}, in step {self.step + 1}") from error
         except torch.OutOfMemoryError as error:
             camera = self.dataset.train.view(0).camera
             size = f"{camera.width} x {camera.height} pixels"

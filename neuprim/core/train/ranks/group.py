@@ -31,6 +31,9 @@ _LETTER = 2048
 
 _HEAD = 4
 
+LOOK = 0.2
+"""Seconds between two looks at whether another rank is through."""
+
 
 class Group(Alone):
     """This process as one of several.
@@ -140,19 +143,24 @@ class Group(Alone):
                 looks += 1
                 if store.check(["failed"]) or (looks % 25 == 0 and rank in self.pulse.gone(store)):
                     raise self._cause(RankError(f"rank {rank} is gone"))
-                time.sleep(0.2)
+                time.sleep(LOOK)
         except RuntimeError as error:
             raise self._cause(RankError("the store that ranks meet in is gone")) from error
 
     # ------------------------------------------------------------ faults
 
-    def fail(self, text: str) -> bool:
-        """Leave a word for the others that the training ends and why; whether it is this rank's to tell the user, being the first."""
-        own = json.dumps({"rank": self.rank, "text": text[:4000]})
+    def fail(self, line: str, of_ranks: bool = False) -> str | None:
+        """Leave a word for the others that the training ends and why; returns the line that the user must be told, None if another rank was first.
+
+        Args:
+            of_ranks: the line names ranks itself.
+        """
+        said = line if of_ranks or self.first else f"rank {self.rank}: {line}"
+        own = json.dumps({"rank": self.rank, "text": said[:4000]})
         try:
-            return bool(self.wire.store.compare_set("failed", "", own).decode() == own)
+            return said if self.wire.store.compare_set("failed", "", own).decode() == own else None
         except RuntimeError:
-            return True
+            return said
 
     def _cause(self, found: RankError) -> RankError:
         """What is behind a broken connection."""
@@ -179,8 +187,7 @@ class Group(Alone):
 
 
 def _told(text: bytes) -> RankError:
-    word = json.loads(text)
-    return RankError(f"rank {word['rank']}: {word['text']}", told=True)
+    return RankError(json.loads(text)["text"], told=True)
 
 
 class _GroupViews(StepViews):

@@ -10,10 +10,13 @@ import pytest
 import torch
 
 from neuprim.core.data import Dataset
+from neuprim.core.errors import ConfigError
+from neuprim.core.train.ranks import ALONE
+from neuprim.core.train.ranks.group import Group
 from neuprim.core.train.step import StepReport
 from neuprim.core.train.trainer import Trainer
 from tests.core import tiny
-from tests.ranks import together
+from tests.ranks import done, together
 
 STEPS = 30
 STRATEGIES: dict[str, dict[str, Any]] = {
@@ -53,17 +56,13 @@ def trained(size: int, make: Callable[[int], Trainer], views: int = 1) -> None:
     expected = list(alone.run())
     assert [r.change for r in expected if r.change], "the population must have changed, or the test says nothing of it"
 
-    def work(group: Any) -> tuple[Trainer, list[StepReport]]:
+    def work(group: Group) -> tuple[Trainer, list[StepReport]]:
         trainer = make(views)
         trainer.join(group)
         return trainer, list(trainer.run())
 
-    found = together(size, work)
     elapsed = set()
-    for each in found:
-        if isinstance(each, Exception):
-            raise each
-        trainer, reports = each
+    for trainer, reports in done(together(size, work)):
         assert curve(reports) == curve(expected)
         same(trainer, alone)
         elapsed.add(trainer.elapsed)
@@ -81,3 +80,63 @@ def test_exposures_of_photographs_are_shared() -> None:
     dataset = photographs()
     # more views a step than there are: one is seen twice in a step
     trained(4, lambda looks: tiny.trainer(dataset, STEPS, population=STRATEGIES["relocate"], views_per_step=looks, exposure_rate=0.02), 2)
+
+
+def test_a_budget_of_seconds_is_the_first_ranks(scene: Dataset) -> None:
+    def work(group: Group) -> tuple[int, float, list[float]]:
+        trainer = tiny.trainer(scene, 10**9, max_seconds=0.3)
+        trainer.join(group)
+        seconds = [report.seconds for report in trainer.run()]
+        return trainer.step, trainer.elapsed, seconds
+
+    first, second = done(together(2, work))
+    assert first == second
+    steps, elapsed, seconds = first
+    assert steps > 3 and elapsed >= 0.3 and seconds == sorted(seconds)
+
+
+def test_a_state_goes_on_with_any_number_of_ranks(scene: Dataset) -> None:
+    """Six views a step: by three ranks, then by one process, then by two ranks; and by one process throughout."""
+
+    def make(views: int) -> Trainer:
+        return tiny.trainer(scene, STEPS, population=STRATEGIES["relocate"], views_per_step=views)
+
+    whole = make(6)
+    list(whole.run())
+
+    def part(views: int, size: int, state: Any) -> Any:
+        def work(group: Group) -> Any:
+            trainer = make(views)
+            if state is not None:
+                tensors, header = state
+                trainer.load_state({name: value.clone() for name, value in tensors.items()}, header, "state")
+            trainer.join(group)
+            for _ in range(10):
+                trainer.train_step()
+            return trainer
+
+        return done(together(size, work))[0] if size > 1 else work(ALONE)  # type: ignore[arg-type]
+
+    trainer = part(2, 3, None)
+    trainer = part(6, 1, trainer.state())
+    trainer = part(3, 2, trainer.state())
+    same(trainer, whole)
+
+
+def test_one_rank_that_is_asked_to_stop_stops_all_after_the_same_step(scene: Dataset) -> None:
+    def work(group: Group) -> int:
+        trainer = tiny.trainer(scene, 1000)
+        trainer.join(group)
+        last = group.last(lambda: group.rank == 1 and trainer.step >= 4)
+        assert any(last() for _ in trainer.run())
+        return trainer.step
+
+    assert done(together(3, work)) == [5, 5, 5]
+
+
+def test_voxels_alone_have_no_views_to_share(scene: Dataset) -> None:
+    trainer = tiny.trainer(scene)
+    trainer.settings = replace(trainer.settings, supervision="voxels")
+    with pytest.raises(ConfigError, match=r"train\.supervision=voxels: there are no views that 2 ranks could share; expected one process"):
+        trainer.join(type("Two", (), {"size": 2})())
+    trainer.join(ALONE)

@@ -1,0 +1,178 @@
+"""Two ranks of one thread against one process of two threads and of one: views per second, and bytes that a step sends.
+
+    python benchmarks/ranks.py [--scenes solids smoke_fire lit_solids large] [--rounds 7] [--seconds 3] [--docs] [--print]
+
+Both ranks of a torchrun hold the same trainer, in the middle of its budget, with a fixed population. They train in turns: together; the first one
+alone with the same views a step, on two threads and on one; and alone with one view a step. So all meet the same noise of a shared machine, and the
+ratios are medians of those of each round. Results go to benchmarks/results/ranks.json; --docs puts the table between the markers of docs/scaling.md,
+--print only prints what was recorded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from shared.tables import ROOT, Table, between_markers
+
+RESULTS, PAGE = Path(__file__).parent / "results" / "ranks.json", ROOT / "docs" / "scaling.md"
+SCENES = {
+    "solids": ("task=static", "scene=solids", "scene.size=200"),
+    "smoke_fire": ("task=dynamic", "scene=smoke_fire", "scene.size=64"),
+    "lit_solids": ("task=relight", "scene=lit_solids", "scene.size=128"),
+    "large": ("task=static", "scene=solids", "scene.size=400", "model.primitives=20000"),
+}
+TITLES = {"large": "`solids`, more primitives"}
+WAYS = {
+    "together": "2 ranks × 1 thread",
+    "two threads": "1 process × 2 threads",
+    "one thread": "1 process × 1 thread",
+    "single view": "1 process × 2 threads, a view a step",
+}
+
+
+def trainers(scene: str, group: Any) -> dict[str, Any]:
+    """The same training in every way; on ranks but the first only what they take part in."""
+    from neuprim.config import compose
+    from neuprim.runs.fit import start
+    from neuprim.runs.training import make_ready
+
+    words = [*SCENES[scene], "train.population.strategy=fixed", "train.population.grow_from=1", "seed=0"]
+    made: dict[str, Any] = {}
+    dataset = None
+    for way in WAYS if group.first else ("together",):
+        config = compose(words, check_output=False)
+        views = 2 if way in ("two threads", "one thread") else 1
+        config = replace(config, train=replace(config.train, views_per_step=views))
+        config = replace(config, renderer=replace(config.renderer, device="cpu", threads=1 if way in ("together", "one thread") else 2))
+        fitted = start(config, dataset=dataset)
+        dataset = fitted.dataset
+        trainer = fitted.trainer
+        if way == "together":
+            trainer.join(group)
+        make_ready(trainer)
+        trainer.step = (trainer.settings.iterations or 0) // 2
+        made[way] = trainer
+    return made
+
+
+def measure(scene: str, rounds: int, seconds: float, group: Any) -> dict[str, Any]:
+    """Seconds per view of every way and round, by the first rank's clock."""
+    from neuprim.runs.fit import one_torch_thread
+
+    with group.in_turn():
+        made = trainers(scene, group)
+
+    def turn(way: str, steps: int) -> float:
+        begun = time.perf_counter()
+        for _ in range(steps):
+            made[way].train_step()
+        return (time.perf_counter() - begun) / steps
+
+    with one_torch_thread():
+        for way in made:
+            turn(way, 10)
+        steps = group.tell({"steps": max(round(seconds / turn("together", 10)), 10)})[0]["steps"]
+        times: dict[str, list[float]] = {way: [] for way in WAYS}
+        sent = 0
+        for _ in range(rounds):
+            for way in WAYS:
+                if way in made:
+                    before = group.sent
+                    if way == "together":
+                        group.tell({})  # the others have waited for the first rank's turns
+                        before = group.sent
+                    took = turn(way, steps)
+                    times[way].append(took / (1 if way == "single view" else 2))
+                    if way == "together":
+                        sent = (group.sent - before) // steps
+    trainer = made["together"]
+    view = trainer.dataset.train.view(0).camera
+    numbers = sum(value.numel() for value in trainer.model.params.values())
+    return {
+        "scene": scene, "size": [view.width, view.height], "primitives": trainer.model.count, "numbers": numbers,
+        "sent": sent, "slice": trainer.ranks.bucket(trainer.model).width, "steps": steps, "seconds": times,
+    }  # fmt: skip
+
+
+def worker(scenes: list[str], rounds: int, seconds: float, out: Path) -> None:
+    """What each process of the torchrun does."""
+    from neuprim.core.train.ranks.group import Group
+    from neuprim.core.train.ranks.place import place_of
+    from neuprim.core.train.ranks.wire import Wire
+
+    place = place_of()
+    assert place is not None and place.size == 2
+    group = Group(place, Wire(place, os.environ))
+    for scene in scenes:
+        found = measure(scene, rounds, seconds, group)
+        if group.first:
+            record = json.loads(out.read_text()) if out.exists() else {}
+            record[scene] = found
+            out.write_text(json.dumps(record, indent=1) + "\n")
+    group.close()
+
+
+def table(record: dict[str, Any]) -> str:
+    rows = Table("scene", "image", "primitives", "views/s, 2 ranks × 1 thread", "of 1 process × 2 threads, 2 views a step", "of the same, 1 view a step",
+                 "of 1 process × 1 thread", "sent per step and rank, measured", "by the formula")  # fmt: skip
+    for scene, found in record["scenes"].items():
+        times = found["seconds"]
+
+        def ratio(way: str, times: dict[str, list[float]] = times) -> str:
+            ratios = [other / own for own, other in zip(times["together"], times[way], strict=True)]
+            return f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
+
+        width, height = found["size"]
+        formula = 4 * (found["numbers"] + 2 * found["primitives"]) + 2048
+        rows.row(
+            TITLES.get(scene, f"`{scene}`"), f"{width}×{height}", f"{found['primitives']:,}", f"{1 / statistics.median(times['together']):.1f}",
+            ratio("two threads"), ratio("single view"), ratio("one thread"), f"{found['sent']:,} B", f"{formula:,} B",
+        )  # fmt: skip
+    return f"{rows}\n\nMedians of {record['rounds']} rounds (smallest to largest), on {record['cpu']}, {record['cores']} cores that other work shared."
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--seconds", type=float, default=3.0, help="of a turn")
+    parser.add_argument("--docs", action="store_true")
+    parser.add_argument("--print", action="store_true")
+    parser.add_argument("--worker", type=Path, metavar="OUT", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.worker is not None:
+        worker(args.scenes, args.rounds, args.seconds, args.worker)
+        return
+    from neuprim.core.compute.machine import cpu_name
+    from neuprim.core.compute.threads import core_count
+
+    record = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"scenes": {}}
+    if not args.print:
+        out = RESULTS.with_suffix(".part")
+        out.unlink(missing_ok=True)
+        more = ["--scenes", *args.scenes, "--rounds", str(args.rounds), "--seconds", str(args.seconds), "--worker", str(out)]
+        subprocess.run([sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", __file__, *more], check=True)
+        record = {
+            "cpu": cpu_name(),
+            "cores": core_count(),
+            "rounds": args.rounds,
+            "scenes": {**record["scenes"], **json.loads(out.read_text())},
+        }
+        RESULTS.write_text(json.dumps(record, indent=1) + "\n")
+        out.unlink()
+    text = table(record)
+    if args.docs:
+        between_markers(PAGE, "ranks", text)
+
+
+if __name__ == "__main__":
+    main()

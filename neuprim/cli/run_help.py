@@ -27,4 +27,5 @@ examples:
   neuprim run task=dynamic scene=vdb scene.vdb=DIR scene.frames=0:100:2
   neuprim run task=static scene=solids
   neuprim run task=static scene=blender scene.path=DIR preset=paper
-  neuprim run -m model.primitives=200,1000 train.max_seconds=60"""
+  neuprim run -m model.primitives=200,1000 train.max_seconds=60
+  torchrun --nproc-per-node 2 -m neuprim run task=static scene=solids      (one scene by two processes)"""

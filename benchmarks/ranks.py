@@ -25,9 +25,9 @@ from shared.tables import ROOT, Table, between_markers
 
 RESULTS, PAGE = Path(__file__).parent / "results" / "ranks.json", ROOT / "docs" / "scaling.md"
 SCENES = {
-    "solids": ("task=static", "scene=solids", "scene.size=200"),
-    "smoke_fire": ("task=dynamic", "scene=smoke_fire", "scene.size=64"),
-    "lit_solids": ("task=relight", "scene=lit_solids", "scene.size=128"),
+    "solids": ("task=static", "scene=solids"),
+    "smoke_fire": ("task=dynamic", "scene=smoke_fire"),
+    "lit_solids": ("task=relight", "scene=lit_solids"),
     "large": ("task=static", "scene=solids", "scene.size=400", "model.primitives=20000"),
 }
 TITLES = {"large": "`solids`, more primitives"}
@@ -99,7 +99,7 @@ def measure(scene: str, rounds: int, seconds: float, group: Any) -> dict[str, An
     numbers = sum(value.numel() for value in trainer.model.params.values())
     return {
         "scene": scene, "size": [view.width, view.height], "primitives": trainer.model.count, "numbers": numbers,
-        "sent": sent, "slice": trainer.ranks.bucket(trainer.model).width, "steps": steps, "seconds": times,
+        "sent": sent, "slice": trainer.ranks.bucket(trainer.model, 1).width, "steps": steps, "seconds": times,
     }  # fmt: skip
 
 

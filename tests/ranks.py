@@ -29,15 +29,14 @@ class Threads:
     def wire(self, rank: int) -> Any:
         return _Wire(self, rank)
 
-    def swap(self, rank: int, rows: Tensor) -> Tensor:
+    def swap(self, rank: int, rows: Tensor, found: Tensor) -> None:
         try:
             self._rows[rank] = rows.clone()
             self._barrier.wait()
-            found = torch.stack([given[rank] for given in self._rows])
+            torch.stack([given[rank] for given in self._rows], out=found)
             self._barrier.wait()
         except threading.BrokenBarrierError:
             raise RankError("broken") from None
-        return found
 
     def hang_up(self) -> None:
         self._barrier.abort()
@@ -49,8 +48,8 @@ class _Wire:
     def __init__(self, threads: Threads, rank: int) -> None:
         self._threads, self.rank, self.store = threads, rank, threads.store
 
-    def swap(self, rows: Tensor) -> Tensor:
-        return self._threads.swap(self.rank, rows)
+    def swap(self, rows: Tensor, found: Tensor) -> None:
+        self._threads.swap(self.rank, rows, found)
 
     def close(self) -> None:
         self._threads.hang_up()

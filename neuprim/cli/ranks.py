@@ -102,9 +102,9 @@ def _fit(config: RunConfig, words: Sequence[str], group: Group) -> bool:
     from neuprim.runs.events import silent
     from neuprim.runs.run import run
 
-    command = shlex.join(
-        ["torchrun", "--nproc-per-node", str(group.place.local_size), "-m", "neuprim", "run", *resuming(words, config.output_dir)]
-    )
+    place = group.place
+    launcher = f"torchrun --nproc-per-node {place.local_size}" if place.size == place.local_size else "torchrun …"
+    command = f"{launcher} -m {shlex.join(['neuprim', 'run', *resuming(words, config.output_dir)])}"
     try:
         if not group.first:
             with warnings.catch_warnings():

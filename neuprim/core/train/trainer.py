@@ -175,8 +175,9 @@ class Trainer:
         for value in model.params.values():
             value.grad = None
 
-        looks = 0 if self.settings.supervision == "voxels" else self.settings.views_per_step * self.ranks.size
-        step = self.ranks.step(model, self.elapsed, start)
+        views = 0 if self.settings.supervision == "voxels" else self.settings.views_per_step
+        looks = views * self.ranks.size
+        step = self.ranks.step(model, views, self.elapsed, start)
         known: PointStep | None = None
         for place, index, background, following in self._deal(looks):
             seen = self._look(progress, index, background, following)

@@ -78,8 +78,8 @@ class Alone:
         which is the same on all of them."""
         return asked
 
-    def step(self, model: Primitives, elapsed: float, start: float) -> StepViews:
-        """What collects the views of a step that began at ``start`` (seconds of ``time.perf_counter``) after ``elapsed`` seconds of training."""
+    def step(self, model: Primitives, views: int, elapsed: float, start: float) -> StepViews:
+        """What collects a step, of so many ``views`` of each rank, that began at ``start`` (seconds of ``time.perf_counter``) after ``elapsed`` seconds of training."""
         return StepViews(model)
 
     def spent(self, elapsed: float, start: float) -> float:

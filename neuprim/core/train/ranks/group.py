@@ -20,7 +20,7 @@ from neuprim.core.errors import RankError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Tally
 from neuprim.core.train.ranks.alone import Alone, Seen, StepViews
-from neuprim.core.train.ranks.bucket import Bucket
+from neuprim.core.train.ranks.bucket import Bucket, Pair
 from neuprim.core.train.ranks.place import Place
 from neuprim.core.train.ranks.pulse import Pulse
 
@@ -65,8 +65,8 @@ class Group(Alone):
         self.asked = asked
         return lambda: self._stopping
 
-    def step(self, model: Primitives, elapsed: float, start: float) -> StepViews:
-        return _GroupViews(self, model, elapsed, start)
+    def step(self, model: Primitives, views: int, elapsed: float, start: float) -> StepViews:
+        return _GroupViews(self, model, views, elapsed, start)
 
     def spent(self, elapsed: float, start: float) -> float:
         """The first rank's clock as it told it in this step; what it spends afterwards counts in the next."""
@@ -74,10 +74,11 @@ class Group(Alone):
         self._tail = time.perf_counter() - self._told_at
         return self._clock
 
-    def bucket(self, model: Primitives) -> Bucket:
-        """The buffer for the model as it is now."""
-        if self._bucket is None or not self._bucket.fits(model.params):
-            self._bucket = Bucket(model.params, self.size)
+    def bucket(self, model: Primitives, views: int) -> Bucket:
+        """The buffer for the model as it is now, and for letters about so many views."""
+        if self._bucket is None or not self._bucket.fits(model.params, views * _LETTER):
+            pair = self.size == 2 and views == 1
+            self._bucket = Pair(model.params, self.rank, _LETTER) if pair else Bucket(model.params, self.size, views * _LETTER)
         return self._bucket
 
     def time(self, elapsed: float, start: float) -> float:
@@ -92,33 +93,39 @@ class Group(Alone):
 
     # ------------------------------------------------------------ talking
 
-    def swap(self, rows: Tensor) -> Tensor:
-        """(R, n) rows, one for each rank -> (R, n) rows, one from each.
+    def swap(self, rows: Tensor, found: Tensor) -> None:
+        """Send (R, n) rows, one to each rank, and find (R, n) rows, one from each.
 
         Raises:
             RankError: a rank failed or is gone; names it.
         """
         self.sent += rows[0].numel() * rows.element_size() * (self.size - 1)
         try:
-            return torch.as_tensor(self.wire.swap(rows))
+            self.wire.swap(rows, found)
         except RankError as error:
             raise self._cause(error) from error
 
     def tell(self, letter: dict[str, Any]) -> list[dict[str, Any]]:
         """Tell all ranks the same; returns what each of them told, by rank. It must be what JSON can say."""
+        return self.tell_by(self._all_get, letter, _LETTER)
+
+    def tell_by(self, post: Callable[[bytes], list[bytes]], letter: dict[str, Any], room: int) -> list[dict[str, Any]]:
+        """The same by another way, which brings ``room`` bytes of each rank to each; what is longer follows by the usual one."""
         text = json.dumps(letter).encode()
         whole = len(text).to_bytes(_HEAD, "little") + text
-        first = self._all_get(whole[:_LETTER].ljust(_LETTER, b"\0"))
+        first = post(whole[:room].ljust(room, b"\0"))
         lengths = [_HEAD + int.from_bytes(part[:_HEAD], "little") for part in first]
-        rest = max(lengths) - _LETTER
+        rest = max(lengths) - room
         if rest > 0:
-            second = self._all_get(whole[_LETTER:].ljust(rest, b"\0"))
+            second = self._all_get(whole[room:].ljust(rest, b"\0"))
             first = [a + b for a, b in zip(first, second, strict=True)]
         return [json.loads(part[_HEAD:length]) for part, length in zip(first, lengths, strict=True)]
 
     def _all_get(self, text: bytes) -> list[bytes]:
-        row = torch.frombuffer(bytearray(text), dtype=torch.uint8)
-        return [part.numpy().tobytes() for part in self.swap(row.expand(self.size, -1))]
+        rows = torch.frombuffer(bytearray(text * self.size), dtype=torch.uint8).view(self.size, -1)
+        found = torch.empty_like(rows)
+        self.swap(rows, found)
+        return [part.numpy().tobytes() for part in found]
 
     def agree(self, what: str, facts: dict[str, Any]) -> None:
         letters = self.tell(facts)
@@ -193,30 +200,33 @@ def _told(text: bytes) -> RankError:
 class _GroupViews(StepViews):
     """The views of a step: this rank's in their rounds, a view of each rank in a round."""
 
-    def __init__(self, group: Group, model: Primitives, elapsed: float, start: float) -> None:
+    def __init__(self, group: Group, model: Primitives, views: int, elapsed: float, start: float) -> None:
         super().__init__(model)
-        self._group, self._bucket, self._when = group, group.bucket(model), (elapsed, start)
-        self._there = dict.fromkeys(model.params, False)
+        self._group, self._bucket, self._when = group, group.bucket(model, views), (elapsed, start)
+        self._there: list[list[bool]] = []
         # of all bits of all positions: a rank that computes otherwise is found before its gradients count
         self._mark = int(model.params["means"].detach().view(torch.int32).sum())
 
     def add(self, seen: Seen, tally: Tally) -> None:
-        group = self._group
-        there = self._bucket.take(self.model.params, tally)
-        letters = group.tell(
-            {"mark": self._mark, "clock": group.time(*self._when), "stop": group.asked(), "there": there, "seen": asdict(seen)}
-        )
-        for rank, letter in enumerate(letters):
-            if letter["mark"] != letters[0]["mark"]:
+        self.seen.append(seen)
+        self._there.append(self._bucket.take(self.model.params, tally))
+        self._bucket.add(self._group.swap)
+
+    def close(self) -> Tally:
+        group, bucket = self._group, self._bucket
+        letter = {
+            "mark": self._mark,
+            "clock": group.time(*self._when),
+            "stop": group.asked(),
+            "there": [any(has) for has in zip(*self._there, strict=True)],
+            "seen": [asdict(seen) for seen in self.seen],
+        }
+        letters = group.tell_by(lambda text: bucket.spread(group.swap, text), letter, bucket.letter)
+        for rank, other in enumerate(letters):
+            if other["mark"] != letters[0]["mark"]:
                 raise RankError(
                     f"rank {rank} does not compute as rank 0 does: its positions differ; expected processors or cards of one kind"
                 )
-            for name, has in zip(self.model.params, letter["there"], strict=True):
-                self._there[name] |= has
-            self.seen.append(Seen(**letter["seen"]))
         group.heard(letters)
-        self._bucket.add(group.swap)
-
-    def close(self) -> Tally:
-        self._bucket.spread(self._group.swap)
-        return self._bucket.give(self.model.params, self._there)
+        self.seen = [Seen(**seen) for views in zip(*(other["seen"] for other in letters), strict=True) for seen in views]
+        return bucket.give(self.model.params, [any(has) for has in zip(*(other["there"] for other in letters), strict=True)])

@@ -46,18 +46,16 @@ class Wire:
                 f"rank {place.rank} of {place.size} cannot meet the others at {place.address} ({' '.join(str(error).split())[:200]})"
             ) from error
 
-    def swap(self, rows: Tensor) -> Tensor:
-        """(R, n) rows, one for each rank -> (R, n) rows, one from each.
+    def swap(self, rows: Tensor, found: Tensor) -> None:
+        """Send (R, n) rows, one to each rank, and find (R, n) rows, one from each.
 
         Raises:
             RankError: a rank is gone; without its name.
         """
-        found = torch.empty(rows.shape, dtype=rows.dtype, device=rows.device)
         try:
-            dist.all_to_all_single(found, rows.contiguous())
+            dist.all_to_all_single(found, rows)
         except RuntimeError as error:  # of gloo: a closed connection, or nothing for too long
             raise RankError(f"the connection between ranks broke ({' '.join(str(error).split())[:200]})") from error
-        return found
 
     def close(self) -> None:
         """Leave."""

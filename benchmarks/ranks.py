@@ -1,11 +1,11 @@
 """Two ranks of one thread against one process of two threads and of one: views per second, and bytes that a step sends.
 
-    python benchmarks/ranks.py [--scenes solids smoke_fire lit_solids large] [--rounds 25] [--seconds 0.5] [--docs] [--print]
+    python benchmarks/ranks.py [--parts pace steps] [--scenes solids smoke_fire lit_solids large] [--rounds 25] [--seconds 0.5] [--docs] [--print]
 
 Both ranks of a torchrun hold the same trainer, in the middle of its budget, with a fixed population. They train in turns: together; the first one
 alone with the same views a step, on two threads and on one; and alone with one view a step. So all meet the same noise of a shared machine, and the
-ratios are medians of those of each round, and ratios of the fastest turns. Results go to benchmarks/results/ranks.json; --docs puts the table between the markers of docs/scaling.md,
---print only prints what was recorded.
+ratios are medians of those of each round, and ratios of the fastest turns. `steps` trains with as many views in fewer, larger steps.
+Results go to benchmarks/results/ranks.json; --docs puts the tables between the markers of docs/scaling.md, --print only prints what was recorded.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from shared.tables import ROOT, Table, between_markers
+from shared.tables import ROOT, Table, between_markers, spread
 
 RESULTS, PAGE = Path(__file__).parent / "results" / "ranks.json", ROOT / "docs" / "scaling.md"
 SCENES = {
@@ -37,6 +37,9 @@ WAYS = {
     "one thread": "1 process × 1 thread",
     "single view": "1 process × 2 threads, a view a step",
 }
+
+
+BUDGET, VIEWS = ("task=static", "scene=solids", "scene.size=128", "model.primitives=1500"), 2400
 
 
 def trainers(scene: str, group: Any) -> dict[str, Any]:
@@ -143,11 +146,38 @@ def table(record: dict[str, Any]) -> str:
     return f"{rows}\n\n{note}"
 
 
+def larger_steps(seeds: int) -> dict[str, Any]:
+    """PSNR on the test views after as many views in fewer, larger steps, by one process: several ranks train the same."""
+    from neuprim.config import compose
+    from neuprim.runs.fit import fit
+
+    found: dict[str, Any] = {"words": list(BUDGET), "views": VIEWS, "psnr": {}}
+    for views in (1, 2, 4, 8):
+        words = [*BUDGET, f"train.iterations={VIEWS // views}", f"train.views_per_step={views}", f"train.population.every={200 // views}"]
+        runs = [fit(compose([*words, f"seed={seed}"], check_output=False)).metrics()["psnr"] for seed in range(seeds)]
+        found["psnr"][str(views)] = runs
+        print(f"{views} views a step: {spread(runs, 2)} dB", flush=True)
+    return found
+
+
+def table_of_steps(found: dict[str, Any]) -> str:
+    rows = Table("views a step, of all ranks together", "steps", "PSNR")
+    for views, values in found["psnr"].items():
+        rows.row(views, f"{found['views'] // int(views):,}", f"{spread(values, 2)} dB")
+    seeds = len(next(iter(found["psnr"].values())))
+    return (
+        f"{rows}\n\n`neuprim run {' '.join(found['words'])}`, {found['views']:,} views in all, rates as for one view a step, means of {seeds} seeds "
+        "± half the spread."
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
     parser.add_argument("--rounds", type=int, default=25)
     parser.add_argument("--seconds", type=float, default=0.5, help="of a turn")
+    parser.add_argument("--seeds", type=int, default=2, help="of the training with larger steps")
+    parser.add_argument("--parts", nargs="+", default=["pace", "steps"], choices=["pace", "steps"])
     parser.add_argument("--docs", action="store_true")
     parser.add_argument("--print", action="store_true")
     parser.add_argument("--worker", type=Path, metavar="OUT", help=argparse.SUPPRESS)
@@ -159,22 +189,28 @@ def main() -> None:
     from neuprim.core.compute.threads import core_count
 
     record = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"scenes": {}}
-    if not args.print:
+    if "pace" in args.parts and not args.print:
         out = RESULTS.with_suffix(".part")
         out.unlink(missing_ok=True)
         more = ["--scenes", *args.scenes, "--rounds", str(args.rounds), "--seconds", str(args.seconds), "--worker", str(out)]
         subprocess.run([sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", __file__, *more], check=True)
-        record = {
+        record |= {
             "cpu": cpu_name(),
             "cores": core_count(),
             "rounds": args.rounds,
             "scenes": {**record["scenes"], **json.loads(out.read_text())},
         }
-        RESULTS.write_text(json.dumps(record, indent=1) + "\n")
         out.unlink()
-    text = table(record)
-    if args.docs:
-        between_markers(PAGE, "ranks", text)
+    if "steps" in args.parts and not args.print:
+        record["larger steps"] = larger_steps(args.seeds)
+    if not args.print:
+        RESULTS.write_text(json.dumps(record, indent=1) + "\n")
+    tables = {"ranks": table(record)} if record["scenes"] else {}
+    if "larger steps" in record:
+        tables["larger-steps"] = table_of_steps(record["larger steps"])
+    for name, text in tables.items():
+        if args.docs:
+            between_markers(PAGE, name, text)
 
 
 if __name__ == "__main__":

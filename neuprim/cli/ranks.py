@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import shlex
+import signal
 import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING
 
 from neuprim.core.errors import BackendUnavailable, ConfigError, RankError, one_line
@@ -36,13 +38,21 @@ def run_as_rank(place: Place, words: list[str], more: bool) -> int:
 
     group = Group(place, Wire(place, os.environ))
     failed = True
+
+    def terminated(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        raise group.cause(RankError("ended by SIGTERM"))
+
+    before = signal.signal(signal.SIGTERM, terminated)  # torchrun sends it where another rank died; a training listens for it itself
     try:
         with sharing(max(machine_cores() // place.local_size, 1)):
             failed = _fit(_composed(words, more, group), words, group)
         return 0
     except KeyboardInterrupt:
         group.fail("interrupted")
-        raise
+        if group.first:
+            raise
+        return 130
     except Exception as error:
         line = one_line(error)
         if line is None:
@@ -56,6 +66,7 @@ def run_as_rank(place: Place, words: list[str], more: bool) -> int:
         return 2
     finally:
         group.close(failed)
+        signal.signal(signal.SIGTERM, before)
 
 
 def _composed(words: list[str], more: bool, group: Group) -> RunConfig:

@@ -19,6 +19,7 @@ from torch import Tensor
 from neuprim.core.errors import RankError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Tally
+from neuprim.core.train.ranks import pulse
 from neuprim.core.train.ranks.alone import Alone, Seen, StepViews
 from neuprim.core.train.ranks.bucket import Bucket, Pair
 from neuprim.core.train.ranks.place import Place
@@ -103,7 +104,7 @@ class Group(Alone):
         try:
             self.wire.swap(rows, found)
         except RankError as error:
-            raise self._cause(error) from error
+            raise self.cause(error) from error
 
     def tell(self, letter: dict[str, Any]) -> list[dict[str, Any]]:
         """Tell all ranks the same; returns what each of them told, by rank. It must be what JSON can say."""
@@ -148,11 +149,11 @@ class Group(Alone):
         try:
             while not store.check([f"through/{rank}"]):
                 looks += 1
-                if store.check(["failed"]) or (looks % 25 == 0 and rank in self.pulse.gone(store)):
-                    raise self._cause(RankError(f"rank {rank} is gone"))
+                if store.check(["failed"]) or (looks % 100 == 0 and rank in self.pulse.gone(store, pulse.LONG_SILENCE)):
+                    raise self.cause(RankError(f"rank {rank} is gone"))
                 time.sleep(LOOK)
         except RuntimeError as error:
-            raise self._cause(RankError("the store that ranks meet in is gone")) from error
+            raise self.cause(RankError("the store that ranks meet in is gone")) from error
 
     # ------------------------------------------------------------ faults
 
@@ -169,13 +170,13 @@ class Group(Alone):
         except RuntimeError:
             return said
 
-    def _cause(self, found: RankError) -> RankError:
-        """What is behind a broken connection."""
+    def cause(self, found: RankError) -> RankError:
+        """What is behind a sign that a rank is gone, such as a broken connection; ``found`` itself where nothing is."""
         store = self.wire.store
         try:
             if store.check(["failed"]):
                 return _told(store.get("failed"))
-            gone = self.pulse.gone(store)
+            gone = self.pulse.gone(store, pulse.SILENCE)
             if store.check(["failed"]):
                 return _told(store.get("failed"))
         except RuntimeError:
@@ -188,7 +189,7 @@ class Group(Alone):
     def close(self, failed: bool = False) -> None:
         """Leave the others."""
         if failed and self.wire.hosted and self.first:
-            time.sleep(4.0)  # the others look into the store for the cause, and it goes with this process
+            time.sleep(1.5 * pulse.SILENCE)  # the others look into the store for the cause, and it goes with this process
         self.pulse.stop()
         self.wire.close()
 

@@ -15,8 +15,11 @@ __all__ = ["Pulse"]
 BEAT = 0.25
 """Seconds between two counts."""
 
-SILENCE = 2.5
-"""Seconds without a count after which a rank is gone; a busy processor delays a thread, but not for so long."""
+SILENCE = 4.0
+"""Seconds without a count after which a rank is gone, where one surely is: a busy processor delays a thread, but not for so long."""
+
+LONG_SILENCE = 60.0
+"""The same where there is no other sign of it: compiled code that does not let go of Python may hold up a thread for a while."""
 
 
 class Pulse:
@@ -42,8 +45,8 @@ class Pulse:
             except RuntimeError:  # the store is gone: so is torchrun, or the rank that held it
                 return
 
-    def gone(self, store: Any) -> list[int]:
-        """Ranks whose count stands still; those that never counted among them. ``store`` is the caller's own.
+    def gone(self, store: Any, silence: float) -> list[int]:
+        """Ranks whose count stands still for that many seconds; those that never counted among them. ``store`` is the caller's own.
 
         Raises:
             RuntimeError: the store is gone.
@@ -52,7 +55,7 @@ class Pulse:
         def counts() -> list[bytes]:
             return [store.get(f"pulse/{r}") if store.check([f"pulse/{r}"]) else b"" for r in range(self.size)]
 
-        before, until = counts(), time.monotonic() + SILENCE
+        before, until = counts(), time.monotonic() + silence
         silent = set(range(self.size)) - {self.rank}
         while silent and time.monotonic() < until:
             time.sleep(BEAT)

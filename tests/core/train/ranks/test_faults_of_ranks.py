@@ -22,6 +22,7 @@ from tests.ranks import Killed, done, together
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pulse, "BEAT", 0.05)
     monkeypatch.setattr(pulse, "SILENCE", 1.0)
+    monkeypatch.setattr(pulse, "LONG_SILENCE", 1.0)
     monkeypatch.setattr(groups, "LOOK", 0.02)
 
 

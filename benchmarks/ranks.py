@@ -1,6 +1,6 @@
 """Two ranks of one thread against one process of two threads and of one: views per second, and bytes that a step sends.
 
-    python benchmarks/ranks.py [--parts pace steps] [--scenes solids smoke_fire lit_solids large] [--rounds 25] [--seconds 0.5] [--docs] [--print]
+    python benchmarks/ranks.py [--parts pace steps] [--scenes solids smoke_fire lit_solids large] [--rounds 15] [--seconds 0.5] [--docs] [--print]
 
 Both ranks of a torchrun hold the same trainer, in the middle of its budget, with a fixed population. They train in turns: together; the first one
 alone with the same views a step, on two threads and on one; and alone with one view a step. So all meet the same noise of a shared machine, and the
@@ -26,8 +26,8 @@ from shared.tables import ROOT, Table, between_markers, spread
 RESULTS, PAGE = Path(__file__).parent / "results" / "ranks.json", ROOT / "docs" / "scaling.md"
 SCENES = {
     "solids": ("task=static", "scene=solids"),
-    "smoke_fire": ("task=dynamic", "scene=smoke_fire"),
-    "lit_solids": ("task=relight", "scene=lit_solids"),
+    "smoke_fire": ("task=dynamic", "scene=smoke_fire", "scene.size=64"),
+    "lit_solids": ("task=relight", "scene=lit_solids", "scene.size=128"),
     "large": ("task=static", "scene=solids", "scene.size=400", "model.primitives=20000"),
 }
 TITLES = {"large": "`solids`, more primitives"}
@@ -174,7 +174,7 @@ def table_of_steps(found: dict[str, Any]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
-    parser.add_argument("--rounds", type=int, default=25)
+    parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--seconds", type=float, default=0.5, help="of a turn")
     parser.add_argument("--seeds", type=int, default=2, help="of the training with larger steps")
     parser.add_argument("--parts", nargs="+", default=["pace", "steps"], choices=["pace", "steps"])

@@ -45,7 +45,7 @@ def of_views(seen: Sequence[Seen]) -> tuple[float, dict[str, float], float, str]
     last, others, looks = seen[-1], seen[:-1], len(seen)
     parts = {**last.parts, **last.more}
     if not others:
-        return last.cost, parts, last.psnr, last.name
-    cost = last.cost + sum(view.loss for view in others) / looks
+        return last.loss, parts, last.psnr, last.name
+    cost = last.loss + sum(view.loss for view in others) / looks
     parts |= {part: sum(view.parts[part] for view in seen) / looks for part in last.parts}
     return cost, parts, sum(view.psnr for view in seen) / looks, f"{last.name} and {looks - 1} more"

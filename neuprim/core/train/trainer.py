@@ -182,21 +182,23 @@ class Trainer:
         for place, index, background, following in self._deal(looks):
             seen = self._look(progress, index, background, following)
             loss = seen.loss / looks if looks > 1 else seen.loss
-            if place == looks - 1:  # points and regularisers go with the last view, whoever looks at it
+            last = place == looks - 1
+            if last:  # points and regularisers go with the last view, whoever looks at it
                 known = self._look_inside() if self._points_due() else None
                 loss = self._beside(loss, known)
             elif place >= looks - self.ranks.size and self._points_due():
                 self._draw_points()  # another rank looks at them
-            cost = self._go_back(loss, seen, known)
+            cost = self._go_back(loss, loss if last else seen.loss, seen, known)
             gain = None if self.exposures is None else self.exposures.gradient(index)
             more = {} if known is None else known.parts
-            step.add(Seen(index, seen.name, seen.loss.item(), seen.psnr, seen.parts, cost, more, gain), seen.tally)
+            step.add(Seen(index, seen.name, cost, seen.psnr, seen.parts, more, gain), seen.tally)
             del seen, loss  # and what the frame kept, before the next one is drawn
         if looks:
             tally = step.close()
         else:
             known = self._look_inside()
-            cost = self._go_back(self._beside(None, known), None, known)
+            loss = self._beside(None, known)
+            cost = self._go_back(loss, loss, None, known)
             tally = known.tally()
 
         self.population.observe(model, tally)
@@ -240,13 +242,13 @@ class Trainer:
             loss = loss + self.settings.anisotropy_weight * scale_anisotropy(self.model.params["log_scales"])
         return loss
 
-    def _go_back(self, loss: Tensor, seen: ImageStep | None, known: PointStep | None) -> float:
-        """Add a loss to the gradients; returns its value.
+    def _go_back(self, loss: Tensor, judged: Tensor, seen: ImageStep | None, known: PointStep | None) -> float:
+        """Add a loss to the gradients; returns the value of ``judged``, what it is made of.
 
         Raises:
             NonFiniteError: it is none.
         """
-        cost = loss.item()
+        cost = judged.item()
         if not math.isfinite(cost):
             self._refuse(cost, seen, known)
         loss.backward()

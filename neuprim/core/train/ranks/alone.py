@@ -20,8 +20,8 @@ class Seen:
 
     Attributes:
         index, name: of the training view.
-        loss, psnr, parts: its own, before its share in the step is taken.
-        cost: what was gone back from: the share of the loss, with whatever the step looked at beside views.
+        loss: its own; of the last one of a step its share, with that of whatever the step looked at beside views.
+        psnr, parts: its own.
         more: named parts of what the step looked at beside views.
         gain: gradient of the logarithm of its exposure, one number per channel; None for no exposures.
     """
@@ -31,7 +31,6 @@ class Seen:
     loss: float
     psnr: float
     parts: dict[str, float]
-    cost: float
     more: dict[str, float] = field(default_factory=dict)
     gain: list[float] | None = None
 

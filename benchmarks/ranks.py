@@ -74,17 +74,19 @@ def measure(scene: str, rounds: int, seconds: float, group: Any) -> dict[str, An
     with group.in_turn():
         made = trainers(scene, group)
 
-    def turn(way: str, steps: int) -> float:
-        begun = time.perf_counter()
+    def turn(way: str, steps: int) -> tuple[float, float]:
+        """Seconds of a step, by the clock and of processors that this process used."""
+        begun, used = time.perf_counter(), time.process_time()
         for _ in range(steps):
             made[way].train_step()
-        return (time.perf_counter() - begun) / steps
+        return (time.perf_counter() - begun) / steps, (time.process_time() - used) / steps
 
     with one_torch_thread():
         for way in made:
             turn(way, 10)
-        steps = group.tell({"steps": max(round(seconds / turn("together", 10)), 4)})[0]["steps"]
+        steps = group.tell({"steps": max(round(seconds / turn("together", 10)[0]), 4)})[0]["steps"]
         times: dict[str, list[float]] = {way: [] for way in WAYS}
+        used: dict[str, list[float]] = {way: [] for way in WAYS}
         sent = 0
         for _ in range(rounds):
             for way in WAYS:
@@ -93,8 +95,9 @@ def measure(scene: str, rounds: int, seconds: float, group: Any) -> dict[str, An
                     if way == "together":
                         group.tell({})  # the others have waited for the first rank's turns
                         before = group.sent
-                    took = turn(way, steps)
+                    took, worked = turn(way, steps)
                     times[way].append(took / (1 if way == "single view" else 2))
+                    used[way].append(worked / (1 if way in ("single view", "together") else 2))  # a rank works for one view a step
                     if way == "together":
                         sent = (group.sent - before) // steps
     trainer = made["together"]
@@ -102,7 +105,7 @@ def measure(scene: str, rounds: int, seconds: float, group: Any) -> dict[str, An
     numbers = sum(value.numel() for value in trainer.model.params.values())
     return {
         "scene": scene, "size": [view.width, view.height], "primitives": trainer.model.count, "numbers": numbers,
-        "sent": sent, "slice": trainer.ranks.bucket(trainer.model, 1).width, "steps": steps, "seconds": times,
+        "sent": sent, "slice": trainer.ranks.bucket(trainer.model, 1).width, "steps": steps, "seconds": times, "processor": used,
     }  # fmt: skip
 
 
@@ -127,7 +130,7 @@ def worker(scenes: list[str], rounds: int, seconds: float, out: Path) -> None:
 def table(record: dict[str, Any]) -> str:
     rows = Table(
         "scene", "image", "primitives", "views/s of 2 ranks × 1 thread", "over 1 process × 2 threads, 2 views a step", "over the same, 1 view a step",
-        "over 1 process × 1 thread, 2 views", "a step sends, measured", "by the formula",
+        "over 1 process × 1 thread, 2 views", "processor time of a view, over 1 process × 2 threads", "a step sends, measured", "by the formula",
     )  # fmt: skip
     for scene, found in record["scenes"].items():
         times = found["seconds"]
@@ -136,11 +139,12 @@ def table(record: dict[str, Any]) -> str:
             middle = statistics.median(other / own for own, other in zip(times["together"], times[way], strict=True))
             return f"{middle:.2f}; {min(times[way]) / min(times['together']):.2f}"
 
+        work = statistics.median(a / b for a, b in zip(found["processor"]["together"], found["processor"]["two threads"], strict=True))
         width, height = found["size"]
         formula = 4 * (found["numbers"] + 2 * found["primitives"]) + 2048
         rows.row(
             TITLES.get(scene, f"`{scene}`"), f"{width}×{height}", f"{found['primitives']:,}", f"{1 / statistics.median(times['together']):.1f}",
-            ratio("two threads"), ratio("single view"), ratio("one thread"), f"{found['sent']:,} B", f"{formula:,} B",
+            ratio("two threads"), ratio("single view"), ratio("one thread"), f"{work:.2f}", f"{found['sent']:,} B", f"{formula:,} B",
         )  # fmt: skip
     note = f"Each ratio: median of {record['rounds']} rounds; of the fastest turns. {record['cpu']}, {record['cores']} cores that other work shared."
     return f"{rows}\n\n{note}"

@@ -182,7 +182,13 @@ def _run(args: argparse.Namespace) -> int:
     from neuprim.config.overrides import Typed, without_place
     from neuprim.config.target import target_words
     from neuprim.config.viewer import viewer_words
+    from neuprim.core.train.ranks.place import place_of
 
+    place = place_of()
+    if place is not None:
+        from neuprim.cli.ranks import run_as_rank
+
+        return run_as_rank(place, args.overrides, args.multirun or args.cfg or args.config is not None)
     check, typed = not args.cfg, Typed(args.overrides, args.config)
     viewer, words = viewer_words(args.overrides)
     launcher, words = launcher_words(words)

@@ -31,4 +31,5 @@ examples:
   neuprim run task=static scene=solids
   neuprim run task=static scene=blender scene.path=DIR preset=paper
   neuprim run -m model.primitives=200,1000 train.max_seconds=60 launcher=processes
-  neuprim run --config RUN_DIR/config.yaml seed=1"""
+  neuprim run --config RUN_DIR/config.yaml seed=1
+  torchrun --nproc-per-node 2 -m neuprim run task=static scene=solids      (one scene by two processes)"""

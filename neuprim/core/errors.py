@@ -19,6 +19,7 @@ __all__ = [
     "FormError",
     "NeuprimError",
     "NonFiniteError",
+    "RankError",
     "nearest",
     "one_line",
 ]
@@ -56,6 +57,18 @@ class NonFiniteError(NeuprimError):
 
 class DeviceMemoryError(NeuprimError):
     """A card's memory is full; the message says with what, and what to lower."""
+
+
+class RankError(NeuprimError):
+    """Another process of the same training died, failed or differs; the message names its rank.
+
+    Attributes:
+        told: whether another rank has told the user already.
+    """
+
+    def __init__(self, message: str, told: bool = False) -> None:
+        super().__init__(message)
+        self.told = told
 
 
 class FormError(NeuprimError):

@@ -142,8 +142,9 @@ def steps(trainer: Trainer, events: Events = silent) -> Iterator[tuple[StepRepor
         events(Step(report, trainer.progress))
         held_out = None
         if trainer.progress >= next_eval:
-            held_out = curve_psnr(trainer)
-            events(Evaluated(held_out))
+            if trainer.ranks.first:
+                held_out = curve_psnr(trainer)
+                events(Evaluated(held_out))
             next_eval = next_evaluation(trainer)
         yield report, held_out
     asked = trainer.settings.population.grow_to or 0

@@ -12,21 +12,28 @@ __all__ = ["interruptible"]
 
 
 @contextmanager
-def interruptible() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; the second interrupts at once. Outside the main thread Ctrl-C is not ours."""
+def interruptible(terminated: bool = False) -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets; the second interrupts at once. Outside the main thread Ctrl-C is not ours.
+
+    Args:
+        terminated: whether SIGTERM counts as Ctrl-C does: torchrun sends it when it is stopped, or another process of it ended.
+    """
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
-    previous = signal.getsignal(signal.SIGINT)
+    numbers = (signal.SIGINT, signal.SIGTERM) if terminated else (signal.SIGINT,)
+    previous = {number: signal.getsignal(number) for number in numbers}
 
     def handler(number: int, frame: FrameType | None) -> None:
         if stop.is_set():
             raise KeyboardInterrupt
         stop.set()
 
-    signal.signal(signal.SIGINT, handler)
+    for number in numbers:
+        signal.signal(number, handler)
     try:
         yield stop
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, before in previous.items():
+            signal.signal(number, before)

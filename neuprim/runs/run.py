@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 
 from neuprim.config import RunConfig, suspects_of
+from neuprim.core.train.ranks import ALONE, Alone
 from neuprim.runs.events import Events, Finishing, silent
 from neuprim.runs.finish import finish
 from neuprim.runs.lock import held
@@ -14,7 +16,7 @@ from neuprim.runs.training import Between, alone, train
 __all__ = ["run"]
 
 
-def run(config: RunConfig, events: Events = silent, between: Between = alone) -> Path:
+def run(config: RunConfig, events: Events = silent, between: Between = alone, ranks: Alone = ALONE) -> Path:
     """Fit, measure and report; returns the run directory.
 
     Ctrl-C finishes the step, writes a checkpoint and a report, and raises KeyboardInterrupt; a second one stops at once.
@@ -22,17 +24,20 @@ def run(config: RunConfig, events: Events = silent, between: Between = alone) ->
     Args:
         events: told what happens.
         between: called between training steps, see :data:`~neuprim.runs.training.Between`.
+        ranks: the processes that train this model, each of which calls this with the same configuration; the first one alone writes files.
 
     Raises:
         NeuprimError: the input's fault, another process that is at work there, or numbers that left the finite; whatever was on disk before
             is intact.
+        RankError: another rank is gone; what was trained is in the checkpoint.
     """
     directory = config.output_dir
     suspects = suspects_of(config)
-    with held(directory), suspects.watch(directory / LOGS):
-        fitted, interrupted = train(config, suspects, events, between=between)
-        events(Finishing("measuring held-out views"))
-        finish(fitted, directory)
+    with held(directory) if ranks.first else nullcontext(), suspects.watch(directory / LOGS):
+        fitted, interrupted = train(config, suspects, events, between=between, ranks=ranks)
+        if ranks.first:
+            events(Finishing("measuring held-out views"))
+            finish(fitted, directory)
     if interrupted:
         raise KeyboardInterrupt
     return directory

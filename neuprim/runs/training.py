@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint
 from neuprim.core.data import Dataset
-from neuprim.core.errors import CheckpointError
+from neuprim.core.errors import CheckpointError, RankError
 from neuprim.core.io.files import write_text
 from neuprim.core.model.edge import EDGES
 from neuprim.core.render.backends import choose, compiled_ahead
+from neuprim.core.train.ranks import ALONE, Alone
+from neuprim.core.train.ranks.beginning import beginning
 from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.blame import Suspects
 from neuprim.plugins.judging import facts_of
@@ -45,9 +48,10 @@ def train(
     dataset: Dataset | None = None,
     hold_out: int = 0,
     between: Between = alone,
+    ranks: Alone = ALONE,
 ) -> tuple[Fitted, bool]:
     """Train until the budget is used or Ctrl-C, which finishes the step; leaves configuration, curve, checkpoint and model in the run's
-    directory either way.
+    directory either way. Of several ranks the first one writes them.
 
     Args:
         suspects: of the configuration, who is watched for crashes around this call.
@@ -60,18 +64,24 @@ def train(
 
     Raises:
         NeuprimError: the input's fault, or numbers that left the finite; whatever was on disk before is intact.
+        RankError: another rank is gone; the first one, if it is there, has written a checkpoint of the last whole step.
     """
     ahead = compiled_ahead(config.renderer) if dataset is None else None  # beside loading; of data that are there nothing is waited for
     edge = config.model.density.get("edge", 0)  # of a density of ours; of another's, whatever the word means there
-    with compiling(None if ahead is None else ahead.name, edge if edge in EDGES else 0) as kernels:
+    with ranks.in_turn(), compiling(None if ahead is None else ahead.name, edge if edge in EDGES else 0) as kernels:
         fitted = start(config, events, dataset, suspects, hold_out)
+        fitted.trainer.join(ranks)
         _resume(fitted, events)
-        config.output_dir.mkdir(parents=True, exist_ok=True)
-        write_text(config.output_dir / "config.yaml", fitted.config.to_yaml())
+        if ranks.first:
+            config.output_dir.mkdir(parents=True, exist_ok=True)
+            write_text(config.output_dir / "config.yaml", fitted.config.to_yaml())
         if kernels.running:
             events(Preparing(COMPILING))
             kernels.wait()
-        return fitted, _train(fitted, events, between)
+        make_ready(fitted.trainer, events)
+    if ranks.size > 1:
+        ranks.agree("expected the same words, data and output directory on all ranks", beginning(fitted.trainer))
+    return fitted, _train(fitted, events, between) if ranks.first else _follow(fitted)
 
 
 def make_ready(trainer: Trainer, events: Events = silent) -> None:
@@ -102,11 +112,11 @@ def _resume(fitted: Fitted, events: Events) -> None:
 def _train(fitted: Fitted, events: Events, between: Between) -> bool:
     """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
     trainer, config = fitted.trainer, fitted.config
-    make_ready(trainer, events)
     curve = open_curve(config.output_dir / "metrics.jsonl", trainer.step)
     last_saved = time.monotonic()
     interrupted = False
-    with interruptible() as stop, curve, one_torch_thread():
+    with interruptible(terminated=trainer.ranks.size > 1) as stop, curve, one_torch_thread(), _kept(fitted):
+        last = trainer.ranks.last(stop.is_set)
         between(fitted, stop)
         for report, held_out in steps(trainer, events):
             line: dict[str, Any] = {}
@@ -122,11 +132,28 @@ def _train(fitted: Fitted, events: Events, between: Between) -> bool:
                 save(fitted)
                 last_saved = time.monotonic()
             between(fitted, stop)
-            if stop.is_set():
+            if last():
                 interrupted = True
                 break
     save(fitted)
     return interrupted
+
+
+def _follow(fitted: Fitted) -> bool:
+    """The same on a rank that writes nothing."""
+    with interruptible(terminated=True) as stop, one_torch_thread():
+        last = fitted.trainer.ranks.last(stop.is_set)
+        return any(last() for _ in steps(fitted.trainer))
+
+
+@contextmanager
+def _kept(fitted: Fitted) -> Iterator[None]:
+    """A rank that is gone costs no step: what the others have is saved."""
+    try:
+        yield
+    except RankError:
+        save(fitted)
+        raise
 
 
 def save(fitted: Fitted) -> None:

@@ -37,9 +37,11 @@ class Tally:
 
 
 def together(tallies: Sequence[Tally], count: int) -> Tally:
-    """The sums over several frames of a model with ``count`` primitives."""
-    sums = [tally.of_all(count) for tally in tallies]
-    weight, error = (torch.stack([each[k] for each in sums]).sum(0) for k in (0, 1))
+    """The sums over several frames of a model with ``count`` primitives, one after the other, as several processes add them up, too."""
+    weight, error = tallies[0].of_all(count)
+    for tally in tallies[1:]:
+        more = tally.of_all(count)
+        weight, error = weight + more[0], error + more[1]
     return Tally(weight, error)
 
 

@@ -6,8 +6,6 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
 
-from torch import Tensor
-
 from neuprim.core.data import Pixels
 
 __all__ = ["Ahead"]
@@ -27,8 +25,8 @@ class Ahead:
         self._pool: ThreadPoolExecutor | None = None
         self._next: tuple[int, Future[Pixels]] | None = None
 
-    def take(self, index: int, order: Tensor) -> Pixels:
-        """Pixels of a view, of which the next are those in ``order`` (M,); what went wrong in reading them is raised here."""
+    def take(self, index: int, following: int | None) -> Pixels:
+        """Pixels of a view, after which comes ``following``, if that is known; what went wrong in reading them is raised here."""
         found, self._next = self._next, None
         if index in self._kept:
             pixels = self._kept[index]
@@ -37,7 +35,6 @@ class Ahead:
             size = sum(x.nbytes for x in (pixels.rgb, pixels.alpha, pixels.mask) if x is not None)
             if size <= self._room:
                 self._kept[index], self._room = pixels, self._room - size
-        following = int(order[0]) if len(order) else None
         if following is not None and following not in self._kept:
             self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="neuprim-views")
             self._next = following, self._pool.submit(copy_context().run, self._read, following)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -37,20 +38,25 @@ class Exposures:
         self._now[index] = gain
         return rgb * gain.exp()
 
-    def step(self) -> None:
-        """Move the factors of the views applied since the last call by their gradients."""
-        for index, gain in self._now.items():
-            if gain.grad is None:
+    def gradient(self, index: int) -> list[float] | None:
+        """Of the factors of a view that was applied, after its backward pass: a number per channel; None where nothing came back."""
+        grad = self._now.pop(index).grad
+        return None if grad is None else [float(x) for x in grad.tolist()]
+
+    def step(self, gradients: Mapping[int, list[float] | None]) -> None:
+        """Move the factors of a step's views by their gradients."""
+        for index, numbers in gradients.items():
+            if numbers is None:
                 continue
+            grad = torch.tensor(numbers, device=self.log_gain.device)
             self.seen[index] += 1
             n = int(self.seen[index])
-            self.m[index] += (1 - _BETA1) * (gain.grad - self.m[index])
-            self.v[index] += (1 - _BETA2) * (gain.grad.square() - self.v[index])
+            self.m[index] += (1 - _BETA1) * (grad - self.m[index])
+            self.v[index] += (1 - _BETA2) * (grad.square() - self.v[index])
             scale = math.sqrt(1 - _BETA2**n) / (1 - _BETA1**n)
             self.log_gain[index] -= self.rate * scale * self.m[index] / (self.v[index].sqrt() + _EPS)
-        if self._now:
+        if gradients:
             self.log_gain -= self.log_gain.mean(0)
-        self._now = {}
 
     def state(self) -> dict[str, Tensor]:
         """Tensors from which :meth:`load_state` goes on."""

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from neuprim.core.compute import device
-from neuprim.core.data import Dataset, PointSupervision
+from neuprim.core.data import Dataset, PointSamples
 from neuprim.core.data.check import check_samples
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Tally
@@ -45,17 +44,15 @@ class PointStep:
 def point_step(
     model: Primitives,
     dataset: Dataset,
-    supervision: PointSupervision,
+    samples: PointSamples,
     settings: TrainSettings,
-    generator: torch.Generator,
     threads: int = 0,
 ) -> PointStep:
-    """Draw points, look what the model holds there, and compare.
+    """Look what the model holds at points, and compare.
 
     The loss is the mean square of errors over their scale: the extinction's, which is the square of its relative L2 error but for how
     the points are spread, and ``train.voxel_colour`` times the source's.
     """
-    samples = supervision.draw(settings.voxels_per_step, generator)
     check_samples(samples, dataset)
     colour = samples.source is not None and settings.voxel_colour > 0
     found = values_at(model, samples.conditions, samples.points, colour, threads)

@@ -11,7 +11,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -19,12 +19,11 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.compute.threads import limited
-from neuprim.core.data import Dataset, Pixels
+from neuprim.core.data import Dataset, Pixels, PointSamples
 from neuprim.core.data.check import check_pixels
-from neuprim.core.errors import CheckpointError, ConfigError, DataError, DeviceMemoryError, NonFiniteError, nearest
+from neuprim.core.errors import CheckpointError, ConfigError, DataError, DeviceMemoryError, NonFiniteError, RankError, nearest
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.render.output import Tally, together
 from neuprim.core.render.place import device_of
 from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.ahead import Ahead
@@ -35,39 +34,14 @@ from neuprim.core.train.losses import scale_anisotropy
 from neuprim.core.train.optimizer import RowAdam
 from neuprim.core.train.points import PointStep, point_step
 from neuprim.core.train.population import Change, make_population
+from neuprim.core.train.ranks import ALONE, Alone, Seen
 from neuprim.core.train.settings import TrainSettings
+from neuprim.core.train.step import ImageStep, StepReport, of_views
 
 __all__ = ["COLD", "StepReport", "Trainer"]
 
 COLD = 0.02
 """What a cool-down leaves of a rate."""
-
-
-@dataclass(frozen=True)
-class StepReport:
-    """What one step did. ``psnr`` is of the training view just seen (the mean of several), or of the extinction at points where no view was; ``change`` says what
-    the population did, if anything."""
-
-    step: int
-    seconds: float
-    loss: float
-    parts: dict[str, float]
-    psnr: float
-    primitives: int
-    view: str
-    change: str | None
-
-
-@dataclass(frozen=True)
-class _ImageStep:
-    """One view, drawn and compared; ``tally`` is filled by the backward pass."""
-
-    loss: Tensor
-    parts: dict[str, float]
-    psnr: float
-    name: str
-    truth: Tensor
-    tally: Tally
 
 
 class Trainer:
@@ -81,6 +55,7 @@ class Trainer:
         step, elapsed: steps done and seconds of training they took (held-out evaluations and file writes not counted).
         stored: parameters -> what will be kept of them, with the gradients of the parameters: images are drawn of that. None: of themselves.
         zeros: parameter -> (N, ...) bool of the numbers that stay zero; empty for none.
+        ranks: the processes that share a step's views; see :meth:`join`.
     """
 
     def __init__(
@@ -120,7 +95,18 @@ class Trainer:
         self.elapsed = 0.0
         self.stored: Callable[[dict[str, Tensor]], dict[str, Tensor]] | None = None
         self.zeros: dict[str, Tensor] = {}
+        self.ranks: Alone = ALONE
         self._watch()
+
+    def join(self, ranks: Alone) -> None:
+        """Train with others from here on: a step looks at ``train.views_per_step`` views of every rank.
+
+        Raises:
+            ConfigError: there are no views to share.
+        """
+        if ranks.size > 1 and self.settings.supervision == "voxels":
+            raise ConfigError(f"train.supervision=voxels: there are no views that {ranks.size} ranks could share; expected one process")
+        self.ranks = ranks
 
     # ------------------------------------------------------------ the budget
 
@@ -162,10 +148,17 @@ class Trainer:
         Raises:
             NonFiniteError: a loss, gradient or parameter is NaN or infinite; nothing was updated by this step.
             DeviceMemoryError: the card has no room for a step; what was saved is intact.
+            RankError: another rank is gone; the state is that before the step.
         """
+        drawn = self.order, self.generator.get_state() if self.ranks.size > 1 else None
         try:
             with limited(self.renderer.threads):
                 return self._train_step()
+        except RankError as error:  # the step is not done: what it drew is drawn again, by whoever goes on from this state
+            self.order = drawn[0]
+            if drawn[1] is not None:
+                self.generator.set_state(drawn[1])
+            raise error if error.told else RankError(f"{error}, in step {self.step + 1}") from error
         except torch.OutOfMemoryError as error:
             camera = self.dataset.train.view(0).camera
             size = f"{camera.width} x {camera.height} pixels"
@@ -182,34 +175,38 @@ class Trainer:
         for value in model.params.values():
             value.grad = None
 
-        looks = 0 if self.settings.supervision == "voxels" else self.settings.views_per_step
-        others = [self._look_and_leave(progress, looks) for _ in range(looks - 1)]
-        seen = self._look(progress) if looks else None
-        known = self._look_inside() if self._points_due() else None
-        if seen is None:
-            assert known is not None
-            loss, parts = known.loss, known.parts
+        views = 0 if self.settings.supervision == "voxels" else self.settings.views_per_step
+        looks = views * self.ranks.size
+        step = self.ranks.step(model, views, self.elapsed, start)
+        known: PointStep | None = None
+        for place, index, background, following in self._deal(looks):
+            seen = self._look(progress, index, background, following)
+            loss = seen.loss / looks if looks > 1 else seen.loss
+            last = place == looks - 1
+            if last:  # points and regularisers go with the last view, whoever looks at it
+                known = self._look_inside() if self._points_due() else None
+                loss = self._beside(loss, known)
+            elif place >= looks - self.ranks.size and self._points_due():
+                self._draw_points()  # another rank looks at them
+            cost = self._go_back(loss, loss if last else seen.loss, seen, known)
+            gain = None if self.exposures is None else self.exposures.gradient(index)
+            more = {} if known is None else known.parts
+            step.add(Seen(index, seen.name, cost, seen.psnr, seen.parts, more, gain), seen.tally)
+            del seen, loss  # and what the frame kept, before the next one is drawn
+        if looks:
+            tally = step.close()
         else:
-            loss, parts = seen.loss, seen.parts
-            if others:
-                loss = loss / looks
-            if known is not None:
-                loss, parts = loss + self.settings.voxel_weight * known.loss, {**parts, **known.parts}
-        if self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from:
-            loss = loss + self.settings.anisotropy_weight * scale_anisotropy(model.params["log_scales"])
-        cost = loss.item()
-        if not math.isfinite(cost):
-            self._refuse(cost, seen, known)
-        loss.backward()
+            known = self._look_inside()
+            loss = self._beside(None, known)
+            cost = self._go_back(loss, loss, None, known)
+            tally = known.tally()
 
-        tally = seen.tally if seen is not None else known.tally() if known is not None else None
-        assert tally is not None
-        self.population.observe(model, tally if not others else together([*(other.tally for other in others), tally], model.count))
+        self.population.observe(model, tally)
         self.optimizer.step(model.params, self.rates())
         for name, zero in self.zeros.items():
             model.params[name].detach()[zero] = 0
         if self.exposures is not None:
-            self.exposures.step()
+            self.exposures.step({view.index: view.gain for view in step.seen})
         if self.angles is not None:
             self.angles.step(self.step, model.params["means"], model.params["log_scales"])
         self.step += 1
@@ -218,29 +215,51 @@ class Trainer:
             change = self.population.intervene(model, self.dataset.extent)
             if change is not None:
                 self._apply(change)
-        self.elapsed += time.perf_counter() - start
-        psnr, name = (seen.psnr, seen.name) if seen is not None else (known.psnr, known.name) if known is not None else (0.0, "")
-        if seen is not None and others:
-            cost += sum(other.loss.item() for other in others) / looks
-            psnr, name = sum(view.psnr for view in (*others, seen)) / looks, f"{name} and {looks - 1} more"
-            parts = parts | {part: sum(view.parts[part] for view in (*others, seen)) / looks for part in seen.parts}
+        self.elapsed = self.ranks.spent(self.elapsed, start)
+        if known is not None and not looks:
+            parts, psnr, name = known.parts, known.psnr, known.name
+        else:
+            cost, parts, psnr, name = of_views(step.seen)
         return StepReport(self.step, self.elapsed, cost, parts, psnr, model.count, name, change.text if change else None)
 
-    def _look_and_leave(self, progress: float, looks: int) -> _ImageStep:
-        """One of several views of a step: its share of the gradient stays, and what its frame kept is given back."""
-        seen = self._look(progress)
-        if not math.isfinite(seen.loss.item()):
-            self._refuse(seen.loss.item(), seen, None)
-        (seen.loss / looks).backward()
-        return replace(seen, loss=seen.loss.detach())
+    def _deal(self, looks: int) -> list[tuple[int, int, Tensor, int | None]]:
+        """Draw the views of a step; of this rank's, by turns: place in the step, view, background, and the view that this rank looks at next.
 
-    def _look(self, progress: float) -> _ImageStep:
-        """Draw the next view and compare."""
-        index = self._next_view()
-        pixels = self._pixels(index) if self._ahead is None else self._ahead.take(index, self.order)
+        All ranks draw all of them, so that their random numbers stay the same.
+        """
+        drawn = [(self._next_view(), self._background()) for _ in range(looks)]
+        mine = range(self.ranks.rank, looks, self.ranks.size)
+        later = int(self.order[self.ranks.rank]) if len(self.order) > self.ranks.rank else None
+        following = [*(drawn[place][0] for place in mine[1:]), later]
+        return [(place, *drawn[place], then) for place, then in zip(mine, following, strict=True)] if looks else []
+
+    def _beside(self, loss: Tensor | None, known: PointStep | None) -> Tensor:
+        """The loss of a step's views, or None, with those of points and regularisers."""
+        if known is not None:
+            loss = known.loss if loss is None else loss + self.settings.voxel_weight * known.loss
+        assert loss is not None
+        if self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from:
+            loss = loss + self.settings.anisotropy_weight * scale_anisotropy(self.model.params["log_scales"])
+        return loss
+
+    def _go_back(self, loss: Tensor, judged: Tensor, seen: ImageStep | None, known: PointStep | None) -> float:
+        """Add a loss to the gradients; returns the value of ``judged``, what it is made of.
+
+        Raises:
+            NonFiniteError: it is none.
+        """
+        cost = judged.item()
+        if not math.isfinite(cost):
+            self._refuse(cost, seen, known)
+        loss.backward()
+        return cost
+
+    def _look(self, progress: float, index: int, background: Tensor, following: int | None) -> ImageStep:
+        """Draw a view and compare."""
+        pixels = self._pixels(index) if self._ahead is None else self._ahead.take(index, following)
         factor = reduction(progress, self.settings.coarse, self.settings.coarse_until)
         view, pixels = reduced(self.dataset.train.view(index), pixels, factor)
-        background = self._background().to(self.device, non_blocking=True)
+        background = background.to(self.device, non_blocking=True)
         truth = pixels.over(background)
         output = render(self._drawn(), view.camera, view.conditions, self.renderer, background)
         rgb = output.rgb if self.exposures is None else self.exposures.apply(index, output.rgb)
@@ -255,7 +274,7 @@ class Trainer:
             counted = flat.numel() if pixels.mask is None else int(pixels.mask.sum()) * channels
             mse = torch.dot(flat, flat).item() / counted
         psnr = -10 * math.log10(max(mse, 1e-20)) if math.isfinite(mse) else math.nan
-        return _ImageStep(loss, parts, psnr, view.name, truth, tally)
+        return ImageStep(loss, parts, psnr, view.name, truth, tally)
 
     def _drawn(self) -> Primitives:
         """What images are drawn of."""
@@ -275,11 +294,14 @@ class Trainer:
 
     def _look_inside(self) -> PointStep:
         """Draw points of known extinction and compare."""
+        return point_step(self._drawn(), self.dataset, self._draw_points(), self.settings, self.renderer.threads)
+
+    def _draw_points(self) -> PointSamples:
         points = self.dataset.points
         assert points is not None, "refused at the start"
-        return point_step(self._drawn(), self.dataset, points, self.settings, self.generator, self.renderer.threads)
+        return points.draw(self.settings.voxels_per_step, self.generator)
 
-    def _refuse(self, value: float, seen: _ImageStep | None, known: PointStep | None) -> None:
+    def _refuse(self, value: float, seen: ImageStep | None, known: PointStep | None) -> None:
         """Say why a loss is not finite.
 
         Raises:

@@ -6,11 +6,6 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuprim.cli.console import plain_console
-from neuprim.cli.progress import RunProgress
-from neuprim.cli.view import run_viewed
-from neuprim.runs.run import run
-
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
     from neuprim.config.overrides import Typed
@@ -21,6 +16,11 @@ __all__ = ["one_run"]
 
 def one_run(config: RunConfig, typed: Typed, viewer: ViewerSettings | None = None) -> Path:
     """The run's directory; an interruption says where it is and what goes on with it."""
+    from neuprim.cli.console import plain_console
+    from neuprim.cli.progress import RunProgress
+    from neuprim.cli.view import run_viewed
+    from neuprim.runs.run import run
+
     try:
         with RunProgress(plain_console(stderr=True), f"{config.task}/{config.scene_name}") as events:
             return run(config, events) if viewer is None else run_viewed(config, events, viewer)

@@ -39,7 +39,10 @@ def test_all_ranks_write_where_the_first_one_does(tmp_path: Path, monkeypatch: p
     assert places[0] == places[1]
 
 
-@pytest.mark.parametrize("words", [[*WORDS, "target.psnr=30", "budget=10m"], [*WORDS, "output_dir=taken"]])
+@pytest.mark.parametrize(
+    "words",
+    [[*WORDS, "target.psnr=30", "budget=10m"], [*WORDS, "launcher=processes"], [*WORDS, "viewer=true"], [*WORDS, "output_dir=taken"]],
+)
 def test_what_the_first_rank_refuses_the_others_do_not_repeat(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken").mkdir()
@@ -51,7 +54,10 @@ def test_what_the_first_rank_refuses_the_others_do_not_repeat(words: list[str], 
 def test_one_run_alone_is_shared(tmp_path: Path) -> None:
     first, _ = together(2, lambda group: _composed(WORDS, True, group))
     assert isinstance(first, ConfigError)
-    assert str(first) == "2 processes of torchrun fit one scene together; expected neither -m, --config, --cfg, a target, a launcher, nor a viewer"
+    assert (
+        str(first)
+        == "2 processes of torchrun fit one scene together; expected neither -m, --config, --cfg, a target, a launcher, nor a viewer"
+    )
 
 
 @pytest.mark.parametrize(

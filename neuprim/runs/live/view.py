@@ -14,8 +14,8 @@ from neuprim.config import suspects_of
 from neuprim.config.viewer import ViewerSettings
 from neuprim.core.channels import stored_channels
 from neuprim.core.data import Dataset
-from neuprim.core.data.records import Record
 from neuprim.core.errors import NeuprimError
+from neuprim.core.io.records import Record
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.live.desk import Desk
 from neuprim.runs.live.frame import Look

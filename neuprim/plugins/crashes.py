@@ -21,11 +21,12 @@ def written(error: BaseException, who: str, name: str, folders: Sequence[Path]) 
     Args:
         who: what it says first.
         name: its own begins so.
-        folders: each is passed over while the directory around it holds nothing, because a run refuses to write into one that does.
+        folders: each is passed over while the directory around it holds nothing but hidden files, as the lock of the run that works there,
+            because a run refuses to write into one that does.
     """
     text = f"{who}, neuprim {__version__}, Python {sys.version.split()[0]}\n\n{''.join(traceback.format_exception(error))}"
     stem = f"{re.sub(r'[^A-Za-z0-9_-]+', '_', name).strip('_')}-{time.strftime('%Y%m%d-%H%M%S')}"
-    begun = [folder for folder in folders if folder.parent.is_dir() and any(folder.parent.iterdir())]
+    begun = [folder for folder in folders if _begun(folder.parent)]
     for folder in (*begun, Path(tempfile.gettempdir())):
         for number in range(1, 100):  # several in one second
             path = folder / (f"{stem}.txt" if number == 1 else f"{stem}-{number}.txt")
@@ -40,3 +41,7 @@ def written(error: BaseException, who: str, name: str, folders: Sequence[Path]) 
             except OSError:
                 break
     return None
+
+
+def _begun(directory: Path) -> bool:
+    return directory.is_dir() and any(not path.name.startswith(".") for path in directory.iterdir())

@@ -120,6 +120,11 @@ def test_the_tables_of_web_pages_are_those_of_the_recorded_results(benchmark: Ca
         assert max(view["whole"] for view in run["views"]) < 1e-5 and len(run["views"]) == 8
 
 
+def test_the_table_of_factors_is_that_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
+    recorded = json.loads((RESULTS / "factors.json").read_text(encoding="utf-8"))["trials"]
+    assert between("docs/tradeoffs.md", "factors") == str(benchmark("factors").table(recorded))
+
+
 def test_the_levels_of_effort_are_those_that_were_measured(benchmark: Callable[[str], ModuleType]) -> None:
     """Both the tables and the files that a run reads."""
     script = benchmark("effort")

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -82,8 +82,10 @@ class Processes:
         for pool in self._busy if now else []:
             for process in list((pool.executor._processes or {}).values()):
                 process.kill()
-        for pool in [*self._idle, *self._busy]:
-            pool.executor.shutdown(wait=True)
+        pools = [*self._idle, *self._busy]
+        if pools:
+            with ThreadPoolExecutor(len(pools)) as together:  # a worker takes a second to end
+                list(together.map(lambda pool: pool.executor.shutdown(wait=True), pools))
 
     def _new(self) -> _Pool:
         log = self._folder.absolute() / f"worker-{next(self._numbers)}.log"

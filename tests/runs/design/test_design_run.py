@@ -17,6 +17,7 @@ from PIL import Image
 import neuprim.runs.design.session as session
 from neuprim.cli import main
 from neuprim.config import compose
+from neuprim.config.launcher import LauncherSettings
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, DataError, NonFiniteError
 from neuprim.runs.design.plan import Plan
@@ -169,6 +170,24 @@ def test_a_word_that_changes_nothing_is_no_model(scene: Path, tmp_path: Path) ->
     _, record = design_run(request(scene, tmp_path / "set", "preset=paper", knobs=("model.density.edge",)))
     assert "density.edge=2" in names(record) and "density.edge=0" not in names(record)
     assert (("model.density.edge=0",), "the same model as the centre") in [(one.words, one.reason) for one in record.left_out]
+
+
+def test_several_are_trained_together_and_the_set_is_the_same(
+    scene: Path, measured: tuple[Path, Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batches: list[int] = []
+
+    def together(trials: list[list[Trial]], *args: Any) -> list[list[Outcome] | NonFiniteError]:
+        batches.append(len(trials))
+        bad = [trial.config.model.neurons == 8 for (trial,) in trials]
+        return [NonFiniteError("not finite") if wrong else [run_trial(trial)] for wrong, (trial,) in zip(bad, trials, strict=True)]
+
+    monkeypatch.setattr(session, "launched_trials", together)
+    monkeypatch.setattr("neuprim.runs.launch.share.machine_cores", lambda: 2)
+    _, record = design_run(request(scene, tmp_path / "set", launcher=LauncherSettings("processes")))
+    assert max(batches) > 1 and sum(batches) >= len(SINGLES)
+    assert names(record) == SINGLES - {"neurons=8"} and [one.reason for one in record.left_out] == ["not finite"]
+    assert models(record)[0].name == CENTRE and models(record)[0].quality["psnr"] == models(measured[1])[0].quality["psnr"]
 
 
 # ---------------------------------------------------------------- what is kept

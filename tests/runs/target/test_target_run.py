@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,16 @@ import pytest
 
 import neuprim.runs.prune.run as pruning
 from neuprim.config import RunConfig, compose
+from neuprim.config.launcher import LauncherSettings
 from neuprim.config.target import Target
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.runs.events import Event, Note, Step
+from neuprim.runs.events import Event, Note, Step, silent
+from neuprim.runs.launch.jobs import Job, Result, perform
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import read_metrics
 from neuprim.runs.target import Record, target_run
 from neuprim.runs.target.record import read_record
+from neuprim.runs.trial_jobs import trial_of
 from tests.systems import posix
 
 BUDGET = 400.0
@@ -75,6 +79,34 @@ def met(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record, Clock]:
 
 def trainings(record: Record) -> list[tuple[Any, ...]]:
     return [(a.purpose, a.words, a.primitives, a.steps, a.quality("psnr")) for a in record.attempts]
+
+
+def test_launched_it_trains_two_lengths_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a launcher that works here, at the pace that the clock says."""
+    asked: list[list[str]] = []
+
+    def launched(jobs: list[Job], settings: LauncherSettings, folder: Path, hear: Any) -> list[Result]:
+        asked.append([job.name for job in jobs])
+        assert settings.threads == 1 and folder == tmp_path / "run" / "target"
+        results = [perform(job, 0, silent) for job in jobs]
+        for job, result in zip(jobs, results, strict=True):
+            steps, primitives = trial_of(job.data).config.train.iterations, trial_of(job.data).config.model.primitives
+            pace = 0.1 + 2e-4 * primitives
+            clock.now += pace * (steps or 0) / len(jobs)
+            results[results.index(result)] = replace(
+                result, value=replace(result.value, pace=pace, compiling=0.0, seconds=pace * (steps or 0))
+            )
+        return results
+
+    clock = Clock()
+    monkeypatch.setattr("neuprim.runs.target.trying.launch_jobs", launched)
+    monkeypatch.setattr("neuprim.runs.launch.share.machine_cores", lambda: 2)
+    settings = LauncherSettings("processes")
+    record = target_run(config(tmp_path / "run"), Target(psnr=20.0), BUDGET, clock.hear, clock, settings)
+    sizes = [names for names in asked if len(names) == 2]
+    assert sizes and len(asked[0]) == 1, "the pace alone, then pairs"
+    assert record.achieved["held_out"]["psnr"] >= 20.0 and all(a.outcome is not None for a in record.attempts)
+    assert (tmp_path / "run" / "model.neuprim").exists() and not (tmp_path / "run" / ".lock").exists()
 
 
 # ---------------------------------------------------------------- what a search leaves

@@ -24,6 +24,8 @@ GROUPS = {
     "SolverSettings": "solver",
     "Look": "scene.optics",
     "Light": "scene.optics.light",
+    "LauncherSettings": "launcher",
+    "ViewerSettings": "viewer",
 }
 """The dotted names under which users type them; of all others it is ``scene``."""
 

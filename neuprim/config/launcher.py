@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, get_args
 
 from neuprim.config.overrides import parse, swept_keys
-from neuprim.core.checked import Range, checked
+from neuprim.core.checked import Range, checked, verify
 from neuprim.core.errors import ConfigError, nearest
 
 __all__ = ["LAUNCHERS", "LauncherSettings", "launcher_words"]
@@ -42,6 +42,9 @@ class LauncherSettings:
     retries: Annotated[int, Range(0, 1000, says="a whole number from 0 to 1000")] = 2
     address: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        verify(self, "launcher")
 
     def given(self) -> dict[str, Any]:
         """Name -> value of what differs from the defaults; JSON-able."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from neuprim.config.overrides import parse, swept_keys
-from neuprim.core.checked import Range, checked, converted, text
+from neuprim.core.checked import Range, checked, converted, text, verify
 from neuprim.core.errors import ConfigError, nearest
 
 __all__ = ["LOOPBACK", "ViewerSettings", "is_viewer_word", "viewer_words"]
@@ -30,6 +30,9 @@ class ViewerSettings:
 
     host: Annotated[str, text("an address of this machine")] = LOOPBACK
     port: Annotated[int, Range(0, 65535, says="a port, 1 to 65535, or 0 for any")] = 8080
+
+    def __post_init__(self) -> None:
+        verify(self, "viewer")
 
 
 def viewer_words(words: Sequence[str]) -> tuple[ViewerSettings | None, list[str]]:

@@ -8,9 +8,6 @@ import socket
 from typing import Any
 from urllib.parse import urlsplit
 
-import ray
-from ray import exceptions
-
 from neuprim.config.launcher import LauncherSettings
 from neuprim.core.compute.threads import machine_cores
 from neuprim.core.errors import BackendUnavailable, ConfigError
@@ -35,12 +32,15 @@ class Ray:
     """
 
     def __init__(self, settings: LauncherSettings, jobs: int) -> None:
+        import ray  # an extra, so that this module can be imported without it
+
+        self._ray = ray
         self._refs: list[Any] = []
         self._mine = not ray.is_initialized()
         if self._mine:
-            _connect(settings.address or os.environ.get("RAY_ADDRESS") or LOCAL)
+            _connect(ray, settings.address or os.environ.get("RAY_ADDRESS") or LOCAL)
         try:
-            self.workers, self.threads = _shared_out(settings, jobs)
+            self.workers, self.threads = _shared_out(ray, settings, jobs)
             self._do = ray.remote(_do).options(**{"num_cpus": self.threads, **settings.options}, max_retries=0)
         except (ValueError, TypeError) as error:
             self.close(True)
@@ -55,33 +55,33 @@ class Ray:
         return ref
 
     def done(self, handle: Any) -> bool:
-        return bool(ray.wait([handle], timeout=0)[0])
+        return bool(self._ray.wait([handle], timeout=0)[0])
 
     def result(self, handle: Any) -> Result:
         self._refs.remove(handle)
         try:
-            result: Result = ray.get(handle)
+            result: Result = self._ray.get(handle)
             return result
-        except exceptions.RayTaskError as error:  # the worker lacks something: a job's own errors are in its result
+        except self._ray.exceptions.RayTaskError as error:  # the worker lacks something: a job's own errors are in its result
             return Result("failed", line=f"the worker cannot do it: {_line(error.cause)}", trace=str(error))
-        except exceptions.RayError as error:
+        except self._ray.exceptions.RayError as error:
             raise WorkerDied(_line(error)) from None
 
     def cancel(self, handle: Any) -> None:
-        ray.cancel(handle, force=False)
+        self._ray.cancel(handle, force=False)
 
     def close(self, now: bool) -> None:
         for ref in self._refs if now else []:
-            ray.cancel(ref, force=True)
+            self._ray.cancel(ref, force=True)
         if self._mine:
-            ray.shutdown()
+            self._ray.shutdown()
 
 
 def _do(task: Task) -> Result:
     return task()
 
 
-def _connect(address: str) -> None:
+def _connect(ray: Any, address: str) -> None:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     how: dict[str, Any] = {"num_cpus": machine_cores(), "include_dashboard": False}
     if address != LOCAL:
@@ -112,7 +112,7 @@ def _reach(address: str) -> None:
         ) from None
 
 
-def _shared_out(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
+def _shared_out(ray: Any, settings: LauncherSettings, jobs: int) -> tuple[int, int]:
     """(runs at once, threads of each); what is more than the cluster has at a time waits in Ray's queue."""
     machines = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
     if len(machines) == 1 and settings.address is None:

@@ -216,7 +216,7 @@ def finished(tmp_path: Path) -> Path:
 
 def drawn(run: Path, name: str, *flags: str) -> Tensor:
     out = run.parent / f"{name}.exr"
-    assert main(["render", str(run), "--camera", str(run.parent / "one.json"), "--out", str(out), *flags]) == 0
+    assert main(["render", str(run), "--camera", str(run.parent / "one.json"), "--layers", "beauty", "--out", str(out), *flags]) == 0
     return read_image(out)
 
 

@@ -91,7 +91,6 @@ def measure(scene: str, rounds: int, seconds: float, group: Any) -> dict[str, An
         for _ in range(rounds):
             for way in WAYS:
                 if way in made:
-                    before = group.sent
                     if way == "together":
                         group.tell({})  # the others have waited for the first rank's turns
                         before = group.sent
@@ -105,7 +104,7 @@ def measure(scene: str, rounds: int, seconds: float, group: Any) -> dict[str, An
     numbers = sum(value.numel() for value in trainer.model.params.values())
     return {
         "scene": scene, "size": [view.width, view.height], "primitives": trainer.model.count, "numbers": numbers,
-        "sent": sent, "slice": trainer.ranks.bucket(trainer.model, 1).width, "steps": steps, "seconds": times, "processor": used,
+        "sent": sent, "steps": steps, "seconds": times, "processor": used,
     }  # fmt: skip
 
 

@@ -37,6 +37,7 @@ from torch import Tensor
 from neuprim.config import compose
 from neuprim.core.cameras import Camera, orbit
 from neuprim.core.compute.machine import cpu_name
+from neuprim.core.conditions import read_conditions
 from neuprim.core.extensions import TrainedModel
 from neuprim.core.io.files import write_json
 from neuprim.core.render import render
@@ -58,12 +59,16 @@ RATES = (110e9, 220e9)
 """Instructions a second of integrated graphics: half and all of 24 units of 8 lanes at 1.15 GHz."""
 
 COUNTS = (5_000, 20_000)
-STARTS: dict[str, tuple[tuple[str, ...], str]] = {
-    "solids": (("task=static", "scene=solids", "scene.size=64"), ""),
-    "smoke_fire": (("task=dynamic", "scene=smoke_fire", "scene.size=32", "scene.timesteps=8", "scene.cameras=8"), "time"),
-    "lit_solids": (("task=relight", "scene=lit_solids", "scene.size=32"), "light"),
+FRAMES = 60
+STARTS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
+    "solids": (("task=static", "scene=solids", "scene.size=64"), {}),
+    "smoke_fire": (
+        ("task=dynamic", "scene=smoke_fire", "scene.size=32", "scene.timesteps=8", "scene.cameras=8"),
+        {"time": f"0:1:{FRAMES}"},
+    ),
+    "lit_solids": (("task=relight", "scene=lit_solids", "scene.size=32"), {"light": f"orbit:4:40:{FRAMES}"}),
 }
-"""Scene -> words, and the condition that moves. Images are small, as none is looked at."""
+"""Scene -> words, and what moves, as `neuprim render` takes it. Images are small, as none is looked at."""
 
 
 # ---------------------------------------------------------------- exactness, size and work
@@ -127,7 +132,7 @@ def plain(conditions: Mapping[str, Tensor]) -> dict[str, Any]:
 
 def prepared(chromium: Any, scene: str, count: int, folder: Path) -> dict[str, Any]:
     """Milliseconds of the worker. The model has not learned yet: how much work it is does not depend on what it would have."""
-    words, name = STARTS[scene]
+    words, sweep = STARTS[scene]
     fitted = start(compose([*words, f"model.primitives={count}", "train.population.grow_from=1"], check_output=False))
     fitted.unlock()
     model, view, specs = fitted.model, fitted.dataset.test.view(0), fitted.task.conditions
@@ -136,9 +141,10 @@ def prepared(chromium: Any, scene: str, count: int, folder: Path) -> dict[str, A
     path.write_text(page.text, encoding="utf-8")
     middle = model.params["means"].detach().mean(0)
     away = float((view.camera.position - middle).norm())
-    around = orbit(view.camera, middle, fitted.dataset.up, away, 0.3, 60)
+    around = orbit(view.camera, middle, fitted.dataset.up, away, 0.3, FRAMES)
     still = [dict(view.conditions) for _ in around]
-    moving = [values | {name: _moved(values[name], k / len(around))} for k, values in enumerate(still)] if name else []
+    moved = read_conditions(specs, sweep)
+    moving = [values | {name: found[k] for name, found in moved.items()} for k, values in enumerate(still)] if moved else []
     result: dict[str, Any] = {"scene": scene, "primitives": model.count}
     with open_tab(chromium, path) as tab:
         for key, values in (("camera", still), ("conditions", moving)):
@@ -146,15 +152,6 @@ def prepared(chromium: Any, scene: str, count: int, folder: Path) -> dict[str, A
                 result |= {key: timed(tab, around, values)}
         assert not tab.faults, tab.faults
     return result
-
-
-def _moved(value: Tensor, share: float) -> Tensor:
-    """A time from 0 to 1, or a light around the axis that is up."""
-    if value.ndim == 0:
-        return torch.tensor(share)
-    c, s = math.cos(2 * math.pi * share), math.sin(2 * math.pi * share)
-    x, y, z = value.tolist()
-    return torch.tensor([c * x - s * y, s * x + c * y, z])
 
 
 def timed(tab: Tab, cameras: Sequence[Camera], conditions: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:

@@ -178,7 +178,7 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
 
 def _run(args: argparse.Namespace) -> int:
     from neuprim.config import compose, compose_all, stored_config
-    from neuprim.config.launcher import launcher_words
+    from neuprim.config.launcher import LauncherSettings, launcher_words
     from neuprim.config.overrides import Typed, without_place
     from neuprim.config.target import target_words
     from neuprim.config.viewer import viewer_words
@@ -193,7 +193,8 @@ def _run(args: argparse.Namespace) -> int:
     viewer, words = viewer_words(args.overrides)
     launcher, words = launcher_words(words)
     wanted, words = target_words(words)
-    beside = {"-m": args.multirun, "target": wanted is not None, "launcher": launcher.given() != {"name": "inline"}}
+    elsewhere = launcher != LauncherSettings()
+    beside = {"-m": args.multirun, "target": wanted is not None, "launcher": elsewhere}
     if viewer is not None and any(beside.values()):
         raise ConfigError(f"viewer=true: shows one run; expected no {next(word for word, on in beside.items() if on)} beside it")
     if wanted is not None and args.multirun:
@@ -202,6 +203,7 @@ def _run(args: argparse.Namespace) -> int:
         from neuprim.runs.sweep.record import begun_words
 
         words = begun_words(words)
+        typed = Typed([*words, *args.overrides], args.config)  # what goes on with it says all of it
     stored = None if args.config is None else stored_config(args.config)
     configs = compose_all(words, check, stored) if args.multirun else [compose(words, check, stored)]
     if args.cfg:
@@ -217,7 +219,7 @@ def _run(args: argparse.Namespace) -> int:
         from neuprim.cli.sweep import sweep
 
         return sweep(configs, words, launcher, typed)
-    if launcher.given() != {"name": "inline"}:
+    if elsewhere:
         from neuprim.cli.sweep import launch_one
 
         return launch_one(configs[0], launcher, typed)

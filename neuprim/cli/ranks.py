@@ -46,7 +46,8 @@ def run_as_rank(place: Place, words: list[str], more: bool) -> int:
     before = signal.signal(signal.SIGTERM, terminated)  # torchrun sends it where another rank died; a training listens for it itself
     try:
         with sharing(max(machine_cores() // place.local_size, 1)):
-            failed = _fit(_composed(words, more, group), words, group)
+            _fit(_composed(words, more, group), words, group)
+        failed = False
         return 0
     except KeyboardInterrupt:
         group.fail("interrupted")

@@ -53,9 +53,10 @@ class _Shown(LaunchProgress):
         self._configs = configs
 
     def __call__(self, number: int, status: Status) -> None:
+        fresh = self._statuses[number].state == "waiting"
         super().__call__(number, status)
         directory, many = self._configs[number].output_dir, len(self._configs)
-        if not self.live and many > 1 and status.state == "starting" and not status.attempt:
+        if not self.live and many > 1 and fresh and status.state == "starting" and not status.attempt:
             print(f"[{number + 1}/{many}] {directory}", flush=True)
         if not self.live and status.state == "done":
             print(directory, flush=True)

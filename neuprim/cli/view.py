@@ -71,6 +71,6 @@ def _warn_of_others(settings: ViewerSettings) -> None:
 
 
 def _port(text: str) -> int:
-    if not text.isdigit() or not 0 <= int(text) <= 65535:
+    if not (text.isascii() and text.isdigit()) or int(text) > 65535:
         raise ConfigError(f"--port {text}: expected a port, 1 to 65535, or 0 for any")
     return int(text)

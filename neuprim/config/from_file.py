@@ -10,12 +10,11 @@ from typing import Any
 from neuprim.config.overrides import Assignment
 from neuprim.config.record import RunConfig, RunSettings
 from neuprim.core.errors import ConfigError
-from neuprim.plugins.names import qualified, split
+from neuprim.plugins.names import BUILT_IN, qualified, split
 
 __all__ = ["chosen_beside", "settings_below", "stored_config"]
 
 _NOT_TAKEN = ("output_dir", "resume")
-_OURS = "neuprim"
 
 
 def stored_config(path: Path) -> RunConfig:
@@ -94,4 +93,4 @@ def _other_form(density: Any, values: Sequence[Assignment]) -> bool:
 
 def _word(name: str, maker: Any) -> str:
     """``NAME``, or ``PACKAGE:NAME`` of another package's."""
-    return name if maker is None or maker.package in ("", _OURS) else qualified(maker.package, name)
+    return name if maker is None or maker.package in ("", BUILT_IN) else qualified(maker.package, name)

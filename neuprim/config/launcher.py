@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, get_args
 
-from neuprim.config.overrides import parse, swept_keys
+from neuprim.config.overrides import key_of, parse, swept_keys
 from neuprim.core.checked import Range, checked, verify
 from neuprim.core.errors import ConfigError, nearest
 
@@ -32,7 +32,7 @@ class LauncherSettings:
         threads: of each run; None: the cores are shared out.
         retries: how often a run goes on from its checkpoint after its worker died.
         address: of Ray, as ``ray.init`` takes it: ``auto``, ``HOST:PORT``, ``ray://HOST:PORT``; of Slurm, submitit's name of an executor: ``slurm`` or
-            ``local``. None: Ray on this machine; Slurm.
+            ``local``. None: the Ray of ``RAY_ADDRESS``, else one on this machine; Slurm.
         options: handed to the engine: Ray's options of a task, such as ``num_gpus``; submitit's parameters, such as ``slurm_partition``.
     """
 
@@ -100,5 +100,5 @@ def _who_uses(name: str) -> str:
 
 
 def _is_own(word: str) -> bool:
-    key = word.partition("=")[0].strip().lstrip("+")
+    key = key_of(word)
     return key == "launcher" or key.startswith("launcher.")

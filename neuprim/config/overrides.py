@@ -11,7 +11,7 @@ from typing import Any
 
 from neuprim.core.errors import ConfigError
 
-__all__ = ["Assignment", "Typed", "assigned", "expand_sweep", "parse", "sweep_names", "swept_keys", "without_place", "word"]
+__all__ = ["Assignment", "Typed", "assigned", "expand_sweep", "key_of", "parse", "sweep_names", "swept_keys", "without_place", "word"]
 
 NOT_SWEPT = ("output_dir", "resume")
 MAX_RUNS = 10_000
@@ -111,9 +111,14 @@ class Typed:
         return [*flags, *without_place(self.words), assigned("output_dir", str(directory.parent if sweep else directory)), "resume=true"]
 
 
+def key_of(word: str) -> str:
+    """The key of ``KEY=VALUE`` or ``+KEY=VALUE``, as it is typed."""
+    return word.partition("=")[0].strip().lstrip("+")
+
+
 def without_place(overrides: Iterable[str]) -> list[str]:
     """The words that say what is made, and not where or whether it goes on."""
-    return [word for word in overrides if word.partition("=")[0].strip().lstrip("+") not in NOT_SWEPT]
+    return [word for word in overrides if key_of(word) not in NOT_SWEPT]
 
 
 def swept_keys(overrides: Iterable[str]) -> list[str]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from neuprim.config.duration import seconds_of
-from neuprim.config.overrides import Assignment, parse, swept_keys
+from neuprim.config.overrides import Assignment, key_of, parse, swept_keys
 from neuprim.core.checked import Range, checked, shown
 from neuprim.core.errors import ConfigError, nearest
 
@@ -82,7 +82,7 @@ def target_words(words: Sequence[str]) -> tuple[tuple[Target, float] | None, lis
 
 
 def _is_own(word: str) -> bool:
-    key = word.partition("=")[0].strip().lstrip("+")
+    key = key_of(word)
     return key in ("budget", "target") or key.startswith(("target.", "budget."))
 
 

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from neuprim.config.overrides import parse, swept_keys
+from neuprim.config.overrides import key_of, parse, swept_keys
 from neuprim.core.checked import Range, checked, converted, text, verify
 from neuprim.core.errors import ConfigError, nearest
 
-__all__ = ["LOOPBACK", "ViewerSettings", "is_viewer_word", "viewer_words"]
+__all__ = ["LOOPBACK", "ViewerSettings", "viewer_words"]
 
 LOOPBACK = "127.0.0.1"
 
@@ -41,7 +41,7 @@ def viewer_words(words: Sequence[str]) -> tuple[ViewerSettings | None, list[str]
     Raises:
         ConfigError: no such setting, several values, or an impossible one.
     """
-    own = [word for word in words if is_viewer_word(word)]
+    own = [word for word in words if _is_own(word)]
     for key in swept_keys(own):
         raise ConfigError(f"{key}: several values; expected one")
     wanted, given = bool(own), {}
@@ -55,10 +55,9 @@ def viewer_words(words: Sequence[str]) -> tuple[ViewerSettings | None, list[str]
                 raise ConfigError(f"{assignment.key}: no such setting{nearest(name, names, prefix=f'{head}.')}")
             given[name] = assignment.value
     settings = checked(ViewerSettings, given, "viewer")
-    return (settings if wanted else None), [word for word in words if not is_viewer_word(word)]
+    return (settings if wanted else None), [word for word in words if not _is_own(word)]
 
 
-def is_viewer_word(word: str) -> bool:
-    """Whether a word is about the viewer."""
-    key = word.partition("=")[0].strip().lstrip("+")
+def _is_own(word: str) -> bool:
+    key = key_of(word)
     return key == "viewer" or key.startswith("viewer.")

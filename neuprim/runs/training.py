@@ -17,7 +17,6 @@ from neuprim.core.io.files import write_text
 from neuprim.core.model.edge import EDGES
 from neuprim.core.render.backends import choose, compiled_ahead
 from neuprim.core.train.ranks import ALONE, Alone
-from neuprim.core.train.ranks.beginning import beginning
 from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.blame import Suspects
 from neuprim.plugins.judging import facts_of
@@ -80,6 +79,8 @@ def train(
             kernels.wait()
         make_ready(fitted.trainer, events)
     if ranks.size > 1:
+        from neuprim.core.train.ranks.beginning import beginning
+
         ranks.agree("expected the same words, data and output directory on all ranks", beginning(fitted.trainer))
     return fitted, _train(fitted, events, between) if ranks.first else _follow(fitted)
 

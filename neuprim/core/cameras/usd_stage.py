@@ -39,7 +39,6 @@ def main(path: str, wanted: str, most: int) -> dict[str, Any]:
     return {
         "path": str(camera.GetPath()),
         "frames": [frame(camera, moment) for moment in moments],
-        "times": [None if math.isnan(moment.GetValue()) else moment.GetValue() for moment in moments],
         "fps": stage.GetTimeCodesPerSecond(),
         "up": str(UsdGeom.GetStageUpAxis(stage)),
         "meters": UsdGeom.GetStageMetersPerUnit(stage),

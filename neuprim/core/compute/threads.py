@@ -29,7 +29,8 @@ def machine_cores() -> int:
 
 def core_count() -> int:
     """Cores this process may use: its share, where it has one."""
-    return min(machine_cores(), _share or machine_cores())
+    cores = machine_cores()
+    return min(cores, _share) if _share else cores
 
 
 @contextmanager

@@ -55,6 +55,12 @@ class LayerFrame:
         return self._render(self.lowered, replace(self.settings, depth=True))
 
     @cached_property
+    def emitted(self) -> Tensor | None:
+        """(H, W, C) integral of sigma c along each ray, where each primitive has one colour in the frame; else None."""
+        colours = self.lowered.colour.flat
+        return None if colours is None else torch.stack([self.integral(channel) for channel in colours.clamp_min(0.0).unbind(1)], -1)
+
+    @cached_property
     def unshaded(self) -> Tensor:
         """(H, W, C) the frame over black without what :meth:`~neuprim.core.model.fields.ColourField.shade` multiplies its colours by."""
         with torch.no_grad():

@@ -147,7 +147,7 @@ class _Watch:
     def look(self, number: int, task: Task) -> None:
         status = read_status(task.status)
         before, since = self._last[number]
-        if status is not None and status.attempt == task.attempt and status != before:
+        if status is not None and status.attempt >= task.attempt and status != before:
             self.tell(number, status)
         elif time.monotonic() - since > _SILENT:
             self._hear(number, replace(before, text=f"no sign of it for {time.monotonic() - since:.0f} s"))

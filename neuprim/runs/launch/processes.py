@@ -57,9 +57,15 @@ class Processes:
 
     def submit(self, task: Task) -> _Handle:
         pool = self._idle.pop() if self._idle else self._new()
-        self._busy.append(pool)
         with _set(environment(self.threads)):  # a process starts with the first task, and has the variables of then
-            return _Handle(pool.executor.submit(task), pool)
+            try:
+                future = pool.executor.submit(task)
+            except BrokenProcessPool:  # it was killed while it had nothing to do
+                pool.executor.shutdown(wait=False)
+                pool = self._new()
+                future = pool.executor.submit(task)
+        self._busy.append(pool)
+        return _Handle(future, pool)
 
     def done(self, handle: _Handle) -> bool:
         return handle.future.done()

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from neuprim.runs.events import Evaluated, Event, Finishing, Note, Preparing, Step
+from neuprim.runs.events import Evaluated, Event, Finishing, Preparing, Step
 
 __all__ = ["ENDED", "Listener", "Status", "read_status", "write_status"]
 
@@ -24,7 +24,6 @@ class Status:
         text: what it does, or why it ended so.
         step, progress: of the training; the used fraction of its budget, 0..1.
         psnr: held out, the last point of the curve, dB.
-        seconds: of training so far.
         attempt: how often its worker died before.
         beat: counts up while its worker lives.
     """
@@ -34,7 +33,6 @@ class Status:
     step: int = 0
     progress: float = 0.0
     psnr: float | None = None
-    seconds: float = 0.0
     attempt: int = 0
     beat: int = 0
 
@@ -44,7 +42,6 @@ class Listener:
 
     def __init__(self, attempt: int = 0) -> None:
         self.status = Status("starting", attempt=attempt)
-        self.notes: list[str] = []
 
     def __call__(self, event: Event) -> None:
         now = self.status
@@ -54,13 +51,11 @@ class Listener:
                 self.status = replace(now, state="preparing", text=f"{event.text}{share}")
             case Step():
                 report = event.report
-                self.status = replace(now, state="training", text="", step=report.step, progress=event.progress, seconds=report.seconds)
+                self.status = replace(now, state="training", text="", step=report.step, progress=event.progress)
             case Evaluated():
                 self.status = replace(now, psnr=event.psnr)
             case Finishing():
                 self.status = replace(now, state="finishing", text=event.text)
-            case Note():
-                self.notes.append(event.text)
 
 
 def write_status(file: Path, status: Status) -> None:

@@ -32,7 +32,7 @@ class ConditionControls:
 
     def __init__(self, session: Session) -> None:
         self.session = session
-        self._shows: dict[str, Callable[[Tensor], None]] = {}
+        self._shows: dict[str, Callable[..., None]] = {}
         for spec in session.subject.task.conditions:
             self._add(spec)
 
@@ -52,11 +52,12 @@ class ConditionControls:
         handle = self._handle(spec)
         play = gui.add_checkbox(f"play {name}", False, hint=f"{flag(name)} {spec.sweep}, or the values above where they are several")
 
-        def show(value: Tensor) -> None:
+        def show(value: Tensor, typed: bool = False) -> None:
             # Setting a value calls back as typing it does; what is there already is left alone, so that this ends.
-            if slider is not None and not math.isclose(slider.value, float(value), abs_tol=1e-6):
-                slider.value = float(value.clamp(low, high))
-            if text.value != shown(value) and not play.value:
+            near = float(value.clamp(low, high)) if slider is not None else 0.0
+            if slider is not None and not math.isclose(slider.value, near, abs_tol=1e-6):
+                slider.value = near
+            if text.value != shown(value) and not play.value and not typed:  # a text of several values stays as it was typed
                 text.value = shown(value)
             if handle is not None:
                 handle.position = tuple(value.tolist())
@@ -83,14 +84,14 @@ class ConditionControls:
         return handle
 
     def _slid(self, spec: ConditionSpec, value: float) -> None:
-        if not math.isclose(value, float(self._value(spec)), abs_tol=1e-6):
+        if not math.isclose(value, float(self._value(spec).clamp(*spec.range)), abs_tol=1e-6):  # beyond its ends the slider says nothing
             self._set(spec, torch.tensor(value, dtype=torch.float32))
 
     def _typed(self, spec: ConditionSpec, text: str) -> None:
         if text == shown(self._value(spec)):
             return
         try:
-            self._set(spec, self._read(spec, text)[0])
+            self._set(spec, self._read(spec, text)[0], typed=True)
         except NeuprimError as error:
             self.session.say(str(error))  # it may not be typed to its end yet
 
@@ -98,10 +99,10 @@ class ConditionControls:
         """Raises ConfigError as a command would."""
         return [value.float() for value in read_conditions([spec], {spec.name: text}, self.session.say)[spec.name]]
 
-    def _set(self, spec: ConditionSpec, value: Tensor) -> None:
+    def _set(self, spec: ConditionSpec, value: Tensor, typed: bool = False) -> None:
         if not torch.equal(value, self._value(spec)):
             self.session.set_conditions({spec.name: value})
-            self._shows[spec.name](value)
+            self._shows[spec.name](value, typed)
 
     def _play(self, spec: ConditionSpec, text: str, box: Any) -> None:
         """Go through several values, again and again, as long as the box is ticked."""

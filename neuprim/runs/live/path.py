@@ -104,6 +104,7 @@ class CameraPath:
         return {
             "w": width,
             "h": height,
+            "fps": self.fps,
             "frames": [_frame(pose, size) for pose in self.poses(self.frames)],
         }
 

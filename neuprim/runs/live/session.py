@@ -172,10 +172,7 @@ class Session:
         levels, look = self.levels(), self.look()
         level = levels.within(SMOOTH, look.camera.width * look.camera.height)
         self.draw(level)
-        if level is levels.full:
-            self._after()
-        else:
-            self.ask("picture", self._full, _STILL, soft=True)
+        self.ask("picture", self._after if level is levels.full else self._full, _STILL, soft=True)
 
     def _full(self) -> None:
         self.draw(self.levels().full)

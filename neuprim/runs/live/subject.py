@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras import Camera, look_at
+from neuprim.core.cameras import Camera, orbit
 from neuprim.core.channels import Channels
 from neuprim.core.data import Dataset, View
 from neuprim.core.io.images import to_uint8
@@ -111,7 +112,7 @@ class Subject:
         if self.dataset is None:
             return {}
         views = self.dataset.test
-        return {views.view(i).name: i for i in range(len(views)) if isinstance(views.view(i).camera, Camera)}
+        return {view.name: i for i in range(len(views)) if isinstance((view := views.view(i)).camera, Camera)}
 
     @staticmethod
     def middle_of(model: Primitives) -> np.ndarray:
@@ -130,11 +131,10 @@ class Subject:
             means = self.model().living(conditions).geometry.means.double().cpu()
         middle = torch.from_numpy(np.asarray(self.center, np.float64))
         radius = max(float((means - middle).norm(dim=1).quantile(0.9)), 1e-6) if len(means) else 1.0
-        up = torch.tensor(self.up, dtype=torch.float64)
-        aside = torch.linalg.cross(up, up.roll(1) + torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64))
-        eye = middle + 3.5 * radius * (aside / aside.norm() + 0.4 * up / up.norm())
-        camera = Camera(look_at(eye, middle, up), 500.0, 500.0, 320.0, 180.0, 640, 360)
-        return View("", replace(camera, fx=180 / np.tan(_FOV / 2), fy=180 / np.tan(_FOV / 2)), conditions)
+        focal = 180 / math.tan(_FOV / 2)
+        template = Camera(torch.eye(4, dtype=torch.float64), focal, focal, 320.0, 180.0, 640, 360)
+        (camera,) = orbit(template, middle, torch.tensor(self.up, dtype=torch.float64), 3.5 * radius, 0.4, 1)
+        return View("", camera, conditions)
 
 
 def _floats(conditions: Mapping[str, Tensor]) -> dict[str, Tensor]:

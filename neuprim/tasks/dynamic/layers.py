@@ -6,7 +6,6 @@ models for direct volume rendering", 1995, has the emission alone as the model w
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from neuprim.core.layers import LayerFrame, LayerSpec
@@ -16,16 +15,12 @@ __all__ = ["LAYERS"]
 
 def emission(frame: LayerFrame) -> Tensor | None:
     """(H, W, C) integral of sigma c, linear light."""
-    colours = frame.lowered.colour.flat
-    if colours is None:
-        return None
-    return torch.stack([frame.integral(channel) for channel in colours.clamp_min(0.0).unbind(1)], -1)
+    return frame.emitted
 
 
 def absorption(frame: LayerFrame) -> Tensor | None:
     """(H, W, C) integral of sigma L: the emitted light that does not arrive."""
-    emitted = emission(frame)
-    return None if emitted is None else emitted - frame.drawn.rgb
+    return None if frame.emitted is None else frame.emitted - frame.drawn.rgb
 
 
 LAYERS = (

@@ -56,7 +56,8 @@ class Group(Alone):
         self.asked: Callable[[], bool] = lambda: False
         self._stopping = False
         self._clock = 0.0
-        self._told_at: float | None = None
+        self._told_at = 0.0
+        self._turns = 0
         self._tail = 0.0
         self.pulse = Pulse(wire.store.clone(), self.rank, self.size)
 
@@ -71,7 +72,6 @@ class Group(Alone):
 
     def spent(self, elapsed: float, start: float) -> float:
         """The first rank's clock as it told it in this step; what it spends afterwards counts in the next."""
-        assert self._told_at is not None
         self._tail = time.perf_counter() - self._told_at
         return self._clock
 
@@ -83,7 +83,7 @@ class Group(Alone):
         return self._bucket
 
     def time(self, elapsed: float, start: float) -> float:
-        """Seconds of training up to now, by this rank's clock, which only the first rank's counts of."""
+        """Seconds of training up to now by this rank's clock; only the first rank's counts."""
         self._told_at = time.perf_counter()
         return elapsed + self._tail + self._told_at - start
 
@@ -138,16 +138,17 @@ class Group(Alone):
     @contextmanager
     def in_turn(self) -> Iterator[None]:
         """The first rank of all goes first, then the first of each other machine, then the rest."""
+        self._turns += 1
         for rank in sorted({0, self.place.local_first} - {self.rank}):
             self._wait_for(rank)
         yield
-        self.wire.store.set(f"through/{self.rank}", "1")
+        self.wire.store.set(f"through/{self._turns}/{self.rank}", "1")
 
     def _wait_for(self, rank: int) -> None:
-        """Until a rank is through, however long it works."""
+        """Until a rank is through with this turn, however long it works."""
         store, looks = self.wire.store, 0
         try:
-            while not store.check([f"through/{rank}"]):
+            while not store.check([f"through/{self._turns}/{rank}"]):
                 looks += 1
                 if store.check(["failed"]) or (looks % 100 == 0 and rank in self.pulse.gone(store, pulse.LONG_SILENCE)):
                     raise self.cause(RankError(f"rank {rank} is gone"))

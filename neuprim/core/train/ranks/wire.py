@@ -31,7 +31,6 @@ class Wire:
     """
 
     def __init__(self, place: Place, environment: Any) -> None:
-        self.place = place
         self.hosted = environment.get("TORCHELASTIC_USE_AGENT_STORE") != "True"
         backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and dist.is_nccl_available() else "gloo"
         try:

@@ -2,11 +2,16 @@
 const lib = {
   dot: (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2],
   cross: (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]],
+  crossed(a, b, into) {
+    into[0] = a[1] * b[2] - a[2] * b[1];
+    into[1] = a[2] * b[0] - a[0] * b[2];
+    into[2] = a[0] * b[1] - a[1] * b[0];
+  },
 
   // To length 1, in place. Vectors shorter than 1e-6 keep their share of it, so that zero stays zero.
   unit(v) {
     const top = Math.max(Math.abs(v[0]), Math.abs(v[1]), Math.abs(v[2]), 1e-6);
-    const length = Math.max(Math.hypot(v[0] / top, v[1] / top, v[2] / top), 1) * top;
+    const x = v[0] / top, y = v[1] / top, z = v[2] / top, length = Math.max(Math.sqrt(x * x + y * y + z * z), 1) * top; // Math.hypot is slow
     for (let a = 0; a < 3; a++) v[a] /= length;
     return v;
   },
@@ -23,7 +28,7 @@ const lib = {
     const bands = (degree + 1) ** 2 - 1, Y = new Float64Array(15);
     return (i, centre, eye, lowest, into) => {
       let x = centre[0] - eye[0], y = centre[1] - eye[1], z = centre[2] - eye[2];
-      const length = Math.max(Math.hypot(x, y, z), 1e-30);
+      const length = Math.max(Math.sqrt(x * x + y * y + z * z), 1e-30);
       x /= length;
       y /= length;
       z /= length;

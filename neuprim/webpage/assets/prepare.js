@@ -51,15 +51,44 @@ function preparer(page, tensors, density, colour) {
     }
   }
 
-  const centre = new Float64Array(3 * count), depth = new Float64Array(count), alive = new Int32Array(count), sort = sorter(count);
-  const place = new Float64Array(3), eye = new Float64Array(3), B = new Float64Array(9), channels = Math.max(...pick) + 1;
-  const seen = { base: new Float64Array(channels), factor: new Float64Array(channels), phases: new Float64Array(H) };
+  // What frames read, axis by axis: scene axes -> whitened axes. Rows are made in the order of storage, each in the place that its depth gave it,
+  // because fetching parameters in order of depth takes as long as all the rest.
+  const whitening = new Float64Array(9 * count), squares = new Float64Array(3 * count);
+  for (let i = 0; i < count; i++) {
+    for (let a = 0; a < 3; a++) {
+      const s = axes[3 * i + a];
+      squares[3 * i + a] = s * s;
+      for (let b = 0; b < 3; b++) whitening[9 * i + 3 * a + b] = local[9 * i + 3 * b + a] / s;
+    }
+  }
+  const centre = new Float64Array(3 * count), depth = new Float64Array(count), seen = new Int32Array(count), sort = sorter(count), rank = new Int32Array(count);
+  const place = new Float64Array(3), eye = new Float64Array(3), R = new Float64Array(9), channels = Math.max(...pick) + 1;
+  const look = { base: new Float64Array(channels), factor: new Float64Array(channels), phases: new Float64Array(H) };
   const scene = new Float64Array(3 * count); // where the centres are under these conditions
+  const A = new Float64Array(9); // of one primitive: camera axes -> whitened axes
   const e0 = new Float64Array(3), ex = new Float64Array(3), ey = new Float64Array(3), xa = new Float64Array(3), span = new Float64Array(5);
+  const k0 = new Float64Array(3), ka = new Float64Array(3), kb = new Float64Array(3), ra = new Float64Array(3), rb = new Float64Array(3);
+
+  function turn(i) {
+    for (let o = 9 * i, to = 0; to < 9; o += 3, to += 3) {
+      const x = whitening[o], y = whitening[o + 1], z = whitening[o + 2];
+      A[to] = R[0] * x + R[1] * y + R[2] * z;
+      A[to + 1] = R[3] * x + R[4] * y + R[5] * z;
+      A[to + 2] = R[6] * x + R[7] * y + R[8] * z;
+    }
+  }
+
+  // Component (p, q) of the ellipsoid's covariance on the camera's axes, over its largest half axis squared; after turn(i).
+  const covariance = (i, p, q) => A[p] * A[q] * squares[3 * i] ** 2 + A[3 + p] * A[3 + q] * squares[3 * i + 1] ** 2 + A[6 + p] * A[6 + q] * squares[3 * i + 2] ** 2;
 
   // Screen silhouette relative to the anchor into `span`; false where no ray meets it.
   function silhouette(tc, aa, xe, ye) {
-    const { dot, cross } = lib, k0 = cross(xa, e0), ka = cross(xa, ex), kb = cross(xa, ey), ra = cross(ex, e0), rb = cross(ey, e0);
+    const { dot, crossed } = lib;
+    crossed(xa, e0, k0);
+    crossed(xa, ex, ka);
+    crossed(xa, ey, kb);
+    crossed(ex, e0, ra);
+    crossed(ey, e0, rb);
     for (let j = 0; j < 3; j++) {
       ka[j] += tc * ra[j];
       kb[j] += tc * rb[j];
@@ -79,62 +108,64 @@ function preparer(page, tensors, density, colour) {
     return true;
   }
 
-  // Whether the exact screen box of primitive i misses the image.
+  // Whether the exact screen box of primitive i, whose whole is in front, misses the image; after turn(i).
   function outside(i, camera, szz) {
-    const m = unit[i], z = centre[3 * i + 2] / m, den = z * z - szz, s = 3 * i;
+    const m = unit[i], z = centre[3 * i + 2] / m, den = z * z - szz;
     for (let axis = 0; axis < 2; axis++) {
-      const o = 3 * axis, c = centre[3 * i + axis] / m, f = axis ? camera.fy : camera.fx, p = axis ? camera.cy : camera.cx;
-      const sii = (B[o] * axes[s]) ** 2 + (B[o + 1] * axes[s + 1]) ** 2 + (B[o + 2] * axes[s + 2]) ** 2;
-      const siz = B[o] * B[6] * axes[s] ** 2 + B[o + 1] * B[7] * axes[s + 1] ** 2 + B[o + 2] * B[8] * axes[s + 2] ** 2;
+      const c = centre[3 * i + axis] / m, f = axis ? camera.fy : camera.fx, p = axis ? camera.cy : camera.cx;
+      const sii = covariance(i, axis, axis), siz = covariance(i, axis, 2);
       const root = Math.sqrt(Math.max(z * z * sii - 2 * c * z * siz + c * c * szz - (sii * szz - siz * siz), 0)), mid = c * z - siz;
       if ((f * (mid + root)) / den + p <= 0 || (f * (mid - root)) / den + p >= (axis ? camera.height : camera.width)) return true;
     }
     return false;
   }
+  const wholeInFront = (i, reach) => centre[3 * i + 2] - reach > 1e-3 * reach;
 
   // Which primitives live under these conditions, ascending, and in `scene` where they are.
   function settle(conditions) {
-    const folded = density.at(conditions), living = [];
+    const folded = density.at(conditions), living = new Int32Array(count);
+    let n = 0;
     for (let i = 0; i < count; i++) {
       if (folded.alive && !folded.alive(i)) continue;
       for (let a = 0; a < 3; a++) place[a] = means[3 * i + a];
       if (folded.move) folded.move(i, place);
-      scene.set(place, 3 * i);
-      living.push(i);
+      for (let a = 0; a < 3; a++) scene[3 * i + a] = place[a];
+      living[n++] = i;
     }
-    return { folded, living };
+    return { folded, living: living.subarray(0, n) };
+  }
+
+  // Which of them the camera sees, ascending, into `seen`, and their centres; returns how many.
+  function visible(camera, living, near) {
+    const { t } = camera;
+    let n = 0;
+    for (let p = 0; p < living.length; p++) {
+      const i = living[p], o = 3 * i, m = unit[i], x = scene[o], y = scene[o + 1], z = scene[o + 2], c2 = R[6] * x + R[7] * y + R[8] * z + t[2];
+      if (c2 + m <= near) continue;
+      centre[o] = R[0] * x + R[1] * y + R[2] * z + t[0];
+      centre[o + 1] = R[3] * x + R[4] * y + R[5] * z + t[1];
+      depth[i] = centre[o + 2] = c2;
+      turn(i);
+      const szz = covariance(i, 2, 2), reach = m * Math.sqrt(szz);
+      if (c2 + reach <= near || (wholeInFront(i, reach) && outside(i, camera, szz))) continue;
+      seen[n++] = i;
+    }
+    return n;
   }
 
   // camera: {R: 9 numbers, t: 3, fx, fy, cx, cy, width, height, near}, OpenCV axes; settled: of settle; arriving: null, or (count,) light that
   // arrives at each primitive; coloured: whether colours are needed, which depth images have none of. Fills rows (Float32Array of ROW a primitive)
   // and phases (4 `moving` numbers a primitive), front to back.
   function frame(camera, conditions, { folded, living }, arriving, rows, phases, coloured = true) {
-    const { R, t, fx, fy, cx, cy, near = page.near } = camera;
+    const { t, fx, fy, cx, cy, near = page.near } = camera;
+    R.set(camera.R);
     for (let a = 0; a < 3; a++) eye[a] = -(R[a] * t[0] + R[3 + a] * t[1] + R[6 + a] * t[2]);
-    const tint = colour.at(conditions, eye);
-    let ahead = 0;
-    for (const i of living) {
-      for (let a = 0; a < 3; a++) {
-        centre[3 * i + a] = R[3 * a] * scene[3 * i] + R[3 * a + 1] * scene[3 * i + 1] + R[3 * a + 2] * scene[3 * i + 2] + t[a];
-      }
-      depth[i] = centre[3 * i + 2];
-      if (depth[i] + unit[i] > near) alive[ahead++] = i;
-    }
-    const order = sort(alive, ahead, depth);
+    const tint = colour.at(conditions, eye), count = visible(camera, living, near), order = sort(seen, count, depth);
+    for (let n = 0; n < count; n++) rank[order[n]] = n;
 
-    let n = 0;
-    for (let p = 0; p < ahead; p++) {
-      const i = order[p], m = unit[i], c0 = centre[3 * i], c1 = centre[3 * i + 1], c2 = centre[3 * i + 2];
-      for (let a = 0; a < 3; a++) {
-        for (let b = 0; b < 3; b++) {
-          B[3 * a + b] = R[3 * a] * local[9 * i + b] + R[3 * a + 1] * local[9 * i + 3 + b] + R[3 * a + 2] * local[9 * i + 6 + b];
-        }
-      }
-      const szz = (B[6] * axes[3 * i]) ** 2 + (B[7] * axes[3 * i + 1]) ** 2 + (B[8] * axes[3 * i + 2]) ** 2, reach = m * Math.sqrt(szz);
-      if (c2 + reach <= near) continue;
-      const inFront = c2 - reach > 1e-3 * reach;
-      if (inFront && outside(i, camera, szz)) continue;
-
+    for (let p = 0; p < count; p++) {
+      const i = seen[p], n = rank[i], m = unit[i], c0 = centre[3 * i], c1 = centre[3 * i + 1], c2 = centre[3 * i + 2];
+      turn(i);
       let az = 0, ax = Math.fround(cx), ay = Math.fround(cy); // the anchor: the projected centre, or the camera where that is too near
       if (c2 > ANCHOR_RADII * m) {
         az = m * Math.fround(c2 / m);
@@ -144,7 +175,7 @@ function preparer(page, tensors, density, colour) {
       const tc = az / m, u = (ax - cx) / fx, v = (ay - cy) / fy, x0 = tc * u - c0 / m, x1 = tc * v - c1 / m, x2 = tc - c2 / m;
       let aa = 0, xe = 0, ye = 0;
       for (let a = 0; a < 3; a++) {
-        const s = axes[3 * i + a], A0 = B[a] / s, A1 = B[3 + a] / s, A2 = B[6 + a] / s;
+        const A0 = A[3 * a], A1 = A[3 * a + 1], A2 = A[3 * a + 2];
         e0[a] = A0 * u + A1 * v + A2;
         ex[a] = A0 / fx;
         ey[a] = A1 / fy;
@@ -153,14 +184,16 @@ function preparer(page, tensors, density, colour) {
         xe += ex[a] * e0[a];
         ye += ey[a] * e0[a];
       }
-      span.fill(0);
+      let weight = folded.weight(i);
+      span[0] = span[1] = span[2] = 0;
       span[3] = span[4] = -1; // the whole screen
-      if (inFront && !silhouette(tc, aa, xe, ye)) continue;
-
+      if (wholeInFront(i, m * Math.sqrt(covariance(i, 2, 2))) && !silhouette(tc, aa, xe, ye)) {
+        weight = span[3] = span[4] = 0; // nothing to draw, in a place that is already given
+      }
       if (coloured) {
         for (let a = 0; a < 3; a++) place[a] = scene[3 * i + a];
-        seen.factor.fill(1);
-        tint.look(i, place, seen);
+        look.factor.fill(1);
+        tint.look(i, place, look);
       }
       const light = arriving ? arriving[i] : 1, o = ROW * n, tu = (-tc * xe) / aa, tv = (-tc * ye) / aa;
       for (let a = 0; a < 3; a++) {
@@ -170,7 +203,7 @@ function preparer(page, tensors, density, colour) {
         rows[o + 12 + a] = xa[a];
         rows[o + 16 + a] = tc * ex[a] + tu * e0[a];
         rows[o + 20 + a] = tc * ey[a] + tv * e0[a];
-        const factor = seen.factor[pick[a]] * light, base = seen.base[pick[a]];
+        const factor = look.factor[pick[a]] * light, base = look.base[pick[a]];
         rows[o + 24 + a] = H ? factor : factor * Math.max(base, 0);
         rows[o + 40 + a] = base;
       }
@@ -180,7 +213,7 @@ function preparer(page, tensors, density, colour) {
       rows[o + 15] = tv;
       rows[o + 19] = (near - az) / m;
       rows[o + 23] = folded.offset(i);
-      rows[o + 27] = folded.weight(i);
+      rows[o + 27] = weight;
       rows[o + 28] = m;
       rows[o + 29] = az;
       rows[o + 30] = i;
@@ -192,11 +225,10 @@ function preparer(page, tensors, density, colour) {
           for (let k = 0; k < K; k++) phases[q + k] = reduced(turns * folded.phase(i, k));
           q += 4 * phaseTexels;
         }
-        for (let h = 0; h < H; h++) phases[q + h] = reduced(seen.phases[h] / (2 * Math.PI));
+        for (let h = 0; h < H; h++) phases[q + h] = reduced(look.phases[h] / (2 * Math.PI));
       }
-      n++;
     }
-    return n;
+    return count;
   }
 
   // How many of the first n rows, which are in order, are no further away than each of the edges.

@@ -1,9 +1,10 @@
 """What a scene requires: models of the presets, pruned, in few bits, and both.
 
     python benchmarks/smaller.py --orders RUN_DIR
-    python benchmarks/smaller.py [--chair DIR] [--fire DIR] [--scenes chair fire fire_half lit_solids smoke_fire] [--seeds 3] [--jobs 2] [--docs] [--print]
+    python benchmarks/smaller.py [--chair DIR] [--fire DIR] [--scenes chair chair_5000 fire fire_half lit_solids smoke_fire] [--seeds 3] [--jobs 2] [--docs] [--print]
 
-Every model is its preset's own (`quick`, the preset's number of views), but for `fire_half`, half as large as the preset's and with the 4,000 views of docs/dynamic.md. Then, as `neuprim prune` and `neuprim compress` do it:
+Every model is its preset's own (`quick`, the preset's number of views), but for `fire_half`, half as large as the preset's and with the 4,000 views of docs/dynamic.md, and
+`chair_5000`, two and a half times as large. Then, as `neuprim prune` and `neuprim compress` do it:
 
     trained as long   the whole model, fine-tuned for the steps that pruning has: what they bring without pruning
     pruned            `neuprim prune --tolerance 0.1dB --steps 4000`
@@ -47,6 +48,7 @@ RESULTS = Path(__file__).parent / "results" / "smaller.json"
 RUNS = ROOT / "outputs" / "smaller"
 SCENES = {
     "chair": ("task=static", "scene=blender"),
+    "chair_5000": ("task=static", "scene=blender", "model.primitives=7000"),
     "fire": ("task=dynamic", "scene=vdb", "scene.size=64"),
     "fire_half": (
         "task=dynamic",
@@ -64,6 +66,7 @@ PRUNED, FEW_BITS, TOLERANCE = 4000, 1000, 0.1
 LEVELS = (2, 3, 4)
 SHOWN = {
     "chair": "chair, 200×200",
+    "chair_5000": "chair, 200×200, as large as 5,000 of the paper's",
     "fire": "real fire, 64×64",
     "fire_half": "real fire, 96×96, half as many",
     "lit_solids": "lit_solids, 128×128",
@@ -206,7 +209,7 @@ def main() -> None:
         orders(args.orders)
         return
     rows: list[dict[str, Any]] = json.loads(RESULTS.read_text())["rows"] if RESULTS.exists() else []
-    data = {"chair": args.chair, "fire": args.fire, "fire_half": args.fire}
+    data = {"chair": args.chair, "chair_5000": args.chair, "fire": args.fire, "fire_half": args.fire}
     if not args.print:
         context = multiprocessing.get_context("spawn")
         queue = context.Manager().Queue()

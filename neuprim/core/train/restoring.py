@@ -17,12 +17,17 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.exposure import Exposures
 from neuprim.core.train.optimizer import RowAdam
 
-__all__ = ["Restored", "by_row", "names_of", "part", "restored"]
+__all__ = ["Restored", "by_row", "by_row_name", "names_of", "part", "restored"]
 
 
 def by_row(name: str, value: Tensor) -> bool:
     """Whether a tensor of the state has a row for each primitive."""
-    return name.split(".")[0] in ("params", "adam", "population", "zeros") and value.dim() > 0
+    return by_row_name(name) and value.dim() > 0
+
+
+def by_row_name(name: str) -> bool:
+    """The same of one that is not a single number."""
+    return name.split(".")[0] in ("params", "adam", "population", "zeros")
 
 
 def part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
@@ -50,7 +55,13 @@ class Restored:
 
 
 def restored(
-    tensors: dict[str, Tensor], header: dict[str, Any], where: str, like: Primitives, beta2: float, train: ViewSet, exposures: Exposures | None
+    tensors: dict[str, Tensor],
+    header: dict[str, Any],
+    where: str,
+    like: Primitives,
+    beta2: float,
+    train: ViewSet,
+    exposures: Exposures | None,
 ) -> Restored:
     """Read :meth:`~neuprim.core.train.trainer.Trainer.state`; ``exposures`` are taken over.
 
@@ -91,7 +102,9 @@ def restored(
                 raise ValueError(f"zeros of {name!r} are {zero.dtype} {tuple(zero.shape)}")
         given = part(tensors, "exposure.")
         if bool(given) != (exposures is not None):
-            raise ValueError(f"it has {'' if given else 'no '}exposures, train.exposure_rate is {0.0 if exposures is None else exposures.rate:g}")
+            raise ValueError(
+                f"it has {'' if given else 'no '}exposures, train.exposure_rate is {0.0 if exposures is None else exposures.rate:g}"
+            )
         if exposures is not None:
             exposures.load_state(given)
     except (ValueError, KeyError, RuntimeError, TypeError, IndexError) as error:

@@ -110,11 +110,16 @@ class Trainer:
             raise ConfigError(f"train.supervision=voxels: there are no views that {ranks.size} ranks could share; expected one process")
         self.ranks = ranks
         if ranks.parts:
-            refuse_parts(self.settings, self.population, self.model, ranks.size)
+            refuse_parts(self.settings, ranks.size)
             tensors, header = self.state()
             own = ranks.cut({name: value for name, value in tensors.items() if by_row(name, value)})
-            self.population.count = ranks.count(self.model)
             self.load_state({**tensors, **own}, header, "the whole model")
+
+    def leave(self, params: dict[str, Tensor]) -> None:
+        """Train no more: the whole model's tensors take the place of this rank's part, and its moments go."""
+        self.ranks, self.population.count = ALONE, None
+        self.model.params = {name: params[name].to(self.device) for name in self.model.params}
+        self.optimizer = RowAdam(self.model.specs, self.model.params, self.settings.adam_beta2)
 
     # ------------------------------------------------------------ the budget
 
@@ -246,7 +251,7 @@ class Trainer:
         later = int(self.order[self.ranks.rank]) if len(self.order) > self.ranks.rank else None
         following = [*(drawn[place][0] for place in mine[1:]), later]
         peers = [[index for index, _ in drawn[place - self.ranks.rank :][: self.ranks.size]] for place in mine]
-        return [(place, *drawn[place], *rest) for place, *rest in zip(mine, following, peers, strict=True)] if looks else []
+        return [(place, *drawn[place], then, now) for place, then, now in zip(mine, following, peers, strict=True)] if looks else []
 
     def _looks(self, peers: list[int], samples: PointSamples | None) -> list[Look]:
         """What all ranks look at now; points go with the last one's."""
@@ -386,5 +391,6 @@ class Trainer:
         self.order, self.generator = tensors["order"].clone(), found.generator
         self.population.load_state({name: value.to(self.device) for name, value in found.population.items()})
         self.zeros = {name: zero.to(self.device) for name, zero in found.zeros.items()}
+        self.population.count = self.count if self.ranks.parts else None
         self.step, self.elapsed = found.step, found.elapsed
         self._watch()

@@ -111,6 +111,18 @@ class Alone:
         """Primitives of the whole model of which ``model`` is what this rank has."""
         return model.count
 
+    def own_of(self, count: int) -> tuple[int, int]:
+        """First row that this rank keeps of a whole model of ``count`` primitives from now on, and the one after the last.
+
+        Raises:
+            ConfigError: there are too few for all.
+        """
+        return 0, count
+
+    def collected(self, value: Tensor) -> Iterator[Tensor]:
+        """On the first rank an (N, ...) tensor of the whole model, in pieces from first to last; called on all, with their rows of it."""
+        yield value
+
     def cut(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         """What this rank keeps of (N, ...) tensors of the whole model."""
         return tensors

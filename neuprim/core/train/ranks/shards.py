@@ -8,7 +8,7 @@ their owners add up in the order of the views. Primitives that were not sent hav
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import View
-from neuprim.core.model.fields import ColourField, Conditions
+from neuprim.core.errors import ConfigError
+from neuprim.core.model.fields import ColourField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.frustum import in_sight
 from neuprim.core.render.output import Tally
@@ -26,7 +27,7 @@ from neuprim.core.train.ranks.alone import Alone, Look, Seen, StepViews
 from neuprim.core.train.ranks.blocks import Blocks, regrouped
 from neuprim.core.train.ranks.group import Group
 
-__all__ = ["Shards"]
+__all__ = ["Shards", "shards_of"]
 
 _PIECE = 1 << 22
 """Numbers of a tensor that are collected at once."""
@@ -53,7 +54,7 @@ class Shards(Alone):
         near: depth below which nothing is drawn.
 
     Attributes:
-        blocks: which rows of the whole model each rank has, once :meth:`cut` was called.
+        blocks: which rows of the whole model each rank has, as last asked for by :meth:`own_of`.
     """
 
     def __init__(self, group: Group, near: float) -> None:
@@ -85,8 +86,10 @@ class Shards(Alone):
     def agree(self, what: str, facts: dict[str, Any]) -> None:
         self.group.agree(what, facts)
 
-    def in_turn(self) -> AbstractContextManager[None]:
-        return self.group.in_turn()
+    @contextmanager
+    def in_turn(self) -> Iterator[None]:
+        with self.group.in_turn():
+            yield
 
     # ------------------------------------------------------------ a step
 
@@ -145,10 +148,15 @@ class Shards(Alone):
 
     # ------------------------------------------------------------ who has what
 
+    def own_of(self, count: int) -> tuple[int, int]:
+        if count < self.size:
+            raise ConfigError(f"train.shard=true: {count} primitives for {self.size} ranks; expected one for each at least")
+        self.blocks = Blocks(count, self.size)
+        return self.blocks.of(self.rank)
+
     def cut(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         """This rank's rows of tensors of the whole model."""
-        self.blocks = Blocks(len(next(iter(tensors.values()))), self.size)
-        mine = slice(*self.blocks.of(self.rank))
+        mine = slice(*self.own_of(len(next(iter(tensors.values())))))
         return {name: value.detach()[mine].clone() for name, value in tensors.items()}
 
     def collected(self, value: Tensor) -> Iterator[Tensor]:
@@ -191,6 +199,12 @@ class Shards(Alone):
         found = value.new_empty(sum(take))
         self.group.exchange(value.repeat(self.size), found, [len(value)] * self.size, take)
         return found
+
+
+def shards_of(ranks: Alone, near: float) -> Shards:
+    """The ranks of a group with a part of the primitives each."""
+    assert isinstance(ranks, Group), "one process is refused"
+    return Shards(ranks, near)
 
 
 class _ShardViews(StepViews):

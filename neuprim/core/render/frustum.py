@@ -44,12 +44,22 @@ def in_sight(geometry: Geometry, camera: AnyCamera, near: float) -> Tensor | Non
     offsets[4] -= near
     where = geometry.means.device
     directions, offsets = (normals @ view[:3, :3]).T.contiguous().to(where), offsets.to(where)
+    lengths = directions.norm(dim=0)
     found = []
     for start in range(0, geometry.count, _AT_ONCE):
         part = geometry[start : start + _AT_ONCE]
-        part = Geometry(part.means.detach().double(), part.log_scales.detach().double(), part.quats.detach().double())
-        middle = part.means @ directions + offsets
-        reach = ((part.rotations.transpose(1, 2) @ directions) * part.scales[:, :, None]).norm(dim=1)
-        outside = middle + reach < -_ROUNDING * (middle.abs() + reach)
-        found.append((~outside.any(dim=1)).nonzero()[:, 0] + start)
+        middle = part.means.detach().double() @ directions + offsets
+        ball = part.log_scales.detach().amax(dim=1).double().exp()[:, None] * lengths
+        # most are decided by a ball around them; of the others the ellipsoid itself is looked at
+        inside, outside = (middle >= 0).all(dim=1), _beyond(middle, ball) & part.quats.detach().sum(dim=1).isfinite()
+        open_ = (~inside & ~outside).nonzero()[:, 0]
+        rest = Geometry(*(x[open_].detach().double() for x in (part.means, part.log_scales, part.quats)))
+        reach = ((rest.rotations.transpose(1, 2) @ directions) * rest.scales[:, :, None]).norm(dim=1)
+        outside[open_] = _beyond(middle[open_], reach)
+        found.append((~outside).nonzero()[:, 0] + start)
     return torch.cat(found) if found else torch.zeros(0, dtype=torch.int64, device=where)
+
+
+def _beyond(middle: Tensor, reach: Tensor) -> Tensor:
+    """(N,) whether (N, planes) distances of centres and reaches along normals leave something wholly behind one of the planes; never where one is NaN."""
+    return (middle + reach < -_ROUNDING * (middle.abs() + reach)).any(dim=1)

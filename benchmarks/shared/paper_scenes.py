@@ -70,7 +70,8 @@ def amounts(scene: Paper) -> dict[str, float]:
 def seconds_here(scene: Paper, model: dict[str, Any], ranks: int, parts: bool) -> dict[str, float]:
     """Terms of a step of one view a rank, on one thread each."""
     a, view = amounts(scene), model["step"]
-    in_view = a["drawn"] if parts else scene.primitives
+    alive = a["drawn"] if scene.frames else scene.primitives  # of a sequence, others are left out before anything is computed
+    in_view = a["drawn"] if parts else alive
     numbers = scene.primitives * scene.numbers / (ranks if parts else 1)
     sent = (a["parts send"] if parts else a["whole sends"]) * (ranks - 1) / ranks
     return {
@@ -79,7 +80,7 @@ def seconds_here(scene: Paper, model: dict[str, Any], ranks: int, parts: bool) -
         "pixels": view["a pixel"] * scene.pixels,
         "hits": view["an ellipsoid over a pixel"] * scene.overlap * scene.pixels,
         "Adam": model["adam"]["a number"] * numbers,
-        "who is in sight": model["sight"]["a primitive"] * scene.primitives if parts else 0.0,
+        "who is in sight": model["sight"]["a primitive"] * alive if parts else 0.0,
         "sending": model["exchange"]["a byte"] * sent,
     }
 
@@ -124,7 +125,7 @@ def _ways(scene: Paper, model: dict[str, Any]) -> Table:
 
 def _truth(scene: Paper, model: dict[str, Any]) -> str:
     rays = 4 * scene.pixels
-    frame = sum(model["frame"].values(), 0.0) - model["frame"]["a voxel"] + model["frame"]["a voxel"] * scene.voxels**3
+    frame = sum(c * n for c, n in zip(model["frame"].values(), (1, scene.voxels**3, scene.voxels**4), strict=True))
     image = model["image"]["an image"] + model["image"]["a ray"] * rays + model["image"]["a cell of a ray"] * rays * scene.voxels
     hours = scene.frames * (frame + scene.cameras * image) / 3600
     return (

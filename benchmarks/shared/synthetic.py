@@ -50,7 +50,7 @@ class _Views(ViewSet):
 def random_trainer(
     primitives: int, size: int, overlap: float, degree: int = 3, views: int = 1, inside: bool = False, threads: int = 1, shard: bool = False
 ) -> Trainer:
-    """A fixed population of two neurons with a soft edge in the unit cube, in the middle of an endless budget.
+    """A fixed population of two neurons with a soft edge in the unit cube, in the middle of an endless budget, which nothing moves.
 
     Args:
         size: edge of the images in pixels.
@@ -74,6 +74,8 @@ def random_trainer(
     dataset = Dataset(
         name="random", train=sets[0], test=sets[1], start=start, extent=1.0, background=torch.zeros(3), data_source="generated"
     )
-    settings = TrainSettings(iterations=10**9, views_per_step=views, shard=shard, population=PopulationSettings(strategy="fixed"))
+    still = {spec.name: 0.0 for spec in model.specs}  # a step costs the same and leaves the scene as it is, however many are taken
+    population = PopulationSettings(strategy="fixed")
+    settings = TrainSettings(iterations=10**9, views_per_step=views, shard=shard, rates=still, population=population)
     loss = photometric({"ssim_weight": settings.ssim_weight})
     return Trainer(model, dataset, loss, settings, RenderSettings(device="cpu", threads=threads), 0)

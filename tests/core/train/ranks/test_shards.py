@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,8 @@ import torch
 from neuprim.core import checkpoint
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, RankError
-from neuprim.core.train.ranks import ALONE, group as groups, pulse
+from neuprim.core.train.ranks import ALONE, pulse
+from neuprim.core.train.ranks import group as groups
 from neuprim.core.train.ranks.blocks import Blocks
 from neuprim.core.train.ranks.group import Group
 from neuprim.core.train.ranks.refusals import refuse_parts
@@ -210,6 +212,6 @@ def test_fewer_primitives_than_ranks_are_refused(scene: Dataset) -> None:
 @pytest.mark.parametrize(("count", "size"), [(7, 3), (12, 5), (4, 4), (1_000_003, 64)])
 def test_blocks_follow_each_other(count: int, size: int) -> None:
     blocks = [Blocks(count, size).of(rank) for rank in range(size)]
-    assert blocks[0][0] == 0 and blocks[-1][1] == count and all(a[1] == b[0] for a, b in zip(blocks, blocks[1:], strict=False))
+    assert blocks[0][0] == 0 and blocks[-1][1] == count and all(a[1] == b[0] for a, b in itertools.pairwise(blocks))
     lengths = [stop - start for start, stop in blocks]
     assert max(lengths) - min(lengths) <= 1

@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -78,7 +79,6 @@ class Trainer:
         first = dataset.train.view(0)
         self.device = device_of(model, self.renderer, first.camera, first.conditions)
         model.params = model.to(self.device).params
-        self.optimizer = RowAdam(model.specs, model.params, settings.adam_beta2)
         self._ahead = Ahead(self._pixels, device.spare_memory(self.device) // 4) if self.device.type == device.CARD else None
         self.population = make_population(settings.population)
         self.angles = None if settings.angular_size is None else AngularSize(dataset.train, settings.angular_size)
@@ -111,15 +111,26 @@ class Trainer:
         self.ranks = ranks
         if ranks.parts:
             refuse_parts(self.settings, ranks.size)
-            tensors, header = self.state()
-            own = ranks.cut({name: value for name, value in tensors.items() if by_row(name, value)})
-            self.load_state({**tensors, **own}, header, "the whole model")
+            if self.step:
+                tensors, header = self.state()
+                own = ranks.cut({name: value for name, value in tensors.items() if by_row(name, value)})
+                self.load_state({**tensors, **own}, header, "the whole model")
+                return
+            self.model.params = ranks.cut(self.model.params)
+            vars(self).pop("optimizer", None)
+            self.population.count = self.count
+            self._watch()
 
     def leave(self, params: dict[str, Tensor]) -> None:
         """Train no more: the whole model's tensors take the place of this rank's part, and its moments go."""
         self.ranks, self.population.count = ALONE, None
         self.model.params = {name: params[name].to(self.device) for name in self.model.params}
-        self.optimizer = RowAdam(self.model.specs, self.model.params, self.settings.adam_beta2)
+        vars(self).pop("optimizer", None)
+
+    @cached_property
+    def optimizer(self) -> RowAdam:
+        """Made when it is first needed: a rank that keeps a part of the primitives never has moments of all."""
+        return RowAdam(self.model.specs, self.model.params, self.settings.adam_beta2)
 
     # ------------------------------------------------------------ the budget
 

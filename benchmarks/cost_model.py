@@ -307,7 +307,11 @@ def table_of_judged(record: dict[str, Any]) -> str:
         rows.row(
             name, KINDS[row["kind"]], *times, f"{row['said'] / row['measured']:.2f}", clock, f"{row['sent']:,} B" if row["sent"] else ""
         )
-    return str(rows)
+    note = (
+        f"Processor seconds are those of a quiet machine. By the clock two ranks also wait for other work, and for each other: while this was measured there was "
+        f"{record['busy']:.1f} times as much to do as there are cores, these two ranks included."
+    )
+    return f"{rows}\n\n{note}"
 
 
 def main() -> None:
@@ -327,7 +331,8 @@ def main() -> None:
         out = RESULTS.with_suffix(".part")
         words = ["--rounds", str(args.rounds), "--worker", str(out)]
         subprocess.run([sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", __file__, *words], check=True)
-        record = {"cpu": cpu_name(), "cores": core_count(), "rounds": args.rounds, **json.loads(out.read_text())}
+        busy = os.getloadavg()[1] / core_count()
+        record = {"cpu": cpu_name(), "cores": core_count(), "busy": busy, "rounds": args.rounds, **json.loads(out.read_text())}
         RESULTS.write_text(json.dumps({**record, "model": model_of(record)}, indent=1) + "\n")
         out.unlink()
     record = json.loads(RESULTS.read_text())

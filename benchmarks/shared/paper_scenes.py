@@ -105,7 +105,7 @@ def _size(count: float) -> str:
 def _ways(scene: Paper, model: dict[str, Any]) -> Table:
     rows = Table(
         "ranks", "primitives", "state of a rank", "and buffers, rows", "a rank sends a step", "step of a view a rank here", "most of it", "core-hours here",
-        "H100, computed: step", "hours",
+        "H100, computed, without sending: step", "hours",
     )  # fmt: skip
     a = amounts(scene)
     for ranks, parts in ((1, False), (8, False), (8, True), (64, True)):
@@ -128,10 +128,21 @@ def _truth(scene: Paper, model: dict[str, Any]) -> str:
     frame = sum(c * n for c, n in zip(model["frame"].values(), (1, scene.voxels**3, scene.voxels**4), strict=True))
     image = model["image"]["an image"] + model["image"]["a ray"] * rays + model["image"]["a cell of a ray"] * rays * scene.voxels
     hours = scene.frames * (frame + scene.cameras * image) / 3600
+    light = model["frame"]["a cell on a voxel's way to the light"] * scene.voxels**4 * scene.frames / 3600
     return (
         f"Ground truth: {frame:.3g} s a frame and {image:.3g} s an image here, {hours:,.0f} core-hours for {scene.frames:,} frames and {scene.cameras} cameras; "
         f"a frame's medium takes {_size(33 * scene.voxels**3)} while it is prepared, whose box is full; images of half floats {_size(8 * scene.pixels * scene.views * 1.2)} "
-        "before they are compressed."
+        f"before they are compressed. {100 * light / hours:.0f} % of the hours are voxels' ways to the light, which grow with the fourth power of the resolution: frames are independent, "
+        "so that workers share them, and this, not the training, is what such a sequence waits for."
+    )
+
+
+def _photographs(scene: Paper) -> str:
+    whole = 4.0 * scene.primitives * scene.numbers
+    return (
+        f"Photographs of 8 bits take {_size(3.0 * scene.pixels * scene.views)}, of which a process keeps 2 GiB and reads the rest again; all parameters, which every rank makes at the start and the "
+        f"first reads at the end, {_size(whole)}, {_size(8 * whole)} for eight ranks of one machine. Parts take the terms that grow with the whole scene out of a step but for one, who is in "
+        "sight: each rank asks that of its primitives for everybody's view. What is left grows with a view, which more ranks do not make smaller."
     )
 
 
@@ -146,7 +157,7 @@ def table_of_scenes(model: dict[str, Any]) -> str:
         parts.append(
             f"**{scene.title[0].upper() + scene.title[1:]}**: {scene.primitives / 1e6:g} million primitives of {scene.numbers} numbers, {100 * scene.shown:g} % of them in a "
             f"view, {scene.overlap:g} over a pixel; {scene.views:,} views of {scene.pixels / 1e6:.3g} Mpx, each seen {scene.seen} times."
-            + (f" {_truth(scene, model)}" if scene.frames else "")
+            + f" {_truth(scene, model) if scene.frames else _photographs(scene)}"
             + f"\n\n{_ways(scene, model)}\n\nOn a card, drawing such a view would take {_size(drawing)}; beside it a card of 80 GB has room for the state of "
             f"{max(fits, 0) / 1e6:,.0f} million primitives."
         )

@@ -141,8 +141,8 @@ def _photographs(scene: Paper) -> str:
     whole = 4.0 * scene.primitives * scene.numbers
     return (
         f"Photographs of 8 bits take {_size(3.0 * scene.pixels * scene.views)}, of which a process keeps 2 GiB and reads the rest again; all parameters, which every rank makes at the start and the "
-        f"first reads at the end, {_size(whole)}, {_size(8 * whole)} for eight ranks of one machine. Parts take the terms that grow with the whole scene out of a step but for one, who is in "
-        "sight: each rank asks that of its primitives for everybody's view. What is left grows with a view, which more ranks do not make smaller."
+        f"first reads at the end, {_size(whole)}, {_size(8 * whole)} for eight ranks of one machine. Parts leave out what a view does not show and share Adam's numbers "
+        "out; one term still grows with the whole scene, who is in sight: each rank asks that of its primitives for everybody's view. What is left grows with a view, which more ranks do not make smaller."
     )
 
 

@@ -25,6 +25,7 @@ class Threads:
         self.size, self.store = size, dist.HashStore()
         self._barrier = threading.Barrier(size, timeout=60)
         self._rows: list[Tensor] = [torch.empty(0)] * size
+        self._parts: list[list[Tensor]] = [[]] * size
 
     def wire(self, rank: int) -> Any:
         return _Wire(self, rank)
@@ -34,6 +35,17 @@ class Threads:
             self._rows[rank] = rows.clone()
             self._barrier.wait()
             torch.stack([given[rank] for given in self._rows], out=found)
+            self._barrier.wait()
+        except threading.BrokenBarrierError:
+            raise RankError("broken") from None
+
+    def exchange(self, rank: int, rows: Tensor, found: Tensor, give: list[int], take: list[int]) -> None:
+        try:
+            self._parts[rank] = [part.clone() for part in rows.split(give)]
+            self._barrier.wait()
+            parts = [given[rank] for given in self._parts]
+            assert [len(part) for part in parts] == take, "both ends of an exchange know its length"
+            found.copy_(torch.cat(parts))
             self._barrier.wait()
         except threading.BrokenBarrierError:
             raise RankError("broken") from None
@@ -50,6 +62,9 @@ class _Wire:
 
     def swap(self, rows: Tensor, found: Tensor) -> None:
         self._threads.swap(self.rank, rows, found)
+
+    def exchange(self, rows: Tensor, found: Tensor, give: list[int], take: list[int]) -> None:
+        self._threads.exchange(self.rank, rows, found, give, take)
 
     def close(self) -> None:
         self._threads.hang_up()

@@ -7,7 +7,7 @@ A *model* holds what rendering needs and nothing else; a *checkpoint* holds the 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,26 @@ from torch import Tensor
 from neuprim.core import compressed
 from neuprim.core.errors import CheckpointError, nearest
 from neuprim.core.io.files import atomic_path
+from neuprim.core.io.pieces import Kind, write_pieces
 from neuprim.core.model.fields import ColourField, DensityField, pieces_by_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.zeros import split_off, whole
 from neuprim.core.task import TaskSpec
 
-__all__ = ["FORMAT", "extra_of", "load_model", "read", "read_header", "save_compressed", "save_model", "stored_config", "write"]
+__all__ = [
+    "FORMAT",
+    "extra_of",
+    "load_model",
+    "model_header",
+    "read",
+    "read_header",
+    "save_compressed",
+    "save_model",
+    "shapes",
+    "stored_config",
+    "write",
+    "write_in_pieces",
+]
 
 FORMAT = 1
 _KEY = "neuprim"
@@ -78,8 +92,36 @@ def _checked(path: Path, header: Any, kind: str) -> dict[str, Any]:
     return header
 
 
-def read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def write_in_pieces(
+    path: Path, kind: str, kinds: Mapping[str, Kind], header: Mapping[str, Any], pieces: Callable[[str], Iterable[Tensor]]
+) -> None:
+    """As :func:`write`, of tensors that are nowhere whole, see :func:`~neuprim.core.io.pieces.write_pieces`."""
+    text = json.dumps({"format": FORMAT, "kind": kind, **header}, allow_nan=False)
+    try:
+        with atomic_path(path) as temporary:
+            write_pieces(temporary, kinds, {_KEY: text}, pieces)
+    except OSError as error:
+        raise CheckpointError(f"{path}: could not write the {kind}: {error}; the previous one, if any, is untouched") from error
+
+
+def shapes(path: Path, kind: str) -> dict[str, tuple[int, ...]]:
+    """Shapes of all tensors of a file that is not compressed; reads none of them.
+
+    Raises:
+        CheckpointError: see :func:`read_header`.
+    """
+    read_header(path, kind)
+    with safe_open(str(path), framework="pt") as file:
+        return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}
+
+
+def read(
+    path: Path, kind: str, rows: Callable[[str, tuple[int, ...]], slice | None] = lambda name, shape: None
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Header and tensors. Memory is bounded by the file's true size: a header that claims more is refused.
+
+    Args:
+        rows: of a tensor's name and shape, those to read; None for all.
 
     Raises:
         CheckpointError: see :func:`read_header`.
@@ -90,7 +132,11 @@ def read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     header = read_header(path, kind)
     try:
         with safe_open(str(path), framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
+            found = {name: file.get_slice(name) for name in file.keys()}
+            parts = {name: rows(name, tuple(one.get_shape())) for name, one in found.items()}
+            empty = {name for name, one in found.items() if 0 in one.get_shape()}  # of which the library takes no slice
+            tensors = {name: found[name][part] if part and name not in empty else file.get_tensor(name) for name, part in parts.items()}
+            tensors |= {name: tensors[name][part] for name, part in parts.items() if part and name in empty}
     except (OSError, SafetensorError, ValueError, RuntimeError) as error:
         raise CheckpointError(f"{path}: tensors of the {kind} are unreadable: {error}") from error
     return header, tensors
@@ -104,7 +150,7 @@ def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any
     """
     pieces = pieces_by_name(model.density, model.colour) if without_zeros else {}
     tensors, apart = split_off(model.params, model.specs, pieces)
-    write(path, "model", tensors, {**_model_header(model, task, extra), **({"apart": apart} if apart else {})})
+    write(path, "model", tensors, {**model_header(model, task, extra), **({"apart": apart} if apart else {})})
 
 
 def save_compressed(
@@ -132,7 +178,7 @@ def save_compressed(
     sections = compressed.encode(model, made)
     if config is not None:
         sections.insert(0, compressed.Section(compressed.CONFIG, compressed.TEXT, (), planes=(config.encode(),)))
-    header = {"format": FORMAT, "kind": "model", **_model_header(model, task, extra)}
+    header = {"format": FORMAT, "kind": "model", **model_header(model, task, extra)}
     sizes = compressed.write_compressed(path, header, model.count, sections)
     return {name: compressed.Stored(compressed.bits_in_words(scheme), sizes[name]) for name, scheme in made.items()}
 
@@ -146,7 +192,8 @@ def stored_config(path: Path) -> str | None:
     return compressed.read_compressed(path)[2]
 
 
-def _model_header(model: Primitives, task: str, extra: Mapping[str, Any]) -> dict[str, Any]:
+def model_header(model: Primitives, task: str, extra: Mapping[str, Any]) -> dict[str, Any]:
+    """The header of a file that :func:`save_model` writes, but for format and kind."""
     fields = {
         kind: {"class": type(field).__name__, "settings": field.settings()}
         for kind, field in (("density", model.density), ("colour", model.colour))

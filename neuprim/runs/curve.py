@@ -8,6 +8,7 @@ from typing import Any
 
 from neuprim.core.io.files import write_text
 from neuprim.core.metrics import psnr
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.measure import draw
@@ -58,9 +59,11 @@ def curve_psnr(trainer: Trainer) -> float:
     it; does not touch the training state."""
     views = trainer.dataset.test
     picks = sorted({i * len(views) // _VIEWS for i in range(_VIEWS)})
-    total = 0.0
-    for i in picks:
+
+    def judge(place: int, model: Primitives) -> float:
+        i = picks[place]
         pixels = views.pixels(i)
-        rendered = draw(trainer.model, views.view(i), trainer.renderer, trainer.dataset.background)
-        total += min(psnr(rendered, pixels.over(trainer.dataset.background), pixels.mask), _PSNR_MAX)
-    return total / len(picks)
+        rendered = draw(model, views.view(i), trainer.renderer, trainer.dataset.background)
+        return min(psnr(rendered, pixels.over(trainer.dataset.background), pixels.mask), _PSNR_MAX)
+
+    return sum(trainer.ranks.judged(trainer.model, [views.view(i) for i in picks], judge)) / len(picks)

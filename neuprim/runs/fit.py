@@ -20,6 +20,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
 from neuprim.core.task import Loss, TaskSpec
 from neuprim.core.train.initial import initial_model
+from neuprim.core.train.ranks.refusals import refuse_parts
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.core.uses import build_settings, loss_settings
@@ -80,6 +81,8 @@ def fit(config: RunConfig, events: Events = silent, dataset: Dataset | None = No
     Raises:
         NeuprimError: the input's fault, or numbers that left the finite.
     """
+    if config.train.shard:
+        refuse_parts(config.train, 1)
     suspects = suspects_of(config)
     with suspects.watch(config.output_dir / LOGS):
         return complete(start(config, events, dataset, suspects), events)
@@ -142,16 +145,16 @@ def steps(trainer: Trainer, events: Events = silent) -> Iterator[tuple[StepRepor
         events(Step(report, trainer.progress))
         held_out = None
         if trainer.progress >= next_eval:
-            if trainer.ranks.first:
+            if trainer.ranks.first or trainer.ranks.parts:  # a view is drawn with the primitives of all
                 held_out = curve_psnr(trainer)
                 events(Evaluated(held_out))
             next_eval = next_evaluation(trainer)
         yield report, held_out
     asked = trainer.settings.population.grow_to or 0
-    if trainer.settings.population.strategy == "relocate" and trainer.model.count < asked:
+    if trainer.settings.population.strategy == "relocate" and trainer.count < asked:
         events(
             Note(
-                f"{trainer.model.count:,} primitives of model.primitives={asked:,}: too few interventions, or places with an error, to split for the others; "
+                f"{trainer.count:,} primitives of model.primitives={asked:,}: too few interventions, or places with an error, to split for the others; "
                 "see train.population.every"
             )
         )

@@ -11,6 +11,7 @@ from neuprim.runs.events import Events, Finishing, silent
 from neuprim.runs.finish import finish
 from neuprim.runs.lock import held
 from neuprim.runs.open import LOGS
+from neuprim.runs.parts import assemble
 from neuprim.runs.training import Between, alone, train
 
 __all__ = ["run"]
@@ -37,6 +38,7 @@ def run(config: RunConfig, events: Events = silent, between: Between = alone, ra
         fitted, interrupted = train(config, suspects, events, between=between, ranks=ranks)
         if ranks.first:
             events(Finishing("measuring held-out views"))
+            assemble(fitted, directory)
             finish(fitted, directory)
     if interrupted:
         raise KeyboardInterrupt

@@ -17,6 +17,7 @@ from neuprim.core.io.files import write_text
 from neuprim.core.model.edge import EDGES
 from neuprim.core.render.backends import choose, compiled_ahead
 from neuprim.core.train.ranks import ALONE, Alone
+from neuprim.core.train.restoring import part
 from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.blame import Suspects
 from neuprim.plugins.judging import facts_of
@@ -26,6 +27,7 @@ from neuprim.runs.curve import open_curve
 from neuprim.runs.events import Events, Note, Preparing, silent
 from neuprim.runs.fit import Fitted, compile_kernels, one_torch_thread, start, steps
 from neuprim.runs.interrupt import interruptible
+from neuprim.runs.parts import in_parts, read_part, write_parts
 
 __all__ = ["COMPILING", "Between", "alone", "make_ready", "save", "train"]
 
@@ -65,10 +67,12 @@ def train(
         NeuprimError: the input's fault, or numbers that left the finite; whatever was on disk before is intact.
         RankError: another rank is gone; the first one, if it is there, has written a checkpoint of the last whole step.
     """
+    ranks = in_parts(config, ranks)
     ahead = compiled_ahead(config.renderer) if dataset is None else None  # beside loading; of data that are there nothing is waited for
     edge = config.model.density.get("edge", 0)  # of a density of ours; of another's, whatever the word means there
     with ranks.in_turn(), compiling(None if ahead is None else ahead.name, edge if edge in EDGES else 0) as kernels:
         fitted = start(config, events, dataset, suspects, hold_out)
+        begun = _begun(fitted.trainer) if ranks.parts else {}  # while the model is whole
         fitted.trainer.join(ranks)
         _resume(fitted, events)
         if ranks.first:
@@ -79,9 +83,8 @@ def train(
             kernels.wait()
         make_ready(fitted.trainer, events)
     if ranks.size > 1:
-        from neuprim.core.train.ranks.beginning import beginning
-
-        ranks.agree("expected the same words, data and output directory on all ranks", beginning(fitted.trainer))
+        facts = {**begun, "steps done": fitted.trainer.step, "primitives": fitted.trainer.count} if begun else _begun(fitted.trainer)
+        ranks.agree("expected the same words, data and output directory on all ranks", facts)
     return fitted, _train(fitted, events, between) if ranks.first else _follow(fitted)
 
 
@@ -98,11 +101,18 @@ def make_ready(trainer: Trainer, events: Events = silent) -> None:
         mark_compiled(backend.name, form)
 
 
+def _begun(trainer: Trainer) -> dict[str, Any]:
+    from neuprim.core.train.ranks.beginning import beginning
+
+    return beginning(trainer)
+
+
 def _resume(fitted: Fitted, events: Events) -> None:
     config, saved = fitted.config, fitted.config.output_dir / "checkpoint.safetensors"
     if not (config.resume and saved.exists()):
         return
-    header, tensors = checkpoint.read(saved, "checkpoint")
+    ranks = fitted.trainer.ranks
+    header, tensors = read_part(saved, "checkpoint", ranks) if ranks.parts else checkpoint.read(saved, "checkpoint")
     if header.get("task") != config.task:
         raise CheckpointError(f"{saved}: written for task {header.get('task')!r}; this run's task is {config.task!r}")
     check_resumed(header.get("made_by"), config.made_by, saved)
@@ -116,6 +126,7 @@ def _train(fitted: Fitted, events: Events, between: Between) -> bool:
     curve = open_curve(config.output_dir / "metrics.jsonl", trainer.step)
     last_saved = time.monotonic()
     interrupted = False
+    due = trainer.ranks.saves(lambda: time.monotonic() - last_saved > config.train.checkpoint_every_seconds)
     with interruptible(terminated=trainer.ranks.size > 1) as stop, curve, one_torch_thread(), _kept(fitted):
         last = trainer.ranks.last(stop.is_set)
         between(fitted, stop)
@@ -129,7 +140,7 @@ def _train(fitted: Fitted, events: Events, between: Between) -> bool:
                 line = {"step": report.step, "seconds": round(report.seconds, 4), "loss": report.loss, **report.parts, "psnr": report.psnr, "primitives": report.primitives, **line}  # fmt: skip
                 curve.write(json.dumps(line) + "\n")
                 curve.flush()
-            if time.monotonic() - last_saved > config.train.checkpoint_every_seconds:
+            if due():
                 save(fitted)
                 last_saved = time.monotonic()
             between(fitted, stop)
@@ -141,28 +152,42 @@ def _train(fitted: Fitted, events: Events, between: Between) -> bool:
 
 
 def _follow(fitted: Fitted) -> bool:
-    """The same on a rank that writes nothing."""
+    """The same on a rank that writes nothing; one that has a part of the primitives hands it to the first, which writes."""
+    ranks = fitted.trainer.ranks
     with interruptible(terminated=True) as stop, one_torch_thread():
-        last = fitted.trainer.ranks.last(stop.is_set)
-        return any(last() for _ in steps(fitted.trainer))
+        last, due = ranks.last(stop.is_set), ranks.saves(lambda: False)
+        interrupted = False
+        for _ in steps(fitted.trainer):
+            if ranks.parts and due():
+                save(fitted)
+            if last():
+                interrupted = True
+                break
+    if ranks.parts:
+        save(fitted)
+    return interrupted
 
 
 @contextmanager
 def _kept(fitted: Fitted) -> Iterator[None]:
-    """A rank that is gone costs no step: what the others have is saved."""
+    """A rank that is gone costs no step: what the others have is saved. Where it had primitives of its own they are gone, and the last checkpoint counts."""
     try:
         yield
     except RankError:
-        save(fitted)
+        if not fitted.trainer.ranks.parts:
+            save(fitted)
         raise
 
 
 def save(fitted: Fitted) -> None:
-    """Checkpoint and model, into the run's directory."""
+    """Checkpoint and model, into the run's directory; where primitives are in parts, called on all ranks."""
     trainer, config, dataset = fitted.trainer, fitted.config, fitted.dataset
     tensors, header = trainer.state()
     made_by = {} if config.made_by is None else {"made_by": config.made_by.to_dict()}
-    checkpoint.write(config.output_dir / "checkpoint.safetensors", "checkpoint", tensors, {"task": config.task, **made_by, **header})
+    header = {"task": config.task, **made_by, **header}
+    files = [config.output_dir / f"{name}.safetensors" for name in ("checkpoint", "model")]
+    if not trainer.ranks.parts:
+        checkpoint.write(files[0], "checkpoint", tensors, header)
     extra: dict[str, Any] = {
         "background": [float(x) for x in dataset.background],
         "color_space": dataset.color_space,
@@ -173,4 +198,9 @@ def save(fitted: Fitted) -> None:
     }
     if dataset.placement is not None:
         extra["world"] = dataset.placement.to_json()
-    checkpoint.save_model(config.output_dir / "model.safetensors", trainer.model, config.task, extra, without_zeros=bool(trainer.zeros))
+    if not trainer.ranks.parts:
+        checkpoint.save_model(files[1], trainer.model, config.task, extra, without_zeros=bool(trainer.zeros))
+        return
+    write_parts(files[0], "checkpoint", trainer, tensors, header)
+    head = {**checkpoint.model_header(trainer.model, config.task, extra), "primitives": trainer.count}
+    write_parts(files[1], "model", trainer, part(tensors, "params."), head, lambda name, value: True)

@@ -236,3 +236,44 @@ def test_the_table_of_photographs_is_that_of_the_recorded_results(benchmark: Cal
     rows = json.loads((RESULTS / "photographs.json").read_text(encoding="utf-8"))["trials"]
     script = benchmark("photographs")
     assert between("docs/static.md", "photographs") == f"{script.table(rows)}\n\n{script.caption(rows)}"
+
+
+def test_the_tables_of_parts_and_of_the_cost_model_are_those_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
+    shards, costs = benchmark("shards"), benchmark("cost_model")
+    parts, record = (json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8")) for name in ("shards", "cost_model"))
+    assert between("docs/scaling.md", "shards") == shards.table(parts)
+    for kind, terms in costs.model_of(record).items():
+        assert record["model"][kind] == pytest.approx(terms, rel=1e-6)
+    for name, text in (
+        ("cost-terms", costs.table_of_terms(record)),
+        ("cost-judged", costs.table_of_judged(record)),
+        ("cost-paper", costs.table_of_scenes(record["model"])),
+    ):
+        assert between("docs/scaling.md", name) == text
+    for place in ("around", "within"):  # state halves, whatever else there is
+        half = max(rank["state"] for rank in parts[place]["parts"])
+        assert half == pytest.approx(parts[place]["alone"][0]["state"] / 2, rel=0.01)
+
+
+def test_a_cost_model_finds_the_terms_that_times_are_made_of(benchmark: Callable[[str], ModuleType]) -> None:
+    costs = benchmark("cost_model")
+    known = [1e-3, 2e-7, 0.0, 5e-8]
+    rows = [[1.0, 10.0**i * (1 + j), 3.0**j, 1e4 * (1 + i * j)] for i in range(2, 5) for j in range(4)]
+    seconds = [sum(c * n for c, n in zip(known, row, strict=True)) for row in rows]
+    assert costs.fitted(rows, seconds) == pytest.approx(known, rel=1e-6, abs=1e-12)
+
+
+def test_amounts_on_paper_are_those_of_a_step(benchmark: Callable[[str], ModuleType]) -> None:
+    """Of a scene of which a view shows all, parts hold the state divided by the ranks, and send what their formula says."""
+    paper = benchmark("shared.paper_scenes")
+    scene = paper.Paper("", 1000, 70, 1.0, 10.0, 64 * 64, 5, 2)
+    found = paper.amounts(scene)
+    assert found["state"] == 1000 * (4 * 4 * 70 + 8) and found["steps"] == 10
+    assert found["parts send"] == 1000 * (8 * 70 + 8) and found["whole sends"] == 2 * 4 * 1000 * 72
+    model = {
+        "step": dict.fromkeys(benchmark("cost_model").TERMS, 0.0),
+        "adam": {"a number": 1.0},
+        "sight": {"a primitive": 0.0},
+        "exchange": {"a byte": 0.0},
+    }
+    assert [paper.seconds_here(scene, model, 8, parts)["Adam"] for parts in (False, True)] == [70_000, 8750]

@@ -273,6 +273,18 @@ class Primitives:
             check_geometry(moved, method(self.density, "move"), stored.count)
         return Living(self.density, conditions, rows, params, own, stored, moved)
 
+    def places(self, conditions: Conditions) -> tuple[Tensor | None, Geometry]:
+        """Rows of the primitives that live in a frame, None for all, and where they are; without gradient, and copying what places them alone."""
+        own = {name: value.detach() for name, value in self.of(self.density).items()}
+        rows = self.density.alive(own, conditions)
+        geometry = Geometry(*(self.params[name].detach() for name in ("means", "log_scales", "quats")))
+        if rows is not None:
+            check_rows(rows, self.count, f"{method(self.density, 'alive')} returned")
+            own, geometry = {name: value[rows] for name, value in own.items()}, geometry[rows]
+        moved = self.density.move(own, geometry, conditions)
+        check_geometry(moved, method(self.density, "move"), geometry.count)
+        return rows, moved
+
     def forms(self, camera: AnyCamera, conditions: Conditions) -> Lowered:
         """As :meth:`lower`, unchecked and unshaded: what kind of forms the fields lower to."""
         living = self.living(conditions)

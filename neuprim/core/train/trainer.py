@@ -7,11 +7,11 @@ the next step is in :meth:`Trainer.state`, so that 2N steps equal N steps, a kil
 
 from __future__ import annotations
 
-import hashlib
 import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -21,7 +21,7 @@ from neuprim.core.compute import device
 from neuprim.core.compute.threads import limited
 from neuprim.core.data import Dataset, Pixels, PointSamples
 from neuprim.core.data.check import check_pixels
-from neuprim.core.errors import CheckpointError, ConfigError, DataError, DeviceMemoryError, NonFiniteError, RankError, nearest
+from neuprim.core.errors import ConfigError, DataError, DeviceMemoryError, NonFiniteError, RankError, nearest
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.place import device_of
@@ -34,7 +34,9 @@ from neuprim.core.train.losses import scale_anisotropy
 from neuprim.core.train.optimizer import RowAdam
 from neuprim.core.train.points import PointStep, point_step
 from neuprim.core.train.population import Change, make_population
-from neuprim.core.train.ranks import ALONE, Alone, Seen
+from neuprim.core.train.ranks import ALONE, Alone, Look, Seen
+from neuprim.core.train.ranks.refusals import refuse_parts
+from neuprim.core.train.restoring import by_row, names_of, part, restored
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.step import ImageStep, StepReport, of_views
 
@@ -77,7 +79,6 @@ class Trainer:
         first = dataset.train.view(0)
         self.device = device_of(model, self.renderer, first.camera, first.conditions)
         model.params = model.to(self.device).params
-        self.optimizer = RowAdam(model.specs, model.params, settings.adam_beta2)
         self._ahead = Ahead(self._pixels, device.spare_memory(self.device) // 4) if self.device.type == device.CARD else None
         self.population = make_population(settings.population)
         self.angles = None if settings.angular_size is None else AngularSize(dataset.train, settings.angular_size)
@@ -99,14 +100,37 @@ class Trainer:
         self._watch()
 
     def join(self, ranks: Alone) -> None:
-        """Train with others from here on: a step looks at ``train.views_per_step`` views of every rank.
+        """Train with others from here on: a step looks at ``train.views_per_step`` views of every rank. Where each has a part of the primitives, this
+        one keeps its own.
 
         Raises:
-            ConfigError: there are no views to share.
+            ConfigError: there are no views to share, or what is trained cannot be in parts.
         """
         if ranks.size > 1 and self.settings.supervision == "voxels":
             raise ConfigError(f"train.supervision=voxels: there are no views that {ranks.size} ranks could share; expected one process")
         self.ranks = ranks
+        if ranks.parts:
+            refuse_parts(self.settings, ranks.size)
+            if self.step:
+                tensors, header = self.state()
+                own = ranks.cut({name: value for name, value in tensors.items() if by_row(name, value)})
+                self.load_state({**tensors, **own}, header, "the whole model")
+                return
+            self.model.params = ranks.cut(self.model.params)
+            vars(self).pop("optimizer", None)
+            self.population.count = self.count
+            self._watch()
+
+    def leave(self, params: dict[str, Tensor]) -> None:
+        """Train no more: the whole model's tensors take the place of this rank's part, and its moments go."""
+        self.ranks, self.population.count = ALONE, None
+        self.model.params = {name: params[name].to(self.device) for name in self.model.params}
+        vars(self).pop("optimizer", None)
+
+    @cached_property
+    def optimizer(self) -> RowAdam:
+        """Made when it is first needed: a rank that keeps a part of the primitives never has moments of all."""
+        return RowAdam(self.model.specs, self.model.params, self.settings.adam_beta2)
 
     # ------------------------------------------------------------ the budget
 
@@ -179,24 +203,24 @@ class Trainer:
         looks = views * self.ranks.size
         step = self.ranks.step(model, views, self.elapsed, start)
         known: PointStep | None = None
-        for place, index, background, following in self._deal(looks):
-            seen = self._look(progress, index, background, following)
+        for place, index, background, following, peers in self._deal(looks):
+            samples = self._draw_points() if place >= looks - self.ranks.size and self._points_due() else None
+            shown = step.drawn(lambda peers=peers, samples=samples: self._looks(peers, samples))  # type: ignore[misc]
+            seen = self._look(progress, index, background, following, shown)
             loss = seen.loss / looks if looks > 1 else seen.loss
             last = place == looks - 1
             if last:  # points and regularisers go with the last view, whoever looks at it
-                known = self._look_inside() if self._points_due() else None
+                known = None if samples is None else self._look_inside(samples, shown)
                 loss = self._beside(loss, known)
-            elif place >= looks - self.ranks.size and self._points_due():
-                self._draw_points()  # another rank looks at them
             cost = self._go_back(loss, loss if last else seen.loss, seen, known)
             gain = None if self.exposures is None else self.exposures.gradient(index)
             more = {} if known is None else known.parts
             step.add(Seen(index, seen.name, cost, seen.psnr, seen.parts, more, gain), seen.tally)
-            del seen, loss  # and what the frame kept, before the next one is drawn
+            del seen, loss, shown  # and what the frame kept, before the next one is drawn
         if looks:
             tally = step.close()
         else:
-            known = self._look_inside()
+            known = self._look_inside(self._draw_points(), model)
             loss = self._beside(None, known)
             cost = self._go_back(loss, loss, None, known)
             tally = known.tally()
@@ -212,7 +236,7 @@ class Trainer:
         self.step += 1
         change = None
         if self.population.due(self.step, progress):
-            change = self.population.intervene(model, self.dataset.extent)
+            change = self.ranks.intervene(self.population, model, self.optimizer, self.dataset.extent)
             if change is not None:
                 self._apply(change)
         self.elapsed = self.ranks.spent(self.elapsed, start)
@@ -220,10 +244,16 @@ class Trainer:
             parts, psnr, name = known.parts, known.psnr, known.name
         else:
             cost, parts, psnr, name = of_views(step.seen)
-        return StepReport(self.step, self.elapsed, cost, parts, psnr, model.count, name, change.text if change else None)
+        return StepReport(self.step, self.elapsed, cost, parts, psnr, self.count, name, change.text if change else None)
 
-    def _deal(self, looks: int) -> list[tuple[int, int, Tensor, int | None]]:
-        """Draw the views of a step; of this rank's, by turns: place in the step, view, background, and the view that this rank looks at next.
+    @property
+    def count(self) -> int:
+        """Primitives of the whole model."""
+        return self.ranks.count(self.model)
+
+    def _deal(self, looks: int) -> list[tuple[int, int, Tensor, int | None, list[int]]]:
+        """Draw the views of a step; of this rank's, by turns: place in the step, view, background, the view that this rank looks at next, and those that
+        all ranks look at now.
 
         All ranks draw all of them, so that their random numbers stay the same.
         """
@@ -231,7 +261,13 @@ class Trainer:
         mine = range(self.ranks.rank, looks, self.ranks.size)
         later = int(self.order[self.ranks.rank]) if len(self.order) > self.ranks.rank else None
         following = [*(drawn[place][0] for place in mine[1:]), later]
-        return [(place, *drawn[place], then) for place, then in zip(mine, following, strict=True)] if looks else []
+        peers = [[index for index, _ in drawn[place - self.ranks.rank :][: self.ranks.size]] for place in mine]
+        return [(place, *drawn[place], then, now) for place, then, now in zip(mine, following, peers, strict=True)] if looks else []
+
+    def _looks(self, peers: list[int], samples: PointSamples | None) -> list[Look]:
+        """What all ranks look at now; points go with the last one's."""
+        looks = [Look(self.dataset.train.view(index)) for index in peers]
+        return looks if samples is None else [*looks[:-1], replace(looks[-1], beside=samples.conditions)]
 
     def _beside(self, loss: Tensor | None, known: PointStep | None) -> Tensor:
         """The loss of a step's views, or None, with those of points and regularisers."""
@@ -254,14 +290,14 @@ class Trainer:
         loss.backward()
         return cost
 
-    def _look(self, progress: float, index: int, background: Tensor, following: int | None) -> ImageStep:
+    def _look(self, progress: float, index: int, background: Tensor, following: int | None, shown: Primitives) -> ImageStep:
         """Draw a view and compare."""
         pixels = self._pixels(index) if self._ahead is None else self._ahead.take(index, following)
         factor = reduction(progress, self.settings.coarse, self.settings.coarse_until)
         view, pixels = reduced(self.dataset.train.view(index), pixels, factor)
         background = background.to(self.device, non_blocking=True)
         truth = pixels.over(background)
-        output = render(self._drawn(), view.camera, view.conditions, self.renderer, background)
+        output = render(self._drawn(shown), view.camera, view.conditions, self.renderer, background)
         rgb = output.rgb if self.exposures is None else self.exposures.apply(index, output.rgb)
         if pixels.mask is not None:
             rgb = torch.where(pixels.mask[..., None], rgb, truth)
@@ -276,9 +312,8 @@ class Trainer:
         psnr = -10 * math.log10(max(mse, 1e-20)) if math.isfinite(mse) else math.nan
         return ImageStep(loss, parts, psnr, view.name, truth, tally)
 
-    def _drawn(self) -> Primitives:
+    def _drawn(self, model: Primitives) -> Primitives:
         """What images are drawn of."""
-        model = self.model
         return model if self.stored is None else Primitives(model.density, model.colour, self.stored(model.params))
 
     def _pixels(self, index: int) -> Pixels:
@@ -292,9 +327,9 @@ class Trainer:
         source = self.settings.supervision
         return source == "voxels" or (source == "both" and (self.step + 1) % self.settings.voxels_every == 0)
 
-    def _look_inside(self) -> PointStep:
-        """Draw points of known extinction and compare."""
-        return point_step(self._drawn(), self.dataset, self._draw_points(), self.settings, self.renderer.threads)
+    def _look_inside(self, samples: PointSamples, shown: Primitives) -> PointStep:
+        """Compare at points of known extinction."""
+        return point_step(self._drawn(shown), self.dataset, samples, self.settings, self.renderer.threads)
 
     def _draw_points(self) -> PointSamples:
         points = self.dataset.points
@@ -349,71 +384,24 @@ class Trainer:
         tensors |= {f"zeros.{k}": v for k, v in self.zeros.items()}
         tensors |= {"generator": self.generator.get_state(), "order": self.order}
         tensors = {name: value.cpu() for name, value in tensors.items()}
-        return tensors, {"step": self.step, "elapsed": self.elapsed, "views": len(self.dataset.train), "names": self._names()}
-
-    def _names(self) -> str:
-        """A short hash of the training views' names: other frames or images of the same number are other data."""
-        views = self.dataset.train
-        text = "\n".join(views.view(i).name for i in range(len(views)))
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        header = {"step": self.step, "elapsed": self.elapsed, "views": len(self.dataset.train), "names": names_of(self.dataset.train)}
+        return tensors, header
 
     def load_state(self, tensors: dict[str, Tensor], header: dict[str, Any], where: str) -> None:
-        """Continue from :meth:`state`.
+        """Continue from :meth:`state`; of a rank with a part of the primitives, from its rows.
 
         Raises:
             CheckpointError: the state belongs to other settings or data; names what differs. The trainer is unchanged.
         """
-
-        def part(prefix: str) -> dict[str, Tensor]:
-            return {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}
-
-        step, elapsed, views = header.get("step"), header.get("elapsed"), header.get("views")
-        if not isinstance(step, int) or not isinstance(elapsed, (int, float)) or step < 0 or not math.isfinite(elapsed):
-            raise CheckpointError(f"{where}: step {step!r}, elapsed {elapsed!r}; expected numbers")
-        if views != len(self.dataset.train):
-            raise CheckpointError(f"{where}: trained on {views} views, the data set now has {len(self.dataset.train)}")
-        if header.get("names", self._names()) != self._names():  # earlier checkpoints have none
-            raise CheckpointError(f"{where}: trained on {views} views with other names than those of the data set now")
-        try:
-            model = Primitives(self.model.density, self.model.colour, part("params."))
-            optimizer = RowAdam(model.specs, model.params, self.settings.adam_beta2)
-            optimizer.load_state(part("adam."))
-            for name, value in (*model.params.items(), *optimizer.m.items(), *optimizer.v.items()):
-                shape = model.params[name].shape
-                if value.shape != shape or value.dtype != torch.float32 or not bool(torch.isfinite(value).all()):
-                    raise ValueError(
-                        f"{name} or a moment of it is {value.dtype} {tuple(value.shape)}; expected finite float32 {tuple(shape)}"
-                    )
-            if optimizer.age.shape != (model.count,) or optimizer.age.dtype != torch.int64:
-                raise ValueError(f"ages are {optimizer.age.dtype} {tuple(optimizer.age.shape)}; expected int64 ({model.count},)")
-            if model.count and not 0 <= int(optimizer.age.min()) <= int(optimizer.age.max()) <= step:
-                raise ValueError(f"ages are {int(optimizer.age.min())} to {int(optimizer.age.max())} steps; expected 0 to {step}")
-            order = tensors["order"]
-            if order.dim() != 1 or order.dtype != torch.int64 or (len(order) and (int(order.min()) < 0 or int(order.max()) >= views)):
-                raise ValueError("the order of views is out of range")
-            generator = torch.Generator()
-            generator.set_state(tensors["generator"])
-            population = part("population.")
-            for name, value in population.items():
-                if value.dim() > 0 and value.shape != (model.count,):
-                    raise ValueError(f"statistic {name} has shape {tuple(value.shape)}; expected ({model.count},)")
-            zeros = part("zeros.")
-            for name, zero in zeros.items():
-                if name not in model.params or zero.shape != model.params[name].shape or zero.dtype != torch.bool:
-                    raise ValueError(f"zeros of {name!r} are {zero.dtype} {tuple(zero.shape)}")
-            exposures = part("exposure.")
-            if bool(exposures) != (self.exposures is not None):
-                raise ValueError(f"it has {'' if exposures else 'no '}exposures, train.exposure_rate is {self.settings.exposure_rate:g}")
-            if self.exposures is not None:
-                self.exposures.load_state(exposures)
-        except (ValueError, KeyError, RuntimeError, TypeError, IndexError) as error:
-            raise CheckpointError(f"{where}: does not fit this run's settings ({error})") from error
+        found = restored(tensors, header, where, self.model, self.settings.adam_beta2, self.dataset.train, self.exposures)
+        model, self.optimizer = found.model, found.optimizer
         self.model.params = model.to(self.device).params
         if self.device != model.device:
-            optimizer = RowAdam(self.model.specs, self.model.params, self.settings.adam_beta2)
-            optimizer.load_state(part("adam."))
-        self.optimizer, self.order, self.generator = optimizer, order.clone(), generator
-        self.population.load_state({name: value.to(self.device) for name, value in population.items()})
-        self.zeros = {name: zero.to(self.device) for name, zero in zeros.items()}
-        self.step, self.elapsed = step, float(elapsed)
+            self.optimizer = RowAdam(self.model.specs, self.model.params, self.settings.adam_beta2)
+            self.optimizer.load_state(part(tensors, "adam."))
+        self.order, self.generator = tensors["order"].clone(), found.generator
+        self.population.load_state({name: value.to(self.device) for name, value in found.population.items()})
+        self.zeros = {name: zero.to(self.device) for name, zero in found.zeros.items()}
+        self.population.count = self.count if self.ranks.parts else None
+        self.step, self.elapsed = found.step, found.elapsed
         self._watch()

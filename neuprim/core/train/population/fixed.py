@@ -12,6 +12,8 @@ __all__ = ["Fixed"]
 class Fixed(Population):
     """Nothing is born and nothing dies."""
 
+    plans = True
+
     def observe(self, model: Primitives, tally: Tally) -> None:
         pass
 

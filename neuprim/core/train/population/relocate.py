@@ -9,8 +9,8 @@ from torch import Tensor
 
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Tally
-from neuprim.core.train.population.interface import Change, Population
-from neuprim.core.train.population.splitting import SPLIT_LONG, SPLIT_OTHERS, SPLIT_SHIFT, split
+from neuprim.core.train.population.interface import Change, Plan, Population
+from neuprim.core.train.population.splitting import carried_out
 from neuprim.core.train.settings import PopulationSettings
 
 __all__ = ["Relocate"]
@@ -31,6 +31,8 @@ class Relocate(Population):
     left need to reach it; budgets that are over before that have their interventions sooner.
     """
 
+    plans = True
+
     def __init__(self, settings: PopulationSettings) -> None:
         super().__init__(settings)
         self.weight: Tensor | None = None
@@ -41,7 +43,7 @@ class Relocate(Population):
     def due(self, step: int, progress: float) -> bool:
         s = self.settings
         share = (s.stop - s.start) / _PARTS
-        if self.weight is not None and len(self.weight) < (s.grow_to or 0) and 0 < share * step < s.every * progress:
+        if self.weight is not None and (self.count or len(self.weight)) < (s.grow_to or 0) and 0 < share * step < s.every * progress:
             # a budget so short that ``every`` would leave it without its primitives, or with all of them born at once
             part = int((progress - s.start) // share)
             due, self._part = self._part < min(part, _PARTS - 1), max(part, self._part)
@@ -62,17 +64,23 @@ class Relocate(Population):
         self.error += error
 
     def intervene(self, model: Primitives, extent: float) -> Change | None:
-        if self.weight is None or self.error is None:
-            return None
-        weight, error = self.weight, self.error
+        found = self.take()
+        plan = None if found is None else self.plan(*found)
+        return None if plan is None else carried_out(plan, model)
+
+    def take(self) -> tuple[Tensor, Tensor] | None:
+        found = None if self.weight is None or self.error is None else (self.weight, self.error)
         self.weight = self.error = None
-        count = model.count
+        return found
+
+    def plan(self, weight: Tensor, error: Tensor) -> Plan | None:
+        count = len(weight)
         budget = int(self.settings.fraction * count)
         missing = max((self.settings.grow_to or 0) - count, 0)
         due = math.ceil(count * ((1 + missing / count) ** (1 / (self._left + 1)) - 1) - 1e-9)  # by the same factor each time that is left
         births = min(missing, max(int(_GROWTH * count), due, 1))
         busiest = torch.argsort(error, descending=True, stable=True)
-        busy = torch.zeros(count, dtype=torch.bool, device=model.device)
+        busy = torch.zeros(count, dtype=torch.bool, device=weight.device)
         busy[busiest[:budget]] = True
         idle = torch.argsort(weight, stable=True)
         idle = idle[~busy[idle]][:budget]
@@ -87,19 +95,9 @@ class Relocate(Population):
         busiest = busiest[: moves + births]
         if len(busiest) == 0:
             return None
-        children = split(model, busiest, SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS)
-        new = torch.arange(count, count + births, device=model.device)
-        target = torch.cat([busiest, idle, new])
-        params = {}
-        for name, value in model.params.items():
-            params[name] = torch.cat([value.detach(), value.detach()[busiest[moves:]]]) if births else value.detach().clone()
-            params[name][target] = children[name]
-        origin = torch.arange(count + births, device=model.device)
-        origin[torch.cat([idle, new])] = busiest
-        fresh = torch.zeros(count + births, dtype=torch.bool, device=model.device)
-        fresh[target] = True
+        new = torch.arange(count, count + births, device=weight.device)
         said = [f"{what} {number}" for what, number in (("moved", moves), ("grew by", births)) if number]
-        return Change(params, origin, fresh, ", ".join(said))
+        return Plan(busiest, torch.cat([idle, new]), count, births, ", ".join(said))
 
     def state(self) -> dict[str, Tensor]:
         found = {} if self.weight is None or self.error is None else {"weight": self.weight, "error": self.error}

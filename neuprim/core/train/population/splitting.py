@@ -8,8 +8,9 @@ from torch import Tensor
 from neuprim.core.model.checks import check_halves, check_tensors, method
 from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.train.population.interface import Change, Plan
 
-__all__ = ["SPLIT_GAUSSIAN", "SPLIT_LONG", "SPLIT_OTHERS", "SPLIT_SHIFT", "split"]
+__all__ = ["SPLIT_GAUSSIAN", "SPLIT_LONG", "SPLIT_OTHERS", "SPLIT_SHIFT", "carried_out", "children_of", "split"]
 
 SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS = 0.5, 0.6, 0.9
 """A child's centre and semi-axes over its parent's: shift along the longest axis, that axis, the other two.
@@ -22,6 +23,23 @@ fixed set of primitives on the chair of the NeRF-synthetic set, and five other s
 SPLIT_GAUSSIAN = 1 / 1.6
 """All semi-axes of a child over its parent's, in the rule of 3D Gaussian splatting (Kerbl et al. 2023: 0.8 times the number of children)
 that the authors of the method keep; such children cover 45 % of their parent."""
+
+
+def children_of(model: Primitives, parents: Tensor) -> dict[str, Tensor]:
+    """Two children per parent in the shape of a :class:`~neuprim.core.train.population.interface.Plan`, as :func:`split` returns them."""
+    return split(model, parents, SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS)
+
+
+def carried_out(plan: Plan, model: Primitives) -> Change:
+    """A plan as the change that it makes of a model."""
+    children = children_of(model, plan.parents)
+    target = torch.cat([plan.parents, plan.others])
+    params = {}
+    for name, value in model.params.items():
+        value = value.detach()
+        params[name] = torch.cat([value, value[plan.parents[len(plan.parents) - plan.births :]]]) if plan.births else value.clone()
+        params[name][target] = children[name]
+    return Change(params, plan.origin, plan.fresh, plan.text)
 
 
 def split(model: Primitives, parents: Tensor, shift: float, long_factor: float, other_factor: float) -> dict[str, Tensor]:

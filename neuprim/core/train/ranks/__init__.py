@@ -4,6 +4,6 @@ The words of data-parallel training are meant: a *rank* is a process and its num
 trainer asks of any; the rest is loaded where there are several.
 """
 
-from neuprim.core.train.ranks.alone import ALONE, Alone, Seen, StepViews
+from neuprim.core.train.ranks.alone import ALONE, Alone, Look, Seen, StepViews
 
-__all__ = ["ALONE", "Alone", "Seen", "StepViews"]
+__all__ = ["ALONE", "Alone", "Look", "Seen", "StepViews"]

@@ -3,15 +3,36 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from neuprim.core.data import View
+from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Tally, together
 
-__all__ = ["ALONE", "Alone", "Seen", "StepViews"]
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from neuprim.core.train.optimizer import RowAdam
+    from neuprim.core.train.population import Change, Population
+
+__all__ = ["ALONE", "Alone", "Look", "Seen", "StepViews"]
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a rank is about to draw, from which others know what of theirs it needs.
+
+    Attributes:
+        view: its camera and conditions.
+        beside: conditions of the points that it looks at, too; None for no points.
+    """
+
+    view: View
+    beside: Conditions | None = None
 
 
 @dataclass(frozen=True)
@@ -47,6 +68,10 @@ class StepViews:
         self.seen: list[Seen] = []
         self._tallies: list[Tally] = []
 
+    def drawn(self, looks: Callable[[], Sequence[Look]]) -> Primitives:
+        """What this rank draws next, when ``looks`` says what each of them does, by rank; gradients are to end in its parameters."""
+        return self.model
+
     def add(self, seen: Seen, tally: Tally) -> None:
         """Called after the backward pass of each view."""
         self.seen.append(seen)
@@ -76,6 +101,43 @@ class Alone:
         """``asked`` says whether this process was asked to stop; what is returned, whether the step just done is the last one as any rank was,
         which is the same on all of them."""
         return asked
+
+    @property
+    def parts(self) -> bool:
+        """Whether each rank has a part of the primitives; else all have all of them."""
+        return False
+
+    def count(self, model: Primitives) -> int:
+        """Primitives of the whole model of which ``model`` is what this rank has."""
+        return model.count
+
+    def own_of(self, count: int) -> tuple[int, int]:
+        """First row that this rank keeps of a whole model of ``count`` primitives from now on, and the one after the last.
+
+        Raises:
+            ConfigError: there are too few for all.
+        """
+        return 0, count
+
+    def collected(self, value: Tensor) -> Iterator[Tensor]:
+        """On the first rank an (N, ...) tensor of the whole model, in pieces from first to last; called on all, with their rows of it."""
+        yield value
+
+    def cut(self, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        """What this rank keeps of (N, ...) tensors of the whole model."""
+        return tensors
+
+    def saves(self, asked: Callable[[], bool]) -> Callable[[], bool]:
+        """As :meth:`last`, for whether a checkpoint is due; the first rank's word counts."""
+        return asked
+
+    def judged(self, model: Primitives, views: Sequence[View], judge: Callable[[int, Primitives], float]) -> list[float]:
+        """What ``judge`` says of each view, by its place and the primitives that it shows; the same on all ranks."""
+        return [judge(place, model) for place in range(len(views))]
+
+    def intervene(self, population: Population, model: Primitives, optimizer: RowAdam, extent: float) -> Change | None:
+        """The next population, of what this rank has of it; None to leave it."""
+        return population.intervene(model, extent)
 
     def step(self, model: Primitives, views: int, elapsed: float, start: float) -> StepViews:
         """What collects a step, of so many ``views`` of each rank, that began at ``start`` (seconds of ``time.perf_counter``) after ``elapsed`` seconds of training."""

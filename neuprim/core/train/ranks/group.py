@@ -7,6 +7,7 @@ Every rank draws all random numbers of a step, looks at its own views, and adds 
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -103,6 +104,18 @@ class Group(Alone):
         self.sent += rows[0].numel() * rows.element_size() * (self.size - 1)
         try:
             self.wire.swap(rows, found)
+        except RankError as error:
+            raise self.cause(error) from error
+
+    def exchange(self, rows: Tensor, found: Tensor, give: list[int], take: list[int]) -> None:
+        """Send ``give[r]`` of the rows to rank r, in their order, and find ``take[r]`` from each, by rank.
+
+        Raises:
+            RankError: a rank failed or is gone; names it.
+        """
+        self.sent += (len(rows) - give[self.rank]) * math.prod(rows.shape[1:]) * rows.element_size()
+        try:
+            self.wire.exchange(rows, found, give, take)
         except RankError as error:
             raise self.cause(error) from error
 

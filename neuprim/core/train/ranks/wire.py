@@ -54,9 +54,24 @@ class Wire:
         try:
             dist.all_to_all_single(found, rows)
         except RuntimeError as error:  # of gloo: a closed connection, or nothing for too long
-            raise RankError(f"the connection between ranks broke ({' '.join(str(error).split())[:200]})") from error
+            raise _broken(error) from error
+
+    def exchange(self, rows: Tensor, found: Tensor, give: list[int], take: list[int]) -> None:
+        """Send ``give[r]`` of the rows (sum of give, ...) to rank r, in their order, and find ``take[r]`` from each, by rank.
+
+        Raises:
+            RankError: a rank is gone; without its name.
+        """
+        try:
+            dist.all_to_all_single(found, rows, take, give)
+        except RuntimeError as error:
+            raise _broken(error) from error
 
     def close(self) -> None:
         """Leave."""
         if dist.is_initialized():
             dist.destroy_process_group()
+
+
+def _broken(error: RuntimeError) -> RankError:
+    return RankError(f"the connection between ranks broke ({' '.join(str(error).split())[:200]})")

@@ -1,4 +1,4 @@
-"""Every task by two ranks, from its own preset, is what one process trains with two views a step."""
+"""Every task by two ranks, from its own preset, is what one process trains with two views a step; also where each has half of the primitives."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from neuprim.core.train.ranks.group import Group
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import start
 from tests.ranks import done, together
+from tests.shards import different, share, whole_of
 
 TASKS = {
     "static": ["scene=solids", "scene.size=24", "scene.train_views=8", "scene.test_views=2", "model.primitives=60"],
@@ -51,3 +52,11 @@ def test_a_task_by_two_ranks(task: str, tmp_path: Path) -> None:
         state = trainer.state()[0]
         assert state.keys() == whole.keys()
         assert [name for name, value in state.items() if not torch.equal(value, whole[name])] == []
+
+    def part(group: Group) -> tuple[Trainer, list[object]]:
+        trainer = share(start(config, dataset=alone.dataset).trainer, group)
+        return trainer, [(report.loss, report.parts, report.change) for report in trainer.run()]
+
+    found = done(together(2, part))
+    assert [reports for _, reports in found] == [expected, expected]
+    assert different(whole_of([trainer for trainer, _ in found]), whole) == []

@@ -38,6 +38,7 @@ __all__ = [
     "check_pair",
     "choose",
     "compiled_ahead",
+    "computing_device",
     "find",
     "names",
     "no_card",
@@ -290,6 +291,14 @@ def run_device(settings: RenderSettings, forms: Callable[[], Lowered], camera: A
             if any(b.fault(lowered, camera) is None for b in TABLE if b.devices[0] == hardware.CARD):
                 kind = hardware.CARD
     return hardware.of_kind(kind)
+
+
+def computing_device(settings: RenderSettings) -> torch.device:
+    """Where a run computes what is no frame of its model, such as the ground truth of volumes: a card that the settings allow and that is there."""
+    kind: str = settings.device
+    if kind == AUTO:
+        kind = hardware.CARD if settings.backend == AUTO else find(settings.backend).devices[0]
+    return hardware.of_kind(hardware.PROCESSOR if kind == hardware.CARD and no_card() is not None else kind)
 
 
 def choose(lowered: Lowered, settings: RenderSettings, camera: AnyCamera | None = None) -> Backend:

@@ -210,7 +210,10 @@ def backward(
     out, error_at = array(pair_rows.view(-1), wp.float32), array(error, wp.float32)
     launch(
         pairs_kernel(form, depth), (pairs, L.WARP),
-        (rows, ids, tile_of, shapes, starts_at, lens, settings.depth_floor, size, reached, hits, grad, gz, error_at, out), device, L.WARP,
+        (
+            rows, ids, tile_of, shapes, starts_at, lens, settings.depth_floor, size, reached, hits, array(g_rgb.view(-1), wp.float32), gz, error_at,
+            out,
+        ), device, L.WARP,
     )  # fmt: skip
     if len(drawn.delicate):
         launch(

@@ -1,12 +1,12 @@
-"""What a hit costs on a card, counted without one: instructions, operations and bytes, and the least time that they take.
+"""What a hit costs on a card, counted without one: instructions, operations and bytes, and the time that they take at full issue.
 
     python benchmarks/gpu_hits.py [--count 100000] [--size 800] [--neurons 8 2 0] [--nvdisasm FILE] [--record | --from-record]
 
 The rule. *Instructions* are those of the innermost loop that draws hits, as compiled for sm_90 and listed by nvdisasm, every branch of the loop
 counted once; neurons take the polynomial up to half a turn, and what one beyond that takes more is counted apart. *Operations* are those of
 its FFMA (two), FMUL and FADD. *Lanes* are the share of a warp's threads that draw a hit while it is in the loop: a frame of the random scene of the
-other benchmarks, drawn on Warp's CPU blocks, says how many warps enter it. *Least time* is instructions times warps, and of the pairs' kernel what
-it does once a pair, at an instruction a cycle of every lane of an H100; no kernel reaches that, and what is measured stands beside it.
+other benchmarks, drawn on Warp's CPU blocks, says how many warps enter it. *At full issue* is the time of instructions times warps at an instruction a cycle of every
+lane of an H100; what is done once a pair or a pixel is not in it, and what was measured stands beside it.
 
 --record        writes benchmarks/results/gpu_hits.json and the table in docs/gpu.md
 --from-record   writes the table from the file and measures nothing
@@ -106,10 +106,10 @@ def instructions(neurons: int, nvdisasm: str) -> dict[str, Row]:
         finally:
             forward.band_of = backward_pairs.band_of = genuine
             _clear()
-    for name, (loop, whole) in counted[True].items():
+    for name, (loop, _) in counted[True].items():
         faster = (counted[False][name][0].total() - loop.total()) / max(neurons, 1)
         found[name] = {
-            "instructions": loop.total(), "flops": flops(loop), "faster_neuron": round(faster), "outside": whole - loop.total(),
+            "instructions": loop.total(), "flops": flops(loop), "faster_neuron": round(faster),
         }  # fmt: skip
     return found
 
@@ -121,7 +121,7 @@ class Lanes:
     Attributes:
         hits, slots, pairs: how many there are.
         patches: times that a warp of 8 x 4 pixels enters the forward loop for a primitive.
-        steps: times that a warp takes 32 slots of a pair. drawn: pairs that are composited.
+        steps: times that a warp takes 32 slots of a pair.
     """
 
     hits: int
@@ -129,7 +129,6 @@ class Lanes:
     pairs: int
     patches: int
     steps: int
-    drawn: int
 
 
 def _observed(lowered: Lowered, size: int) -> tuple[Any, Any]:
@@ -170,26 +169,25 @@ def lanes(count: int, size: int, neurons: int) -> Lanes:
     entered = torch.bincount(patch[before >= settings.transmittance_min], minlength=1) > 0
     reached = torch.arange(len(counts)) < drawn.reached[frame.lists.tile_of.long()]
     steps = ((counts[reached] + L.WARP - 1) // L.WARP).sum()
-    return Lanes(int((alpha > 0).sum()), len(alpha), len(counts), int(entered.sum()), int(steps), int(reached.sum()))
+    return Lanes(int((alpha > 0).sum()), len(alpha), len(counts), int(entered.sum()), int(steps))
 
 
 def predicted(name: str, loop: Row, seen: Lanes) -> tuple[float, float]:
-    """Share of lanes that hit, and the least milliseconds."""
+    """Share of lanes that hit, and the milliseconds at full issue."""
     warps = seen.patches if name != "pairs" else seen.steps
-    once = loop["outside"] * seen.drawn if name == "pairs" else 0
-    return seen.hits / (L.WARP * warps), 1e3 * L.WARP * (loop["instructions"] * warps + once) / RATE
+    return seen.hits / (L.WARP * warps), 1e3 * L.WARP * loop["instructions"] * warps / RATE
 
 
 def document(record: dict[str, Any]) -> str:
     """The table of docs/gpu.md."""
-    head = ["form", "kernel", "instructions a hit", "and a faster neuron", "operations", "lanes", "least ms", "measured ms"]
+    head = ["form", "kernel", "instructions a hit", "and a faster neuron", "operations", "lanes", "ms at full issue", "measured ms"]
     lines = ["| " + " | ".join(head) + " |", "| --- |" + " --- |" * (len(head) - 1)]
     for row in record["rows"]:
         faster = str(row["faster_neuron"]) if row["neurons"] and row["kernel"] != "pixels" else "–"
         measured = "–" if row["measured_ms"] is None else f"{row['measured_ms']:.2f}"
         cells = [
             f"K={row['neurons']} p={row['edge']}", row["kernel"], row["instructions"], faster, row["flops"], f"{row['lanes']:.2f}",
-            f"{row['least_ms']:.2f}", measured,
+            f"{row['full_issue_ms']:.2f}", measured,
         ]  # fmt: skip
         lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
     s = record["scene"]
@@ -210,18 +208,18 @@ def _measured(neurons: int, kernel: str) -> float | None:
 
 
 def measure(count: int, size: int, neurons: list[int], nvdisasm: str) -> dict[str, Any]:
-    table, rows = Table("neurons", "kernel", "instructions", "operations", "lanes", "least ms", "measured ms"), []
+    table, rows = Table("neurons", "kernel", "instructions", "operations", "lanes", "ms at full issue", "measured ms"), []
     scene: Row = {}
     for K in neurons:
         seen = lanes(count, size, K)
         scene = scene or {"count": count, "size": size, "hits": seen.hits, "slots": seen.slots, "pairs": seen.pairs}
         for name, loop in instructions(K, nvdisasm).items():
-            share, least = predicted(name, loop, seen)
+            share, full = predicted(name, loop, seen)
             row = {
-                "neurons": K, "edge": FORMS[K], "kernel": name, **loop, "lanes": share, "least_ms": least, "measured_ms": _measured(K, name),
+                "neurons": K, "edge": FORMS[K], "kernel": name, **loop, "lanes": share, "full_issue_ms": full, "measured_ms": _measured(K, name),
             }  # fmt: skip
             rows.append(row)
-            table.row(K, name, loop["instructions"], loop["flops"], f"{share:.2f}", f"{least:.3f}", row["measured_ms"])
+            table.row(K, name, loop["instructions"], loop["flops"], f"{share:.2f}", f"{full:.3f}", row["measured_ms"])
     return {"warp": warp.__version__, "arch": ARCH, "scene": scene, "rows": rows}
 
 

@@ -1,6 +1,6 @@
 """What every kernel of the CUDA backend takes of a card, compiled ahead of time on any machine: registers, stack, shared memory, code.
 
-    python benchmarks/gpu_kernels.py [--archs 80 89 90] [--forms "K=8 p=0" ...] [--record | --check | --from-record]
+    python benchmarks/gpu_kernels.py [--archs 80 89 90] [--forms "K=8 p=0" ...] [--kernels forward ...] [--record | --check | --from-record]
 
 Compiled are the kernels of K = 0, 2, 8 and 16 neurons, hard edges and p = 2, with constant colours and with colour networks of 8 units, those
 that every frame needs, and those beside frames: of training, of volumes, of lights. No driver is needed. A stack of a frame's kernel means
@@ -85,11 +85,13 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
     yield "float64 pairs, backward", passes.delicate_pairs_kernel(form, False), L.WARP
 
 
-def measure(archs: list[int], forms: list[str]) -> list[Row]:
+def measure(archs: list[int], forms: list[str], names: list[str] | None = None) -> list[Row]:
     table, rows = Table("form", "kernel", "arch", "threads", "capped", "registers", "stack", "shared", "code"), []
     with tempfile.TemporaryDirectory() as place:
         for form in forms:
             for kernel, compiles, block in kernels(form):
+                if names is not None and kernel not in names:
+                    continue
                 for arch in archs:
                     found = resources(compiled(compiles, arch, block, Path(place) / str(len(rows))))
                     capped = compiles.options.get("launch_bounds") is not None
@@ -150,15 +152,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--archs", nargs="*", type=int, choices=ARCHS, default=list(ARCHS))
     parser.add_argument("--forms", nargs="*", choices=(*FORMS, EVERY, BESIDE), default=[*FORMS, EVERY, BESIDE])
+    parser.add_argument("--kernels", nargs="*", help="of the forms, those of these names alone")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--record", action="store_true")
     what.add_argument("--check", action="store_true")
     what.add_argument("--from-record", action="store_true")
     args = parser.parse_args()
+    if args.record and (args.kernels is not None or len(args.forms) < len(FORMS) + 2 or len(args.archs) < len(ARCHS)):
+        parser.error("--record: expected every form, kernel and architecture")
     if args.from_record:
         between_markers(PAGE, "gpu-kernels", document(json.loads(RESULTS.read_text())))
         return 0
-    rows = measure(args.archs, args.forms)
+    rows = measure(args.archs, args.forms, args.kernels)
     faults = spilled(rows)
     if args.check:
         faults += grown(rows, json.loads(RESULTS.read_text())["kernels"])

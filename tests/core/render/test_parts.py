@@ -20,7 +20,7 @@ COUNT = 4
 
 def scene(kind: str) -> tuple[Lowered, Tensor, Any]:
     """Primitives before the camera, or around it, where many are drawn in float64; part 2 has none."""
-    low = scenes.lowered(scenes.tensors(80, 3, seed=5))
+    low = scenes.lowered(scenes.tensors(80, 1, seed=5))
     parts = torch.randint(0, COUNT, (80,), generator=torch.Generator().manual_seed(1))
     parts[parts == 2] = 3
     return low, parts, scenes.camera(37, 29, **({"distance": 0.15, "fov": 70.0} if kind == "inside" else {}))

@@ -51,31 +51,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `neuprim tasks | head`; the interpreter's own flush at exit must not fail either
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except (NeuprimError, OSError) as error:
+    except (NeuprimError, OSError, RuntimeError) as error:
         line = one_line(error)
         if line is None:
             raise
         print(f"neuprim: error: {line}", file=sys.stderr)
         return 2
-    except RuntimeError as error:
-        if not _full_card(error):
-            raise
-        print(f"neuprim: error: {_FULL_CARD}", file=sys.stderr)
-        return 2
     except SystemExit as stop:  # argparse, after --help and --version
         return stop.code if isinstance(stop.code, int) else 0
-
-
-_FULL_CARD = (
-    "the card's memory is full; expected a smaller image or grid, fewer primitives, or CUDA_VISIBLE_DEVICES= in the environment, "
-    "which leaves cards out. What was saved is intact"
-)
-
-
-def _full_card(error: RuntimeError) -> bool:
-    """Whether it is torch's word for that; nothing is imported, as what was not imported raised nothing."""
-    torch = sys.modules.get("torch")
-    return torch is not None and isinstance(error, torch.OutOfMemoryError)
 
 
 def _dispatch(words: list[str]) -> int:

@@ -1,10 +1,11 @@
 """What every kernel of the CUDA backend takes of a card, compiled ahead of time on any machine: registers, stack, shared memory, code.
 
-    python benchmarks/gpu_kernels.py [--archs 80 89 90] [--forms "K=8 p=0" ...] [--record | --check | --from-record]
+    python benchmarks/gpu_kernels.py [--archs 80 89 90] [--forms "K=8 p=0" ...] [--kernels forward ...] [--record | --check | --from-record]
 
-Compiled are the kernels of K = 0, 2, 8 and 16 neurons, hard edges and p = 2, with constant colours and with colour networks of 8 units, and
-those that every frame needs. No driver is needed. A stack means spilled registers, but for kernels in float64, which keep their neurons there;
-one at K <= 8 exits with status 1, unless the kernel itself asks for fewer registers than it could use ("capped"), as more warps hide more.
+Compiled are the kernels of K = 0, 2, 8 and 16 neurons, hard edges and p = 2, with constant colours and with colour networks of 8 units, those
+that every frame needs, and those beside frames: of training, of volumes, of lights. No driver is needed. A stack of a frame's kernel means
+spilled registers, but for kernels in float64, which keep their neurons there; one at K <= 8 exits with status 1. Beside frames it means lists of
+arguments (Adam) and cosines of large angles (grid). "Capped" are kernels that ask for fewer registers than they could use, as more warps hide more.
 
 --record        writes benchmarks/results/gpu_kernels.json and the table in docs/gpu.md
 --check         compares with what is recorded there: exits with status 1 when registers, stack or shared memory have grown
@@ -28,15 +29,20 @@ from shared.cubins import compiled, resources
 from shared.tables import ROOT, Table, between_markers
 
 from neuprim.core.compute.warp import BLOCK
+from neuprim.core.model.colours import sh_warp
 from neuprim.core.render.cuda import binning, delicate, forward, net, passes, prepare, prepare_backward
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.forms import Form
 from neuprim.core.render.cuda.placement import PER_BLOCK
+from neuprim.core.train import adam_warp, ssim_warp
+from neuprim.core.volumes import grid_warp
+from neuprim.tasks.dynamic.volume import traverse_warp
+from neuprim.tasks.relight import visibility_warp
 
 RESULTS = Path(__file__).parent / "results" / "gpu_kernels.json"
 PAGE = ROOT / "docs" / "gpu.md"
 ARCHS = (80, 89, 90)
-EVERY = "every frame"
+EVERY, BESIDE = "every frame", "beside frames"
 NET = ", H=8"
 FORMS = {f"K={K} p={p}{NET if H > 0 else ''}": Form(K, p, 3, H) for H, K, p in product((-1, 8), (0, 2, 8, 16), (0, 2))}
 UNSPILLED, IN_FLOAT64 = 8, "float64"
@@ -58,6 +64,15 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
         yield "sums", passes.sum_pairs, BLOCK
         yield "float64 pairs", delicate.delicate_kernel(False), L.WARP
         return
+    if name == BESIDE:
+        for title, made in (
+            ("harmonics", sh_warp._kernels(3)), ("Adam", adam_warp._kernels()), ("SSIM", ssim_warp._kernels()),
+            ("light", (visibility_warp._kernel(),)), ("grid", (grid_warp._kernel(),)),
+            ("rays of volumes", (traverse_warp._radiances(), traverse_warp._depths(), traverse_warp._extinctions())),
+        ):  # fmt: skip
+            for number, kernel in enumerate(made, 1):
+                yield f"{title} {number}" if len(made) > 1 else title, kernel, BLOCK
+        return
     form = FORMS[name]
     yield "forward", forward.forward_kernel(form, True, False), L.PIXELS
     yield "pixels", passes.pixels_kernel(form, False), L.PIXELS
@@ -70,11 +85,13 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
     yield "float64 pairs, backward", passes.delicate_pairs_kernel(form, False), L.WARP
 
 
-def measure(archs: list[int], forms: list[str]) -> list[Row]:
+def measure(archs: list[int], forms: list[str], names: list[str] | None = None) -> list[Row]:
     table, rows = Table("form", "kernel", "arch", "threads", "capped", "registers", "stack", "shared", "code"), []
     with tempfile.TemporaryDirectory() as place:
         for form in forms:
             for kernel, compiles, block in kernels(form):
+                if names is not None and kernel not in names:
+                    continue
                 for arch in archs:
                     found = resources(compiled(compiles, arch, block, Path(place) / str(len(rows))))
                     capped = compiles.options.get("launch_bounds") is not None
@@ -89,7 +106,7 @@ def spilled(rows: list[Row]) -> list[str]:
         f"{r['form']}: {r['kernel']} spills on sm_{r['arch']}: {r['stack']} bytes of stack"
         for r in rows
         if r["stack"]
-        and not r["capped"]
+        and r["form"] != BESIDE
         and IN_FLOAT64 not in r["kernel"]
         and (r["form"] == EVERY or FORMS[r["form"]].neurons <= UNSPILLED)
     ]
@@ -134,16 +151,19 @@ def document(record: dict[str, Any]) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--archs", nargs="*", type=int, choices=ARCHS, default=list(ARCHS))
-    parser.add_argument("--forms", nargs="*", choices=(*FORMS, EVERY), default=[*FORMS, EVERY])
+    parser.add_argument("--forms", nargs="*", choices=(*FORMS, EVERY, BESIDE), default=[*FORMS, EVERY, BESIDE])
+    parser.add_argument("--kernels", nargs="*", help="of the forms, those of these names alone")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--record", action="store_true")
     what.add_argument("--check", action="store_true")
     what.add_argument("--from-record", action="store_true")
     args = parser.parse_args()
+    if args.record and (args.kernels is not None or len(args.forms) < len(FORMS) + 2 or len(args.archs) < len(ARCHS)):
+        parser.error("--record: expected every form, kernel and architecture")
     if args.from_record:
         between_markers(PAGE, "gpu-kernels", document(json.loads(RESULTS.read_text())))
         return 0
-    rows = measure(args.archs, args.forms)
+    rows = measure(args.archs, args.forms, args.kernels)
     faults = spilled(rows)
     if args.check:
         faults += grown(rows, json.loads(RESULTS.read_text())["kernels"])

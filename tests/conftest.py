@@ -1,4 +1,4 @@
-"""What all tests share: how long one may take, and both ways in which an operation is computed."""
+"""What all tests share: how long one may take, and the ways in which an operation is computed."""
 
 from __future__ import annotations
 
@@ -21,4 +21,13 @@ def either_way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
     """Once as compiled for the processor, once by the twins in torch code that tensors on a card take."""
     if request.param == "twin":
         monkeypatch.setattr(device, "fused", lambda *tensors: False)
+    return str(request.param)
+
+
+@pytest.fixture(params=["processor", "card"])
+def either_kernel(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Once by the processor's kernels, once by those of a card, on Warp's CPU blocks: where both begin and end in the processor's memory."""
+    if request.param == "card":
+        pytest.importorskip("warp", reason="the kernels of a card are written in Warp: pip install 'neuprim[cuda]'")
+        monkeypatch.setattr(device, "computes", lambda where: True)
     return str(request.param)

@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `neuprim tasks | head`; the interpreter's own flush at exit must not fail either
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except (NeuprimError, OSError) as error:
+    except (NeuprimError, OSError, RuntimeError) as error:
         line = one_line(error)
         if line is None:
             raise

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import errno
+import sys
 from collections.abc import Iterable
 
 __all__ = [
@@ -87,10 +88,19 @@ def nearest(name: str, choices: Iterable[str], limit: int = 3, prefix: str = "")
     return "; valid: " + ", ".join(prefix + o for o in options) if options else ""
 
 
+_FULL_CARD = (
+    "the card's memory is full; expected a smaller image or grid, fewer primitives, or CUDA_VISIBLE_DEVICES= in the environment, "
+    "which leaves cards out. What was saved is intact"
+)
+
+
 def one_line(error: BaseException) -> str | None:
     """What is said of an error that a user can act on, in one line; None of a bug, which keeps its traceback."""
     if isinstance(error, NeuprimError):
         return " ".join(str(error).split())
     if isinstance(error, OSError) and error.errno in DISK:
         return f"{error.filename or 'writing'}: {error.strerror}"
+    torch = sys.modules.get("torch")  # what was not imported raised nothing
+    if torch is not None and isinstance(error, torch.OutOfMemoryError):
+        return _FULL_CARD
     return None

@@ -17,6 +17,7 @@ from neuprim.core.io import images
 from neuprim.core.io.drafts import refuse_taken
 from neuprim.core.io.film import write_film
 from neuprim.core.model.fields import Conditions
+from neuprim.core.render.backends import computing_device
 from neuprim.core.volumes.errors import frame_errors
 from neuprim.core.volumes.grid import POINTS_LIMIT, density_grid, lattice
 from neuprim.core.volumes.truth import DensityTruth
@@ -169,7 +170,7 @@ class _Film:
 
     def __init__(self, request: Request, events: Events) -> None:
         run = open_run(request.run_dir)
-        self.model = run.model
+        self.model, self.device = run.model, computing_device(run.settings)
         self.truth: DensityTruth | None = None
         self.channels, self.needed = run.channels, tuple(c.name for c in run.task.conditions)
         self.up = request.up or str(run.scene.get("up", "z"))
@@ -210,7 +211,7 @@ class _Film:
         if self.truth is None:
             return None
         conditions, number = self.pairs[index]
-        numbers = frame_errors(self.model, conditions, self.truth, number)
+        numbers = frame_errors(self.model, conditions, self.truth, number, where=self.device)
         words = "nothing to compare with" if numbers is None else "  ".join(f"{k} {v:.4f}" for k, v in numbers.items())
         events(Note(f"{self.truth.frames[number].name}  {in_words(conditions)}  {words}"))
         return numbers
@@ -220,7 +221,7 @@ class _Film:
         matrix, shape = lattice(box, _COARSE)
         most, depth, total = 0.0, 0.0, np.zeros(shape)
         for conditions, number in self.pairs:
-            grids = [density_grid(self.model, conditions, matrix, shape).numpy()]
+            grids = [density_grid(self.model, conditions, matrix, shape, where=self.device).numpy()]
             if self.truth is not None:
                 grids.append(self.truth.grid(number, matrix, shape).numpy())
             total += grids[-1]
@@ -237,7 +238,9 @@ class _Film:
         """A fresh frame; its grids live as long as it does."""
         conditions, number = self.pairs[index]
         made = FieldFrame(self.model, conditions, in_words(conditions), self.matrix, self.shape, self.top, self.gain, self.focus)
-        made = replace(made, channels=self.channels, needed=self.needed, options=self.options, numbers=self.numbers[index])
+        made = replace(
+            made, channels=self.channels, needed=self.needed, options=self.options, numbers=self.numbers[index], device=self.device
+        )
         truth = self.truth
         if truth is None:
             return made

@@ -17,7 +17,7 @@ from neuprim.core.extensions import TrainedModel
 from neuprim.core.io.files import cache_directory
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
-from neuprim.core.render.backends import at_hand
+from neuprim.core.render.backends import at_hand, computing_device
 from neuprim.core.render.place import device_of
 from neuprim.core.task import SceneContext, TaskSpec
 from neuprim.core.volumes.source import VolumeSource
@@ -57,7 +57,7 @@ def load_dataset(
     Raises:
         NeuprimError: what the loader refuses, or that it crashed.
     """
-    context = SceneContext(config.seed, cache_directory() / "scenes", progress)
+    context = SceneContext(config.seed, cache_directory() / "scenes", progress, computing_device(config.renderer))
     load = scene_of(config, task, None if run_dir is None else run_dir / "config.yaml").spec.load
     scene = suspects_of(config).scene
     with blamed(scene.origin, scene.what, (config.output_dir if run_dir is None else run_dir) / LOGS):
@@ -108,7 +108,8 @@ def open_run(run_dir: Path, progress: Progress = lambda text, fraction: None) ->
             return None
         scene = suspects_of(config).scene
         with blamed(scene.origin, f"volume of {scene.what}", run_dir / LOGS):
-            return load(config.scene, SceneContext(config.seed, cache_directory() / "scenes", progress))
+            where = computing_device(config.renderer)
+            return load(config.scene, SceneContext(config.seed, cache_directory() / "scenes", progress, where))
 
     def dataset() -> Dataset:
         return load_dataset(config, task, progress, run_dir)

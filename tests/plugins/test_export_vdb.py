@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -10,15 +11,18 @@ import numpy as np
 import pytest
 import torch
 
+from neuprim.core.compute import device
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.vdb import Grid, read_grid
 from neuprim.core.volumes.errors import NUMBERS
 from neuprim.core.volumes.grid import density_grid
 from neuprim.plugins.export import vdb as exporter
 from neuprim.runs.export import export_run
+from neuprim.runs.inspect import Request, inspect_run
 from neuprim.runs.open import open_run
 from tests.core.io.vdb.openvdb_oracle import compare, environment, other_python
 from tests.plugins import marked
+from tests.pretend_card import CARD, pretended
 
 
 def centre_of(grid: Grid, near: tuple[float, float, float], radius: float) -> np.ndarray:
@@ -101,6 +105,26 @@ def test_errors_are_those_of_the_runs_own_comparison(moving: Path, tmp_path: Pat
         for key in ("correlation", "relative_l2", "max_error"):  # on the very voxels of the file: only what is faint is missing in it
             assert report.errors[f"{name}.file_{key}"] == pytest.approx(entry[key], abs=1e-3)
     assert any("no bound" in note for note in report.notes)
+
+
+def test_extinction_is_computed_where_the_run_draws(moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The model's and the files', exported and looked into; the numbers are the processor's."""
+    own = tmp_path / "run"
+    shutil.copytree(moving, own)
+    config = (own / "config.yaml").read_text()
+    assert "backend: reference" in config
+    (own / "config.yaml").write_text(config.replace("backend: reference", "backend: auto"))
+    export_run(moving, "vdb", tmp_path / "own", ["time=0.5", "grid=24"])
+    asked: list[torch.device] = []
+    with pretended(monkeypatch):
+        monkeypatch.setattr(device, "computes", lambda where: bool(asked.append(where)))
+        export_run(own, "vdb", tmp_path / "there", ["time=0.5", "grid=24"])
+        assert len(asked) >= 2 and set(asked) == {CARD}
+        asked.clear()
+        inspect_run(Request(own, ("volume",), {"time": "0.5"}, 16, against="scene", out=tmp_path / "seen.vdb"))
+        assert len(asked) >= 4 and set(asked) == {CARD}
+    (here,), (there,) = (list((tmp_path / name).iterdir()) for name in ("own", "there"))
+    assert np.array_equal(read_grid(here, "density").to_dense(), read_grid(there, "density").to_dense())
 
 
 def test_units_times_and_voxels_can_be_chosen(moving: Path, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 __all__ = [
-    "CARD", "HOST", "KINDS", "PROCESSOR", "beside", "card_missing", "from_host", "fused", "kernels", "of_kind", "spare_memory",
+    "CARD", "HOST", "KINDS", "PROCESSOR", "beside", "card_missing", "computes", "from_host", "fused", "kernels", "of_kind", "spare_memory",
 ]  # fmt: skip
 
 PROCESSOR, CARD = "cpu", "cuda"
@@ -36,6 +36,11 @@ def _warp() -> bool:
 def kernels(*tensors: Tensor) -> bool:
     """Whether operations that are compiled for a card may read these tensors."""
     return all(tensor.is_cuda for tensor in tensors) and _warp()
+
+
+def computes(where: torch.device) -> bool:
+    """Whether operations that are compiled for a card run there; elsewhere the processor's do it."""
+    return where.type == "cuda" and _warp()
 
 
 @functools.cache

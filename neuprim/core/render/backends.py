@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera, RayCamera
 from neuprim.core.compute import device as hardware
@@ -38,6 +39,7 @@ __all__ = [
     "check_pair",
     "choose",
     "compiled_ahead",
+    "computing_device",
     "find",
     "names",
     "no_card",
@@ -78,6 +80,7 @@ class Backend:
         compiles: whether it compiles something once per installation, which a run then does beside its other preparations.
         devices: kinds of device that it draws tensors of, its own first: frames whose tensors are elsewhere are moved there and back.
         checks: whether it refuses numbers that are not finite itself, while it prepares a frame; the others get :func:`refuse_non_finite`.
+        parts: loads and returns what draws parts of a set of primitives in one frame, see :mod:`~neuprim.core.render.parts`; None without.
         differentiates_intrinsics: whether gradients reach focal lengths and the principal point.
     """
 
@@ -90,6 +93,7 @@ class Backend:
     checks: bool = False
     differentiates_intrinsics: bool = False
     devices: tuple[str, ...] = (hardware.PROCESSOR,)
+    parts: Callable[[], Callable[..., tuple[Tensor, Tensor]] | None] = _nothing
 
     @property
     def lacking(self) -> str | None:
@@ -153,6 +157,12 @@ def _no_warp() -> str | None:
     return None if importlib.util.find_spec("warp") else "Warp is not installed: pip install 'neuprim[cuda]'"
 
 
+def _cuda_parts() -> Callable[..., tuple[Tensor, Tensor]]:
+    from neuprim.core.render.cuda.backend import render_parts
+
+    return render_parts
+
+
 def _card() -> str:
     return "cuda (no card)" if hardware.card_missing() else f"cuda ({torch.cuda.get_device_name()})"
 
@@ -164,7 +174,7 @@ def _reference() -> Draw:
 
 
 TABLE: tuple[Backend, ...] = (
-    Backend("cuda", _cuda, kernels_refuse, _card, _no_warp, checks=True, devices=(hardware.CARD, hardware.PROCESSOR)),
+    Backend("cuda", _cuda, kernels_refuse, _card, _no_warp, checks=True, devices=(hardware.CARD, hardware.PROCESSOR), parts=_cuda_parts),
     Backend("cpu", _cpu, kernels_refuse, compiles=True, checks=True),
     Backend(ORACLE, _reference, differentiates_intrinsics=True),
 )
@@ -290,6 +300,14 @@ def run_device(settings: RenderSettings, forms: Callable[[], Lowered], camera: A
             if any(b.fault(lowered, camera) is None for b in TABLE if b.devices[0] == hardware.CARD):
                 kind = hardware.CARD
     return hardware.of_kind(kind)
+
+
+def computing_device(settings: RenderSettings) -> torch.device:
+    """Where a run computes what is no frame of its model, such as the ground truth of volumes: a card that the settings allow and that is there."""
+    kind: str = settings.device
+    if kind == AUTO:
+        kind = hardware.CARD if settings.backend == AUTO else find(settings.backend).devices[0]
+    return hardware.of_kind(hardware.PROCESSOR if kind == hardware.CARD and no_card() is not None else kind)
 
 
 def choose(lowered: Lowered, settings: RenderSettings, camera: AnyCamera | None = None) -> Backend:

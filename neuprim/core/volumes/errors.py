@@ -8,8 +8,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.grid import density_grid
@@ -69,15 +71,21 @@ class Comparison:
         }
 
 
-def frame_errors(model: Primitives, conditions: Conditions, truth: DensityTruth, frame: int, threads: int = 0) -> dict[str, float] | None:
-    """The model under ``conditions`` against a frame of the truth, see :meth:`Comparison.numbers`; None where there is nothing to compare with."""
+def frame_errors(
+    model: Primitives, conditions: Conditions, truth: DensityTruth, frame: int, threads: int = 0, where: torch.device = device.HOST
+) -> dict[str, float] | None:
+    """The model under ``conditions`` against a frame of the truth, see :meth:`Comparison.numbers`; None where there is nothing to compare with.
+
+    Args:
+        where: the device that computes the model's extinction.
+    """
     place = truth.points(frame)
     if place is None:
         return None
     found = Comparison()
     for matrix, shape in blocks(*place):
         sigma = truth.grid(frame, matrix, shape).numpy()
-        found.add(sigma, density_grid(model, conditions, matrix, shape, threads).numpy())
+        found.add(sigma, density_grid(model, conditions, matrix, shape, threads, where).numpy())
     return found.numbers()
 
 

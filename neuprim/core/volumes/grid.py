@@ -67,17 +67,23 @@ def agreement(truth: np.ndarray, found: np.ndarray) -> dict[str, float] | None:
 
 
 def density_grid(
-    model: Primitives, conditions: Conditions, scene_from_index: Tensor, shape: tuple[int, int, int], threads: int = 0
+    model: Primitives,
+    conditions: Conditions,
+    scene_from_index: Tensor,
+    shape: tuple[int, int, int],
+    threads: int = 0,
+    where: torch.device = device.HOST,
 ) -> Tensor:
-    """(X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``.
+    """(X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``; on the processor.
 
-    What lowers to a :class:`~neuprim.core.model.forms.Cosine` runs in compiled code on all cores; any other density is asked point by
-    point, in blocks. Beside the grid it takes a few MB.
+    What lowers to a :class:`~neuprim.core.model.forms.Cosine` runs in compiled code on all cores, or on a card; any other density is asked
+    point by point, in blocks, on the processor. Beside the grid it takes a few MB, of a card's memory up to 500.
 
     Args:
         conditions: of the frame, e.g. ``{"time": tensor(0.5)}``.
         scene_from_index: (4, 4) float64 affine map, invertible.
         threads: 0 for all cores; the result does not depend on it.
+        where: the device that computes, wherever the model is. A card's sums are the processor's but for rounding.
 
     Raises:
         ConfigError: more than :data:`POINTS_LIMIT` points, or a map that is singular or not finite.
@@ -89,15 +95,23 @@ def density_grid(
     if not np.isfinite(forward).all() or abs(np.linalg.det(forward[:3, :3])) == 0:
         raise ConfigError(f"scene_from_index {forward.tolist()}: expected a finite, invertible affine map")
     back = np.linalg.inv(forward)
-    grid = np.zeros(shape, np.float32)
     model = model.to(device.HOST)
     with torch.no_grad():
         geometry, form = model.lower_density(conditions)
-        wide = [x.detach().double().numpy() for x in (geometry.means, geometry.scales, geometry.rotations)]
+        ellipsoids = (geometry.means.double(), geometry.scales.double(), geometry.rotations.double())
+        if isinstance(form, Cosine):
+            neurons = (form.W1.double(), form.b1.double(), form.w2.double(), form.b2.reshape(-1).double())
+            if device.computes(where):
+                from neuprim.core.volumes import grid_warp
+
+                ways = torch.from_numpy(forward[:3]), torch.from_numpy(back[:3])
+                return torch.from_numpy(grid_warp.filled(ellipsoids, neurons, form.omega0, form.edge, *ways, shape, where))
+        wide = [x.detach().numpy() for x in ellipsoids]
+        grid = np.zeros(shape, np.float32)
         if not isinstance(form, Cosine):
             _ask(model, conditions, wide, forward, back, grid)
             return torch.from_numpy(grid)
-        wide += [x.detach().double().numpy() for x in (form.W1, form.b1, form.w2, form.b2.reshape(-1))]
+        wide += [x.detach().numpy() for x in neurons]
     arguments = [np.ascontiguousarray(x) for x in (*wide, forward[:3], back[:3])]
     parallel_for(_fill, shape[0], _SLAB, threads, *arguments, form.omega0, form.edge, grid)
     return torch.from_numpy(grid)

@@ -32,6 +32,7 @@ from neuprim.core.io import images
 from neuprim.core.io.files import atomic_path
 from neuprim.core.model.fields import Conditions
 from neuprim.core.render import render
+from neuprim.core.render.backends import computing_device
 from neuprim.core.task import API_VERSION
 from neuprim.core.volumes.grid import density_grid
 from neuprim.plugins.export.appearance import Harmonics, comparison_views, harmonics_of, rgb_of
@@ -122,7 +123,8 @@ def _sample(job: ExportJob, conditions: Conditions, count: int) -> tuple[np.ndar
         raise ConfigError(f"grid={count}: {math.prod(shape)} voxels; expected at most {_MOST_VOXELS}")
     matrix = np.diag([step, step, step, 1.0])
     matrix[:3, 3] = low - 3 * step
-    sigma = density_grid(job.run.model, conditions, torch.from_numpy(matrix), (shape[0], shape[1], shape[2]), job.run.settings.threads)
+    size, settings = (shape[0], shape[1], shape[2]), job.run.settings
+    sigma = density_grid(job.run.model, conditions, torch.from_numpy(matrix), size, settings.threads, computing_device(settings))
     return sigma.numpy(), matrix
 
 

@@ -25,6 +25,7 @@ from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
 from neuprim.core.io.vdb import Grid, Tiles, read_grid, scale_transform, write_vdb
 from neuprim.core.model.fields import Conditions
+from neuprim.core.render.backends import computing_device
 from neuprim.core.task import API_VERSION
 from neuprim.core.volumes.errors import Comparison, blocks, frame_errors
 from neuprim.core.volumes.grid import density_grid
@@ -222,6 +223,8 @@ def _slabs(
     threshold: float,
 ) -> Iterator[Grid]:
     """Sparse grids of blocks of planes that fit in a bounded memory, each a multiple of 8 along the first two axes."""
+    settings = job.run.settings
+    where = computing_device(settings)
     rows = max(8, min(int(size[1]), _SLAB_BYTES // (32 * int(size[2])) & ~7))
     planes = max(8, min(int(size[0]), _SLAB_BYTES // (4 * rows * int(size[2])) & ~7))
     for x in range(0, int(size[0]), planes):
@@ -230,7 +233,7 @@ def _slabs(
             shape = (min(planes, int(size[0]) - x), min(rows, int(size[1]) - y), int(size[2]))
             shifted = scene_from_index.copy()
             shifted[:3, 3] += shifted[:3, :3] @ corner
-            sigma = density_grid(job.run.model, conditions, torch.from_numpy(shifted), shape, job.run.settings.threads).numpy()
+            sigma = density_grid(job.run.model, conditions, torch.from_numpy(shifted), shape, settings.threads, where).numpy()
             values = sigma * np.float32(factor)
             values[values < threshold] = 0.0
             yield Grid.from_dense(name, values, lower=corner.tolist())
@@ -241,7 +244,8 @@ def _errors(
 ) -> dict[str, float]:
     """The model and the written file, each against the source on the source's own voxels, as ``metrics.json`` has it."""
     assert frame.source is not None
-    model = frame_errors(job.run.model, frame.conditions, source, frame.source, job.run.settings.threads)
+    settings = job.run.settings
+    model = frame_errors(job.run.model, frame.conditions, source, frame.source, settings.threads, computing_device(settings))
     place = source.points(frame.source)
     if model is None or place is None:
         return {}

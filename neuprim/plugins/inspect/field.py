@@ -12,6 +12,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.channels import Channels
+from neuprim.core.compute.device import HOST
 from neuprim.core.conditions import flag
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Conditions
@@ -51,6 +52,7 @@ class FieldFrame:
         gain: by which a volume's opacity is stronger than the density's own, for the same reason the same for all frames.
         needed: names of the conditions of the model's task.
         truth: (X, Y, Z) float32 ground truth on the grid, or None; computed when called.
+        device: what computes the extinction on the grid.
         side: "model", or "truth" in the panel that shows the ground truth in the model's place.
     """
 
@@ -68,6 +70,7 @@ class FieldFrame:
     truth: Callable[[], np.ndarray] | None = None
     truth_name: str = ""
     numbers: Mapping[str, float] | None = None
+    device: torch.device = HOST
     side: str = "model"
     _kept: dict[str, np.ndarray] = field(default_factory=dict)  # shared by the panels of a frame
 
@@ -105,7 +108,9 @@ class FieldFrame:
                     raise ConfigError("there is no ground truth to show; give --against")
                 self._kept["truth"] = self.truth()
             else:
-                self._kept["model"] = density_grid(self.model, self.conditions, self.scene_from_index, self.shape).numpy()
+                self._kept["model"] = density_grid(
+                    self.model, self.conditions, self.scene_from_index, self.shape, where=self.device
+                ).numpy()
         return self._kept[self.side]
 
     @property

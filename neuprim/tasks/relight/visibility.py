@@ -23,12 +23,10 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.compute import device
 from neuprim.core.compute.threads import parallel_for
-from neuprim.core.errors import NonFiniteError
-from neuprim.core.model.fields import Constant, LoweredDensity, Shade
+from neuprim.core.model.fields import LoweredDensity, Shade
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import Lowered
-from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.refusals import refuse_non_finite
+from neuprim.core.render import RenderSettings
+from neuprim.core.render.parts import render_parts
 from neuprim.tasks.relight.visibility_torch import arriving
 
 __all__ = ["BIAS", "SIZE", "SOFTNESS", "light_visibility"]
@@ -80,24 +78,7 @@ def light_visibility(
         low, high = torch.stack([depths.min(), depths.max()]).tolist()
         edges = torch.linspace(low, high, LAYERS + 1, dtype=torch.float64)
         slabs = torch.bucketize(depths, device.beside(edges[1:-1], means))
-        order = torch.argsort(slabs, stable=True)
-        geometry_by_slab, density_by_slab = geometry[order], density.rows(order)
-        ends = torch.bincount(slabs, minlength=LAYERS).cumsum(0).tolist()
-        black = torch.zeros(geometry.count, 1, device=means.device)
-        layers = []
-        for first, end in zip([0, *ends], ends, strict=False):
-            if first == end:
-                continue
-            own_rows = slice(first, end)
-            part = Lowered(geometry_by_slab[own_rows], density_by_slab.rows(own_rows), Constant(black[own_rows]))
-            try:
-                output = render_lowered(part, camera, own)
-            except NonFiniteError:
-                refuse_non_finite(Lowered(geometry, density, Constant(black)))  # by its number in the frame
-                raise
-            assert output.depth is not None
-            layers.append((output.alpha, output.depth))
-        opacities, distances = (torch.stack(images) for images in zip(*layers, strict=True))
+        opacities, distances = render_parts(geometry, density, slabs, LAYERS, camera, own)
         view, diameter = camera.viewmat[:3].contiguous(), 2.0 * radius
 
     def visibility(points: Tensor) -> Tensor:

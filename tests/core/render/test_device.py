@@ -13,6 +13,7 @@ import torch
 import neuprim
 from neuprim.config import compose
 from neuprim.core.compute import device
+from neuprim.core.compute.device import HOST
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, FormError
 from neuprim.core.model.fields import Opaque
 from neuprim.core.render import RenderSettings, backends, render_lowered
@@ -79,6 +80,24 @@ def test_a_card_that_nothing_draws_on_is_not_used(monkeypatch: pytest.MonkeyPatc
     assert tiny.trainer(tiny.two_primitives(), 1).device == torch.device("cpu")
     with pytest.raises(BackendUnavailable, match=r"^renderer\.device=cuda: its package is not installed; expected cpu or auto$"):
         backends.check_device(RenderSettings(device="cuda"))
+
+
+def test_what_is_no_frame_is_computed_where_frames_are(card: Card) -> None:
+    for settings, wanted in (
+        (RenderSettings(), CARD), (RenderSettings(device="cpu"), HOST), (RenderSettings(backend="cpu"), HOST),
+        (RenderSettings(backend="card"), CARD), (setting(CARD.type), CARD), (RenderSettings(backend="cuda", device="cpu"), HOST),
+    ):  # fmt: skip
+        assert backends.computing_device(settings) == wanted, settings
+
+
+def test_without_a_card_that_is_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device, "card_missing", lambda: "torch finds no CUDA device")
+    assert {backends.computing_device(RenderSettings(backend=name)) for name in ("auto", "cuda", "reference")} == {HOST}
+    assert not device.computes(HOST) and not device.computes(CARD)
+    monkeypatch.setattr(device, "_warp", lambda: True)
+    assert device.computes(torch.device("cuda", 0)) and not device.computes(HOST)
+    monkeypatch.setattr(device, "_warp", lambda: False)
+    assert not device.computes(torch.device("cuda", 0))
 
 
 def test_a_backend_and_a_device_that_do_not_go_together_are_refused(tmp_path: Path) -> None:

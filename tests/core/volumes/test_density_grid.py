@@ -18,6 +18,8 @@ from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.static.fields import SphericalHarmonics
 from tests import scenes
 
+pytestmark = pytest.mark.usefixtures("either_kernel")
+
 SHAPE = (13, 9, 11)
 
 

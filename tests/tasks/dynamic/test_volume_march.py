@@ -13,6 +13,8 @@ from neuprim.core.errors import ConfigError, DataError
 from neuprim.tasks.dynamic.volume import Medium, integrate
 from tests.tasks.dynamic.volumes import box, camera, grey, march_slowly, ragged, rays, rotation, sheet
 
+pytestmark = pytest.mark.usefixtures("either_kernel")
+
 
 def along_z(size: int = 9, far: float = 1e4) -> object:
     """A camera so far up that all rays are parallel to z; its image is a little wider than a unit box."""

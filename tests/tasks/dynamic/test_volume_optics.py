@@ -50,6 +50,7 @@ def test_black_body_colours() -> None:
 # ---------------------------------------------------------------- shadows
 
 
+@pytest.mark.usefixtures("either_kernel")
 @pytest.mark.parametrize("seed", range(2))
 def test_transmittance_against_brute_force(seed: int) -> None:
     medium = ragged(seed, (6, 8, 7), 20.0)
@@ -71,6 +72,7 @@ def _alpha(medium: Medium, start: np.ndarray, direction: np.ndarray) -> float:
     return float(march_slowly(medium, Camera(viewmat, 1.0, 1.0, 0.5, 0.5, 1, 1), near=0.0, far=2.0, steps=8000)[0, 0, 3])
 
 
+@pytest.mark.usefixtures("either_kernel")
 def test_transmittance_of_a_slab() -> None:
     """exp(-σ d) below the surface of a slab, straight and at 60 degrees, for any number of threads."""
     n, sigma = 32, 6.0

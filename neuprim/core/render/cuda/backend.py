@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -22,7 +23,7 @@ from neuprim.core.render.cuda.ray_colours import FIRST_COLOUR
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["render"]
+__all__ = ["render", "render_parts"]
 
 
 _NET = ("Wx", "bias", "Wout")
@@ -154,3 +155,22 @@ def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings
     alpha = 1 - T
     depth = mean_depth(zsum, alpha).to(dtype) if settings.depth else None
     return RenderOutput(rgb.to(dtype), alpha.to(dtype), depth, stats)
+
+
+def render_parts(lowered: Lowered, parts: Tensor, count: int, camera: Camera, settings: RenderSettings) -> tuple[Tensor, Tensor]:
+    """Opacity and depth of parts of the primitives, each as if it were alone, in one frame; see :func:`neuprim.core.render.parts.render_parts`."""
+    g, density = lowered.geometry, lowered.density
+    assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"
+    tensors = dict(zip(NAMES, (g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1)), strict=True))
+    tensors = {name: value.detach() for name, value in tensors.items()}
+    blank = torch.zeros(g.count, 1, device=g.means.device)
+    form, turns = Form(density.W1.shape[1], density.edge, 1, -1), density.omega0 / (2 * math.pi)
+    own = replace(settings, depth=True)
+    try:
+        images = (parts.int().contiguous(), count)
+        frame = prepared(tensors, blank, camera, camera.viewmat, own.near, turns, density.edge, None, images)
+    except NotFinite as error:
+        raise _blame(tensors, error.row) from None
+    drawn = forward(frame, form, None, blank.new_zeros(1), own, False, count)
+    alpha = (1 - drawn.transmittance).view(count, camera.height, camera.width).to(g.means.dtype)
+    return alpha, mean_depth(drawn.zsum.view(alpha.shape), alpha).to(alpha.dtype)

@@ -2,6 +2,9 @@
 """Backward, second pass: a warp a (tile, primitive) pair over its hits: chord and neurons again, sums in registers, one row for the pair.
 
 The rows of a primitive are then added in the order of its pairs: no sum depends on which block came first, and reruns are the same bits.
+
+With 8 neurons the sums alone are 59 registers of a lane's 128. So over the neurons nothing is kept that a few operations give again: of the
+chord its middle, depth and closest point; of the tile both corners but in one number; of the pair its spans, which are in shared memory.
 """
 
 from __future__ import annotations
@@ -21,14 +24,19 @@ __all__ = ["pairs_kernel", "pixel_of_slot", "sum_pairs"]
 
 
 @wp.func
-def pixel_of_slot(spans: wp.array2d(dtype=wp.uint16), n: int, s: int):
-    """(x, y) in the tile of pixel ``s`` of pair ``n``: the last row that starts at or before it."""
+def pixel_of_slot(spans: Any, n: int, s: int):
+    """(x, y) in the tile of pixel ``s`` of pair ``n``, a row of ``spans``: the last row of pixels that starts at or before it."""
     y = int(0)
     for b in range(4):
         if int(spans[n, y + (8 >> b)]) >> 8 <= s:
             y += 8 >> b
     row = int(spans[n, y])
     return wp.vec2i((row & 15) + s - (row >> 8), y)
+
+
+@wp.func_native("return numbers.data[size_t(row) * size_t(width) + column];")
+def _element(numbers: wp.array(dtype=wp.float32), row: int, width: int, column: int) -> float:
+    """Of an array of rows, without the strides that an array of two dimensions keeps in registers."""
 
 
 @functools.cache
@@ -44,7 +52,7 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
     mean = float(NORMS[P])
     by_rate = -TAU * TAU / (2.0 * P + 3.0)  # B' = -z B_(p+1)/(2p + 3), and z = 2 pi v
 
-    # 128 registers: 16 warps a multiprocessor instead of 12. A seventh of the time with 5 to 8 neurons on an H100; fewer neurons need no cap
+    # 128 registers: 16 warps a multiprocessor instead of 12. With 5 to 8 neurons; fewer need no cap, and with more they would spill
     bounds = (L.WARP, 16) if 4 < K <= 8 else None
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False, launch_bounds=bounds)
@@ -59,7 +67,7 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
         size: wp.vec2i,
         reached: wp.array(dtype=wp.int32),
         hits: wp.array(dtype=wp.vec2),
-        g_rgb: wp.array2d(dtype=wp.float32),
+        g_rgb: wp.array(dtype=wp.float32),
         g_z: wp.array(dtype=wp.float32),
         error: wp.array(dtype=wp.float32),
         out: wp.array(dtype=wp.float32),
@@ -72,6 +80,7 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
             total = row_of()
             if n < reached[tile]:
                 which = wp.tile_load(ids, shape=1, offset=n, storage="shared")
+                own = wp.tile_load(spans, shape=(1, wp.static(L.TILE)), offset=(n, 0), storage="shared")
                 row = wp.tile_load_indexed(rows, indices=which, shape=(1, W), axis=0, storage="shared")
                 gE0 = wp.vec3()
                 gEX = wp.vec3()
@@ -87,14 +96,16 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
                 gz = vecK()
                 gp = vecK()
                 ga = vecK()
+                # here, as no compiler moves a division out of a branch
+                corner = tile % across | (tile // across) << 16
                 begin = offsets[n]
                 count = offsets[n + 1] - begin
                 for s in range(lane, count, wp.static(L.WARP)):
                     hit = hits[begin + s]
                     if hit[1] > 0.0:
-                        at = pixel_of_slot(spans, n, s)
-                        X = (tile % across) * L.TILE + at[0]
-                        Y = (tile // across) * L.TILE + at[1]
+                        at = pixel_of_slot(own, 0, s)
+                        X = (corner & 65535) * L.TILE + at[0]
+                        Y = (corner >> 16) * L.TILE + at[1]
                         pixel = Y * size[0] + X
                         px = float(X) + 0.5
                         py = float(Y) + 0.5
@@ -102,17 +113,16 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
                         g_weight += hit[1]
                         g_error += hit[1] * error[pixel]
                         for k in range(wp.static(C)):
-                            g_colour[k] += hit[1] * g_rgb[pixel, k]
+                            g_colour[k] += hit[1] * _element(g_rgb, pixel, wp.static(C), k)
                         c = chord(ray_of(row, 0), px, py)
-                        D = wp.max(c.D, 1.0e-12)
-                        q = c.x + (c.mid - c.tm) * c.e
-                        v = c.half * c.e
+                        q = c.x + (c.h - c.half) * c.e
                         scale = float(norm)  # I = scale half field
                         if wp.static(P == 1):
-                            scale *= D
+                            scale *= c.D
                         if wp.static(P == 2):
-                            scale *= D * D
-                        gf = hit[0] * scale * c.half
+                            scale *= c.D * c.D
+                        gs = hit[0] * scale
+                        gf = gs * c.half
                         field = float(row[0, L.XA][3])
                         gq = wp.vec3()
                         gv = wp.vec3()
@@ -122,25 +132,31 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
                                 w2 = row[0, wp.static(amplitudes + k // 4)]
                             amplitude = w2[wp.static(k % 4)]
                             w = row[0, wp.static(L.NEURONS + k)]
+                            z = c.half * wp.dot(c.e, xyz(w))
+                            band = pair(z)
                             u = wp.dot(q, xyz(w)) + w[3]
-                            z = wp.dot(v, xyz(w))
                             r = u - wp.rint(u)
                             cosine = cos_turns(r * r)
-                            band = pair(z)
                             one = cosine * band[0]
                             field += amplitude * one
                             ga[k] += gf * one
                             gu = gf * amplitude * band[0] * (-TAU) * sin_turns(r)
                             gw = gf * amplitude * cosine * band[1] * by_rate * z
+                            gh = gw * c.half
                             gp[k] += gu
-                            gx[k] += gu * q[0] + gw * v[0]
-                            gy[k] += gu * q[1] + gw * v[1]
-                            gz[k] += gu * q[2] + gw * v[2]
+                            gx[k] += gu * q[0] + gh * c.e[0]
+                            gy[k] += gu * q[1] + gh * c.e[1]
+                            gz[k] += gu * q[2] + gh * c.e[2]
                             gq += gu * xyz(w)
                             gv += gw * xyz(w)
                         g_offset += gf
                         g_mass += gf * field
-                        g_half = wp.dot(gv, c.e) + hit[0] * scale * field
+                        length = wp.length(c.e)
+                        c.ia = 1.0 / (length * length)
+                        D = c.h * c.h / c.ia
+                        c.mid = c.tm + c.h - c.half
+                        c.x = q - (c.h - c.half) * c.e
+                        g_half = wp.dot(gv, c.e) + gs * field
                         g_mid = wp.dot(gq, c.e)
                         if wp.static(depth):
                             g_mid += hit[1] * g_z[pixel] * row[0, L.REST][1]
@@ -173,7 +189,7 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
                     total[wp.static(L.G_NEURONS + 5 * k + 4)] = ga[k]
                 for k in range(wp.static(C)):
                     total[wp.static(L.G_NEURONS + 5 * K + k)] = g_colour[k]
-            add_lanes(total, lane, out, n * width)
+            add_lanes(total, lane, out, n)
 
     return backward_pairs
 

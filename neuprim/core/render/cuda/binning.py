@@ -43,12 +43,12 @@ class Counted:
 
 @dataclass(frozen=True)
 class TileLists:
-    """Pairs sorted by tile, then by depth, then by index.
+    """Pairs sorted by image, where there are several, then by tile, by depth and by index.
 
     Attributes:
-        starts: (tiles + 1,) int32, first pair of each tile.
+        starts: (tiles + 1,) int32, first pair of each tile, of all images.
         ids: (pairs,) int32, primitive of each pair.
-        tile_of: (pairs,) int32, its tile.
+        tile_of: (pairs,) int32, its tile of its image.
         first: (N + 1,) int32, first entry of each primitive in ``slots_of``.
         slots_of: (pairs,) int32, where each primitive's pairs lie in ``ids``.
     """
@@ -84,10 +84,13 @@ def _kernels() -> tuple[Any, Any]:
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def emit(
         rows: wp.array2d(dtype=wp.vec4), spans: wp.array2d(dtype=wp.vec4), boxes: wp.array(dtype=wp.vec4i), order: wp.array(dtype=wp.int64),
-        counts: wp.array2d(dtype=wp.int32), ends: wp.array2d(dtype=wp.int64), across: int,
+        counts: wp.array2d(dtype=wp.int32), ends: wp.array2d(dtype=wp.int64), across: int, images: wp.array(dtype=wp.int32), tiles: int,
         first: wp.array(dtype=wp.int32), keys: wp.array(dtype=wp.int64), slots: wp.array(dtype=wp.int32), which: wp.array(dtype=wp.int32),
     ):  # fmt: skip
-        """A key tile << 32 | rank for every tile that the primitive of depth rank ``tid`` reaches; dim (N,)."""
+        """A key tile << 32 | rank for every tile that the primitive of depth rank ``tid`` reaches; dim (N,).
+
+        ``tiles``: of each of several images, of which ``images`` says a primitive's; 0 where there is one.
+        """
         rank = wp.tid()
         i = int(order[rank])
         last = int(ends[0, i])
@@ -98,24 +101,27 @@ def _kernels() -> tuple[Any, Any]:
             which[slots[i]] = i
         if counts[0, i] > 0:
             box, at = boxes[i], last - counts[0, i]
+            origin = int(0)
+            if tiles > 0:
+                origin = images[i] * tiles
             e = ellipse(spans[i, 0], spans[i, 1][0], rows[i, _E0][3], rows[i, _EX][3], box)
             for ty in range(box[1] // _TILE, (box[3] - 1) // _TILE + 1):
                 lo_hi = tile_range(e, ty)
                 for tx in range(lo_hi[0], lo_hi[1]):
-                    keys[at] = wp.int64(ty * across + tx) << wp.int64(32) | wp.int64(rank)
+                    keys[at] = wp.int64(origin + ty * across + tx) << wp.int64(32) | wp.int64(rank)
                     at += 1
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def list_pairs(
-        keys: wp.array(dtype=wp.int64), came_from: wp.array(dtype=wp.int64), order: wp.array(dtype=wp.int64), pairs: int, tiles: int,
+        keys: wp.array(dtype=wp.int64), came_from: wp.array(dtype=wp.int64), order: wp.array(dtype=wp.int64), pairs: int, tiles: int, each: int,
         starts: wp.array(dtype=wp.int32), ids: wp.array(dtype=wp.int32), tile_of: wp.array(dtype=wp.int32), slots_of: wp.array(dtype=wp.int32),
     ):  # fmt: skip
-        """From sorted keys to lists; dim (pairs,)."""
+        """From sorted keys to lists; dim (pairs,). ``tiles``: of all images; ``each``: of one."""
         k = wp.tid()
         key = keys[k]
         tile, rank = int(key >> wp.int64(32)), int(key & wp.int64(0xFFFFFFFF))
         ids[k] = int(order[rank])
-        tile_of[k] = tile
+        tile_of[k] = tile % each
         slots_of[int(came_from[k])] = k
         before = wp.int32(-1)
         if k > 0:
@@ -130,11 +136,17 @@ def _kernels() -> tuple[Any, Any]:
 
 
 def bin_primitives(
-    rows: Tensor, spans: Tensor, boxes: Tensor, depth: Tensor, counts: Tensor, counted: Counted, width: int, height: int
-) -> tuple[TileLists, Tensor, Tensor]:
-    """Tile lists of one frame, ``slots`` and ``which``; every argument as ``prepare`` and :func:`count` filled it, no primitive bad."""
+    rows: Tensor, spans: Tensor, boxes: Tensor, depth: Tensor, counts: Tensor, counted: Counted, width: int, height: int,
+    images: tuple[Tensor, int] | None = None,
+) -> tuple[TileLists, Tensor, Tensor]:  # fmt: skip
+    """Tile lists of one frame, ``slots`` and ``which``; every argument as ``prepare`` and :func:`count` filled it, no primitive bad.
+
+    ``images``: of each primitive, (N,) int32, and how many there are.
+    """
     device, N, pairs = rows.device, depth.shape[0], counted.pairs
     across, down = -(-width // TILE), -(-height // TILE)
+    image_of, several = (None, 1) if images is None else (array(images[0], wp.int32), images[1])
+    each = across * down
 
     def integers(n: int) -> Tensor:
         return torch.empty(n, dtype=torch.int32, device=device)
@@ -145,14 +157,14 @@ def bin_primitives(
     slots, which, keys = integers(N), integers(counted.delicate), torch.empty(pairs, dtype=torch.int64, device=device)
     reached = (
         array(rows, wp.vec4), array(spans.view(N, 2, 4), wp.vec4), array(boxes, wp.vec4i), array(order, wp.int64), array(counts, wp.int32),
-        array(counted.ends, wp.int64), across, array(first, wp.int32), array(keys, wp.int64), array(slots, wp.int32), array(which, wp.int32),
+        array(counted.ends, wp.int64), across, image_of, 0 if images is None else each, array(first, wp.int32), array(keys, wp.int64), array(slots, wp.int32), array(which, wp.int32),
     )  # fmt: skip
     launch(emit, N, reached, device, PER_BLOCK)
     keys, came_from = torch.sort(keys)
-    starts = torch.zeros(across * down + 1, dtype=torch.int32, device=device)
+    starts = torch.zeros(several * each + 1, dtype=torch.int32, device=device)
     ids, tile_of, slots_of = integers(pairs), integers(pairs), integers(pairs)
     found = (
-        array(keys, wp.int64), array(came_from, wp.int64), array(order, wp.int64), pairs, across * down,
+        array(keys, wp.int64), array(came_from, wp.int64), array(order, wp.int64), pairs, several * each, each,
         array(starts, wp.int32), array(ids, wp.int32), array(tile_of, wp.int32), array(slots_of, wp.int32),
     )  # fmt: skip
     launch(list_pairs, pairs, found, device)

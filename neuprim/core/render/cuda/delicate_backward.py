@@ -132,6 +132,6 @@ def delicate_pairs_kernel(form: Form, depth: bool) -> Any:
                             total[3 + k] += float(c.du * pull.G[k])
                             total[6 + k] += float(c.dv * pull.G[k])
                             total[9 + k] += float(pull.m[k])
-            add_lanes(total, lane, out, n * width)
+            add_lanes(total, lane, out, n)
 
     return delicate_pairs

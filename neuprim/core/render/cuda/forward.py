@@ -41,12 +41,13 @@ BATCH = 16
 
 
 @functools.cache
-def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False) -> Any:
+def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, several: bool = False) -> Any:
     """Of a form; ``keep``: fill the slots, and take delicate primitives from there; ``depth``: also the sum of w z.
 
     ``listing``: composite nothing, but list every hit for :mod:`~neuprim.core.render.cuda.by_entry`, with its sorting key and its pair.
+    ``several``: images of one size, one after the other.
     """
-    assert keep or not listing
+    assert (keep or not listing) and not (listing and several)
     K, P, C = form.neurons, form.edge, form.channels
     width = L.columns(K, C)
     amplitudes, colours = L.amplitudes(K), L.colours(K)
@@ -84,8 +85,11 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False) -
         tile, lane = wp.tid()
         across = (size[0] + L.TILE - 1) // L.TILE
         at = pixel(lane)
-        X = (tile % across) * L.TILE + at[0]
-        Y = (tile // across) * L.TILE + at[1]
+        place_of = int(tile)
+        if wp.static(several):
+            place_of = tile % (across * ((size[1] + L.TILE - 1) // L.TILE))
+        X = (place_of % across) * L.TILE + at[0]
+        Y = (place_of // across) * L.TILE + at[1]
         px = float(X) + 0.5
         py = float(Y) + 0.5
         norm = mean * wp.length(wp.vec3((px - lens[2]) / lens[0], (py - lens[3]) / lens[1], 1.0))
@@ -197,6 +201,8 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False) -
                 break
         if X < size[0] and Y < size[1]:
             n = Y * size[0] + X
+            if wp.static(several):
+                n += tile // (across * ((size[1] + L.TILE - 1) // L.TILE)) * size[0] * size[1]
             for k in range(wp.static(C)):
                 rgb[n, k] = color[k] + T * background[k]
             transmittance[n] = T

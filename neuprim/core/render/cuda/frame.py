@@ -124,6 +124,7 @@ def prepared(
     turns: float,
     edge: int,
     forced: Tensor | None = None,
+    images: tuple[Tensor, int] | None = None,
 ) -> Frame:
     """Everything that the pixel kernels read of one view; the host waits for the device once.
 
@@ -137,6 +138,7 @@ def prepared(
         turns: omega0 / 2 pi.
         edge: p of the density's soft edge.
         forced: (N,) bool, primitives to draw in float64 whatever this stage finds.
+        images: (N,) int32, which of several images each primitive is drawn in, and how many there are; None for one.
 
     Raises:
         NotFinite: a primitive is not finite, or leaves the range of float32.
@@ -167,7 +169,7 @@ def prepared(
     counted = count(counts, bad)
     if counted.bad >= 0:
         raise NotFinite(counted.bad)
-    lists, slots, which = bin_primitives(rows, spans, boxes, depth, counts, counted, camera.width, camera.height)
+    lists, slots, which = bin_primitives(rows, spans, boxes, depth, counts, counted, camera.width, camera.height, images)
     wide = empty(counted.delicate, L.wide_width(K), dtype=torch.float64)
     launch(
         wide_kernel(double), counted.delicate,

@@ -74,8 +74,10 @@ def _limits(s: RenderSettings) -> object:
     return wp.vec4(s.alpha_min, s.alpha_max, s.transmittance_min, 0.0)
 
 
-def forward(frame: Frame, form: Form, net: Net | None, background: Tensor, settings: RenderSettings, differentiable: bool) -> Composited:
-    """Draw. The host waits for the device once device slots are kept, for how many there are.
+def forward(
+    frame: Frame, form: Form, net: Net | None, background: Tensor, settings: RenderSettings, differentiable: bool, images: int = 1
+) -> Composited:
+    """Draw; of several ``images``, whose pixels come one after the other, without gradients and sorted by centres. The host waits for the device once device slots are kept, for how many there are.
 
     Raises:
         BackendUnavailable: the frame's hits are more than int32 counts.
@@ -132,12 +134,12 @@ def forward(frame: Frame, form: Form, net: Net | None, background: Tensor, setti
                 array(frame.slots, wp.int32), ids, tile_of, shapes, starts_at, size, array(hues, wp.float32),
             ), device, L.WARP,
         )  # fmt: skip
-    pixels = camera.width * camera.height
+    pixels = images * camera.width * camera.height
     rgb, T, z = empty(pixels, form.channels), empty(pixels), empty(pixels if settings.depth else 0)
     reached = empty(tiles, dtype=torch.int32)
     keys, owners = empty(total if sorts else 0, dtype=torch.int64), empty(total if sorts else 0, dtype=torch.int32)
     launch(
-        forward_kernel(form, keep, settings.depth, sorts), (tiles, L.PIXELS),
+        forward_kernel(form, keep, settings.depth, sorts, images > 1), (tiles, L.PIXELS),
         (
             rows, units, array(lists.starts, wp.int32), ids, shapes, starts_at, lens, _limits(settings), array(background, wp.float32), size,
             array(rgb, wp.float32), array(T, wp.float32), array(z, wp.float32), array(hits, wp.vec2), array(depths, wp.float32),
@@ -210,7 +212,10 @@ def backward(
     out, error_at = array(pair_rows.view(-1), wp.float32), array(error, wp.float32)
     launch(
         pairs_kernel(form, depth), (pairs, L.WARP),
-        (rows, ids, tile_of, shapes, starts_at, lens, settings.depth_floor, size, reached, hits, grad, gz, error_at, out), device, L.WARP,
+        (
+            rows, ids, tile_of, shapes, starts_at, lens, settings.depth_floor, size, reached, hits, array(g_rgb.view(-1), wp.float32), gz, error_at,
+            out,
+        ), device, L.WARP,
     )  # fmt: skip
     if len(drawn.delicate):
         launch(

@@ -59,12 +59,14 @@ def net_pairs_kernel(form: Form) -> Any:
                 row = wp.tile_load_indexed(rows, indices=which, shape=(1, columns), axis=0, storage="shared")
                 units = wp.tile_load_indexed(net, indices=which, shape=(1, net_columns), axis=0, storage="shared")
                 begin = offsets[n]
+                left = (tile % across) * L.TILE  # here, as no compiler moves a division out of a branch
+                top = (tile // across) * L.TILE
                 for s in range(lane, offsets[n + 1] - begin, wp.static(L.WARP)):
                     weight = hits[begin + s][1]
                     if weight > 0.0:
                         at = pixel_of_slot(spans, n, s)
-                        X = (tile % across) * L.TILE + at[0]
-                        Y = (tile // across) * L.TILE + at[1]
+                        X = left + at[0]
+                        Y = top + at[1]
                         c = chord(ray_of(row, 0), float(X) + 0.5, float(Y) + 0.5)
                         q = c.x + (c.mid - c.tm) * c.e
                         g = vecC()
@@ -103,7 +105,7 @@ def net_pairs_kernel(form: Form) -> Any:
                             total[3 + k] += c.du * gG[k]
                             total[6 + k] += c.dv * gG[k]
                             total[9 + k] += pulled.m[k]
-            add_lanes(total, lane, out, n * width)
+            add_lanes(total, lane, out, n)
 
     return net_pairs
 
@@ -202,6 +204,6 @@ def delicate_net_kernel(form: Form) -> Any:
                         total[3 + k] += float(c.du * moved.G[k])
                         total[6 + k] += float(c.dv * moved.G[k])
                         total[9 + k] += float(moved.m[k])
-        add_lanes(total, lane, out, n * width)
+        add_lanes(total, lane, out, n)
 
     return delicate_net

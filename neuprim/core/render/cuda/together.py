@@ -38,6 +38,8 @@ def any_thread(yes: int) -> int:
 def _halving(width: int) -> str:
     """Every step keeps half of the values and adds those of a lane's partner: 31 shuffles per 32 values instead of 160.
 
+    A card tells a thread its lane again, so that no register has to keep it; positions are 64 bits, as rows of all pairs may be billions.
+
     Lane l ends with values l m to l m + m - 1, m = width/32. Loops run over constants alone: over two counters they would not be unrolled,
     and the values would go to memory.
     """
@@ -48,14 +50,15 @@ def _halving(width: int) -> str:
     #pragma unroll
     for (int i = 0; i < {half}; ++i) {{
         const float low = x[i], high = x[i + {half}];
-        x[i] = (lane & {bit} ? high : low) + __shfl_xor_sync(0xffffffffu, lane & {bit} ? low : high, {bit});
+        x[i] = (own & {bit} ? high : low) + __shfl_xor_sync(0xffffffffu, own & {bit} ? low : high, {bit});
     }}"""
     each = width // WARP
     return f"""
 #if defined(__CUDA_ARCH__)
+    const int own = threadIdx.x;
 {steps}
     #pragma unroll
-    for (int i = 0; i < {each}; ++i) out.data[at + {each} * lane + i] = x[i];
+    for (int i = 0; i < {each}; ++i) out.data[size_t(pair) * {width} + {each} * own + i] = x[i];
 #else
     static float every[{WARP}][{width}];
     for (int c = 0; c < {width}; ++c) every[lane][c] = x[c];
@@ -65,7 +68,7 @@ def _halving(width: int) -> str:
         for (int l = 0; l < {WARP}; ++l) a[l] = every[l][c];
         for (int bit = {WARP // 2}; bit > 0; bit >>= 1)
             for (int l = 0; l < bit; ++l) a[l] += a[l + bit];
-        out.data[at + c] = a[0];
+        out.data[size_t(pair) * {width} + c] = a[0];
     }}
     WP_TILE_SYNC();
 #endif
@@ -80,10 +83,12 @@ def row_type(width: int) -> Any:
 
 @functools.cache
 def row_sums(width: int) -> Callable[..., Any]:
-    """A function (x, lane, out, at) that writes the sums of ``width`` values over a warp's lanes to ``out[at:]``; a multiple of 32."""
+    """A function (x, lane, out, pair) that writes the sums of ``width`` values over a warp's lanes, a block, to the row of a pair; a multiple
+    of 32.
+    """
     row = row_type(width)
 
     @wp.func_native(_halving(width))
-    def sums(x: row, lane: int, out: wp.array(dtype=wp.float32), at: int): ...
+    def sums(x: row, lane: int, out: wp.array(dtype=wp.float32), pair: int): ...
 
     return sums

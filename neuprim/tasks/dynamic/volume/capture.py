@@ -20,8 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from neuprim.core.cameras import Camera
+from neuprim.core.compute import device as hardware
 from neuprim.core.errors import DataError
 from neuprim.core.io import images
 from neuprim.core.io.files import write_json
@@ -52,6 +54,7 @@ class Capture:
         reader: which grids mean what.
         cameras: all of them, those held out included.
         bounds: (2, 3) box around all matter, scene units.
+        device: what renders them. A card's images have a folder of their own, as they differ in their last bits.
     """
 
     frames: Sequence[VdbFrame]
@@ -61,12 +64,14 @@ class Capture:
     samples: int
     normalisation: Normalisation
     bounds: np.ndarray
+    device: torch.device = hardware.HOST
 
     def key(self) -> str:
         """A short hash of all of it; files count by name, size and time of change."""
         stats = [(f.number, str(f.path), f.path.stat().st_size, f.path.stat().st_mtime_ns) for f in self.frames]
         cameras = [(c.viewmat.tolist(), c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in self.cameras]
         parts = [RENDERER_VERSION, stats, asdict(self.look), dict(self.reader.names), cameras, self.samples, self.normalisation.to_json()]
+        parts += [self.device.type] * hardware.computes(self.device)
         return hashlib.sha256(json.dumps(parts, default=_plain).encode()).hexdigest()[:16]
 
     def medium(self, frame: VdbFrame) -> Medium:
@@ -75,7 +80,7 @@ class Capture:
         if self.reader.extinction not in grids:
             return Medium.nothing()
         try:
-            return medium_of(grids, replace(self.look, extinction_grids=(self.reader.extinction,)), self.normalisation)
+            return medium_of(grids, replace(self.look, extinction_grids=(self.reader.extinction,)), self.normalisation, where=self.device)
         except DataError as error:
             raise DataError(f"{frame.path}: {error}") from error
 
@@ -127,7 +132,7 @@ class Capture:
             draft.chmod(0o755)
             brightest = 0.0
             for c, camera in enumerate(self.cameras):
-                rgba = integrate(medium, camera, samples=self.samples)
+                rgba = integrate(medium, camera, samples=self.samples, where=self.device)
                 peak = float(rgba[..., :3].max().half())  # as it is stored: what half floats round to 0 is no light
                 if not np.isfinite(peak):
                     raise DataError(

@@ -29,7 +29,7 @@ def compare_with_truth(model: Primitives, capture: Capture, times: list[float], 
     chosen = sorted({int((i + 0.5) * count / (3 * per_third)) for i in range(3 * per_third)})
     entries: list[dict[str, Any]] = []
     for t in chosen:
-        numbers = frame_errors(model, {"time": torch.tensor(times[t])}, truth, t)
+        numbers = frame_errors(model, {"time": torch.tensor(times[t])}, truth, t, where=capture.device)
         if numbers is not None:
             entries.append({"frame": capture.frames[t].number, "third": THIRDS[min(3 * t // count, 2)], **numbers})
     result: dict[str, Any] = {"sigma_frames": entries}

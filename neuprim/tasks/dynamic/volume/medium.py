@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+import torch
 from scipy import ndimage
+from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.errors import DataError
 
 __all__ = ["Medium"]
@@ -33,6 +36,7 @@ class Medium:
     values: np.ndarray
     scene_from_index: np.ndarray
     non_finite: int = 0
+    _elsewhere: dict[torch.device, tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         v, m = self.values, self.scene_from_index
@@ -73,6 +77,13 @@ class Medium:
     def bytes(self) -> int:
         """Memory of the voxels and of the skips through empty space."""
         return self.values.nbytes + (0 if self.empty else int(np.prod([n - 1 for n in self.values.shape[:3]])))
+
+    def on(self, where: torch.device) -> tuple[Tensor, Tensor]:
+        """``values`` and ``skips`` as tensors there; kept, as many cameras look at them."""
+        if where not in self._elsewhere:
+            values, skips = (device.from_host(torch.from_numpy(x), where) for x in (self.values, self.skips))
+            self._elsewhere[where] = values, skips
+        return self._elsewhere[where]
 
     @cached_property
     def index_from_scene(self) -> np.ndarray:

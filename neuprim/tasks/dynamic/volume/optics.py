@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
+import torch
 from scipy import ndimage
 
 from neuprim.core.checked import Accepts, Range, Unbounded, verify
+from neuprim.core.compute import device
 from neuprim.core.errors import DataError, nearest
 from neuprim.core.io.vdb import DENSE_LIMIT, Bounds, Grid
 from neuprim.tasks.dynamic.volume.blackbody import black_body_rgb
@@ -124,7 +126,9 @@ class Look:
         return replace(self, up=up, light=replace(self.light, direction=(y, z, x) if up == "y" else (z, x, y)))
 
 
-def medium_of(grids: Mapping[str, Grid], look: Look, normalisation: Normalisation, threads: int = 0) -> Medium:
+def medium_of(
+    grids: Mapping[str, Grid], look: Look, normalisation: Normalisation, threads: int = 0, where: torch.device = device.HOST
+) -> Medium:
     """The medium of one frame on the voxels of its extinction grid.
 
     Other grids are sampled at those voxels' centres: as they are where their transform is the same, trilinearly where not.
@@ -132,6 +136,7 @@ def medium_of(grids: Mapping[str, Grid], look: Look, normalisation: Normalisatio
 
     Args:
         grids: by name; those that the look does not name are ignored.
+        where: the device that computes how much of a light arrives.
 
     Raises:
         DataError: none of the extinction grids is there, one has the wrong number of channels, or the box is too large.
@@ -157,7 +162,7 @@ def medium_of(grids: Mapping[str, Grid], look: Look, normalisation: Normalisatio
     scene_from_index[:3, 3] += scene_from_index[:3, :3] @ np.array(box[0], np.float64)
     arriving: np.ndarray = np.array(look.ambient, np.float32)
     if look.light is not None:
-        lit = transmittance(Medium.padded(values, scene_from_index), look.light.direction, threads)[1:-1, 1:-1, 1:-1]
+        lit = transmittance(Medium.padded(values, scene_from_index), look.light.direction, threads, where)[1:-1, 1:-1, 1:-1]
         arriving = arriving + lit[..., None] * (np.array(look.light.irradiance, np.float32) / np.float32(4.0 * math.pi)).astype(np.float32)
     albedo, more = _albedo(grids, look, base.transform, box, scene_from_index)
     values[..., 1:] = sigma_s[..., None] * (albedo * arriving)

@@ -64,7 +64,8 @@ def _prepare(settings: Mapping[str, Any], context: SceneContext) -> tuple[Volume
         look = dataclasses.replace(look, flame_range=(0.0, hottest)) if hottest > 0 else look
     normalisation = Normalisation.from_bounds(box)
     train, test = rig(asked.size, asked.cameras, up=asked.up, field_of_view=asked.field_of_view)
-    capture = Capture(frames, reader, look, [*train, *test], asked.samples, normalisation, normalisation.to_scene(box))
+    box = normalisation.to_scene(box)
+    capture = Capture(frames, reader, look, [*train, *test], asked.samples, normalisation, box, context.device)
     return asked, name, source, capture, range(len(train), len(train) + len(test))
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 
+from neuprim.core.compute import device
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import ConfigError
 from neuprim.tasks.dynamic.volume.medium import Medium
@@ -14,7 +16,7 @@ from neuprim.tasks.dynamic.volume.traverse import depths
 __all__ = ["transmittance"]
 
 
-def transmittance(medium: Medium, direction: Sequence[float], threads: int = 0) -> np.ndarray:
+def transmittance(medium: Medium, direction: Sequence[float], threads: int = 0, where: torch.device = device.HOST) -> np.ndarray:
     """(X, Y, Z) float32 exp(-∫ σ ds) from each voxel centre towards a directional light.
 
     Every voxel has its own ray, walked cell by cell, so the optical depth is that of the trilinear field but for rounding.
@@ -23,6 +25,7 @@ def transmittance(medium: Medium, direction: Sequence[float], threads: int = 0) 
     Args:
         direction: towards the light, scene axes, any length > 0.
         threads: 0 for all cores.
+        where: the device that computes.
     """
     towards = np.array(direction, np.float64)
     length = float(np.linalg.norm(towards)) if towards.shape == (3,) else 0.0
@@ -30,7 +33,13 @@ def transmittance(medium: Medium, direction: Sequence[float], threads: int = 0) 
         raise ConfigError(f"direction {tuple(direction)}; expected three finite numbers that are not all 0")
     result = np.zeros(medium.values.shape[:3], np.float32)
     if not medium.empty:
-        rx, ry, rz = (medium.index_from_scene[:3, :3] @ (towards / length)).tolist()
+        way = medium.index_from_scene[:3, :3] @ (towards / length)
         sigma = np.ascontiguousarray(medium.values[..., 0])
+        if device.computes(where):
+            from neuprim.tasks.dynamic.volume import traverse_warp
+
+            held = (device.from_host(torch.from_numpy(x), where) for x in (sigma, medium.skips, way))
+            return np.exp(-traverse_warp.depths(*held).cpu().numpy())
+        rx, ry, rz = way.tolist()
         parallel_for(depths, len(sigma), 2, threads, sigma, medium.skips, rx, ry, rz, result)
     return np.exp(-result)

@@ -18,7 +18,11 @@ from neuprim.core.compute.warp import wp
 from neuprim.core.render.cuda import binning, prepare, prepare_backward
 
 BENCHMARKS = Path(__file__).parents[4] / "benchmarks"
+ARCHS = (80, 89, 90)
 needs_sm_90 = pytest.mark.skipif(90 not in wp.get_cuda_supported_archs(), reason="this build of Warp does not compile for sm_90")
+needs_all = pytest.mark.skipif(
+    not set(ARCHS) <= set(wp.get_cuda_supported_archs()), reason="this build of Warp does not compile for sm_80, sm_89 and sm_90"
+)
 KERNELS = {
     "prepare": prepare.prepare_kernel(False),
     "prepare of float64": prepare.prepare_kernel(True),
@@ -55,16 +59,35 @@ def record(script: ModuleType) -> dict[str, Any]:
     return found
 
 
-@needs_sm_90
-@pytest.mark.parametrize("forms", [("K=8 p=0", "K=0 p=2"), ("every frame",)])
-def test_kernels_take_no_more_than_they_did(forms: tuple[str, ...], record: dict[str, Any]) -> None:
+def checked(forms: tuple[str, ...], archs: tuple[int, ...], record: dict[str, Any], *kernels: str) -> None:
     """In a process of its own, as kernels are compiled for blocks of their own sizes. Record what is meant: gpu_kernels.py --record."""
     if record["warp"] != wp.__version__:
         pytest.skip(f"recorded with Warp {record['warp']}, whose compiler is another one than that of {wp.__version__}")
-    words = [sys.executable, str(BENCHMARKS / "gpu_kernels.py"), "--check", "--archs", "90", "--forms", *forms]
+    words = [sys.executable, str(BENCHMARKS / "gpu_kernels.py"), "--check", "--archs", *map(str, archs), "--forms", *forms]
+    words += ["--kernels", *kernels] if kernels else []
     done = subprocess.run(words, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("| 90 |") == sum(r["arch"] == 90 and r["form"] in forms for r in record["kernels"]) > 5
+    own = [r for r in record["kernels"] if r["arch"] in archs and r["form"] in forms and (not kernels or r["kernel"] in kernels)]
+    assert sum(line.startswith(tuple(f"| {form} |" for form in forms)) for line in done.stdout.splitlines()) == len(own) > 5
+
+
+@needs_sm_90
+@pytest.mark.parametrize("forms", [("K=8 p=0", "K=0 p=2"), ("every frame", "beside frames")])
+def test_kernels_take_no_more_than_they_did(forms: tuple[str, ...], record: dict[str, Any]) -> None:
+    checked(forms, (90,), record)
+
+
+@needs_all
+def test_nor_do_those_of_pixels_and_pairs_on_other_cards(record: dict[str, Any]) -> None:
+    """With 8 neurons, the most registers that a frame needs without a stack."""
+    checked(("K=8 p=0",), (80, 89), record, "forward", "pixels", "pairs")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@needs_all
+def test_nor_does_any(script: ModuleType, record: dict[str, Any]) -> None:
+    checked((*script.FORMS, script.EVERY, script.BESIDE), ARCHS, record)
 
 
 def test_what_has_grown_or_spills_is_named(script: ModuleType, record: dict[str, Any]) -> None:
@@ -82,7 +105,12 @@ def test_what_has_grown_or_spills_is_named(script: ModuleType, record: dict[str,
 
 def test_every_form_is_recorded_for_every_architecture(script: ModuleType, record: dict[str, Any]) -> None:
     rows = record["kernels"]
-    wanted = {(form, name, arch) for form in (*script.FORMS, script.EVERY) for name, _, _ in script.kernels(form) for arch in script.ARCHS}
+    wanted = {
+        (form, name, arch)
+        for form in (*script.FORMS, script.EVERY, script.BESIDE)
+        for name, _, _ in script.kernels(form)
+        for arch in script.ARCHS
+    }
     assert {(r["form"], r["kernel"], r["arch"]) for r in rows} == wanted and len(rows) == len(wanted)
     page = script.PAGE.read_text(encoding="utf-8")
     assert f"<!-- gpu-kernels -->\n{script.document(record)}\n<!-- /gpu-kernels -->" in page

@@ -1,0 +1,86 @@
+"""The kernel of a card that fills a grid, on Warp's CPU blocks: which block comes first, and how much is taken at a time, change no bit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+pytest.importorskip("warp", reason="the kernels of a card are written in Warp: pip install 'neuprim[cuda]'")
+
+from neuprim.core.compute import device
+from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.volumes import grid_warp
+from neuprim.core.volumes.grid import density_grid
+from neuprim.tasks.static.fields import SphericalHarmonics
+from tests import scenes
+
+SHAPE = (21, 18, 25)
+MATRIX = torch.diag(torch.tensor([0.08, 0.09, 0.07, 1.0], dtype=torch.float64))
+MATRIX[:3, 3] = torch.tensor([-0.8, -0.8, -0.85])
+
+
+@pytest.fixture(autouse=True)
+def on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device, "computes", lambda where: True)
+
+
+def model(neurons: int = 3, edge: int = 2) -> Primitives:
+    """Small and large ones, one around the whole grid, and some beside it."""
+    t = scenes.tensors(60, neurons, seed=4)
+    t["log_scales"][:5] += 2.0
+    t["log_scales"][5] += 6.0
+    t["means"][6:9] += 5.0
+    params = {**{k: v for k, v in t.items() if k != "colors"}, "sh_dc": t["colors"]}
+    return Primitives(CosineDensity(neurons, edge=edge), SphericalHarmonics(0), params)
+
+
+def filled() -> Tensor:
+    return density_grid(model(), {}, MATRIX, SHAPE)
+
+
+@pytest.mark.parametrize("edge", [0, 1, 2])
+@pytest.mark.parametrize("neurons", [0, 8])
+def test_it_is_the_processors(edge: int, neurons: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sums of the same float32 numbers in the same order: most points have the same bits."""
+    m = model(neurons, edge)
+    found = density_grid(m, {}, MATRIX, SHAPE)
+    monkeypatch.setattr(device, "computes", lambda where: False)
+    wanted = density_grid(m, {}, MATRIX, SHAPE)
+    assert float(wanted.max()) > 1.0 and torch.allclose(found, wanted, rtol=1e-6, atol=1e-6)
+    assert float((found == wanted).float().mean()) > 0.99
+
+
+@pytest.mark.parametrize(("name", "most"), [("_PAIRS", 1), ("_PAIRS", 40), ("_POINTS", 1), ("_POINTS", 8 * 18 * 25)])
+def test_any_part_at_a_time_gives_the_same_bits(name: str, most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = filled()
+    monkeypatch.setattr(grid_warp, name, most)
+    assert bool(whole.any()) and torch.equal(filled(), whole)
+
+
+def test_blocks_may_come_in_any_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last first, each as if it were alone."""
+    whole, genuine, blocks = filled(), grid_warp.launch, []
+
+    def one_by_one(kernel: Any, dim: Any, inputs: Sequence[Any], where: torch.device, block: int) -> None:
+        starts = inputs[0].tensor
+        for tile in reversed(range(dim[0])):
+            alone = torch.where(torch.arange(len(starts)) <= tile, starts[tile], starts[tile + 1])
+            genuine(kernel, dim, (grid_warp.array(alone, inputs[0].dtype), *inputs[1:]), where, block)
+            blocks.append(tile)
+
+    monkeypatch.setattr(grid_warp, "launch", one_by_one)
+    assert torch.equal(filled(), whole) and len(blocks) == 6 * 3 * 4
+
+
+def test_numbers_that_are_not_finite_reach_nothing_else() -> None:
+    m, bad = model(), model()
+    bad.params["means"][9] = torch.nan
+    bad.params["log_scales"][10] = torch.inf
+    for name in ("means", "log_scales"):
+        m.params[name][9:11] = 100.0 if name == "means" else -5.0
+    assert torch.equal(density_grid(bad, {}, MATRIX, SHAPE), density_grid(m, {}, MATRIX, SHAPE))

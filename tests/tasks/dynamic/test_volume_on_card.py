@@ -1,0 +1,103 @@
+"""The ground truth of volumes by the kernels of a card, on Warp's CPU blocks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("warp", reason="the kernels of a card are written in Warp: pip install 'neuprim[cuda]'")
+
+from neuprim.core.cameras import Camera
+from neuprim.core.compute import device
+from neuprim.core.data.context import SceneContext
+from neuprim.core.io.vdb import write_vdb
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import InitContext
+from neuprim.core.volumes.grid import lattice
+from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.dynamic.volume import Medium, integrate
+from neuprim.tasks.dynamic.volume.compare import compare_with_truth
+from neuprim.tasks.dynamic.volume.scene import load_volume
+from neuprim.tasks.dynamic.volume.truth import extinction_on
+from neuprim.tasks.static.fields import SphericalHarmonics
+from tests.tasks.dynamic.sequences import blob, dataset, recorded
+from tests.tasks.dynamic.volumes import camera, ragged, rotation
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    made = tmp_path / "files"
+    made.mkdir()
+    for number in (1, 2, 3):
+        write_vdb(made / f"ball_{number}.vdb", blob(6.0 + 3 * number))
+    return made
+
+
+def on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device, "computes", lambda where: True)
+
+
+def test_a_sequence_is_the_processors_and_lies_in_a_folder_of_its_own(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a light, glow and shadows; within the half floats that images are stored in."""
+    changes = {"size": 32, "samples": 2, "optics": {"light": {"direction": [0.3, -0.5, 0.8], "irradiance": [3.0, 3.0, 3.0]}}}
+    own = dataset(folder, tmp_path, **changes)
+    with monkeypatch.context() as patch:
+        on_blocks(patch)
+        other = dataset(folder, tmp_path, **changes)
+        again = dataset(folder, tmp_path / "again", **changes)
+    assert recorded(own).folder != recorded(other).folder and recorded(own).folder.parent == recorded(other).folder.parent
+    assert own.exposure == pytest.approx(other.exposure, rel=1e-3)
+    for i in range(len(own.test)):
+        mine, theirs, rerun = (data.test.pixels(i) for data in (own, other, again))
+        assert mine.alpha is not None and theirs.alpha is not None
+        assert float(mine.alpha.max()) > 0.3
+        assert torch.allclose(mine.rgb, theirs.rgb, rtol=2e-3, atol=1e-4) and torch.allclose(mine.alpha, theirs.alpha, rtol=2e-3, atol=1e-4)
+        assert torch.equal(theirs.rgb, rerun.rgb) and torch.equal(theirs.alpha, rerun.alpha)  # type: ignore[arg-type]
+
+
+def test_pixels_do_not_depend_on_those_beside_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor on which comes first: any part of an image has the bits of the whole."""
+    on_blocks(monkeypatch)
+    medium, view = ragged(3), camera((2.0, 1.0, 1.5), 24)
+    whole = integrate(medium, view, 2)
+    part = Camera(view.viewmat, view.fx, view.fy, view.cx, view.cy - 9, view.width, 7)
+    assert bool(whole[9:16].any()) and torch.equal(integrate(medium, part, 2), whole[9:16])
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_extinction_on_a_lattice_is_the_processors(turned: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    medium = ragged(1)
+    if turned:
+        medium = Medium(medium.values, rotation(2) @ medium.scene_from_index)
+    matrix, shape = lattice(np.array([[-0.7, -0.6, -0.65], [0.7, 0.75, 0.6]]), 30)
+    places = [(matrix, shape), (torch.from_numpy(medium.scene_from_index), medium.values.shape[:3])]
+    wanted = [extinction_on(medium, *place) for place in places]
+    on_blocks(monkeypatch)
+    found = [extinction_on(medium, *place) for place in places]
+    for a, b in zip(wanted, found, strict=True):
+        assert a.max() > 3 and np.allclose(a, b, rtol=1e-5, atol=1e-5)
+    assert np.allclose(found[1], medium.values[..., 0], rtol=1e-5, atol=1e-5)
+    assert not extinction_on(Medium(np.zeros((1, 4, 4, 4), np.float32), np.eye(4)), *places[0]).any()
+
+
+def test_errors_of_a_model_are_the_processors(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = load_volume({"vdb": str(folder), "size": 24, "cameras": 4, "look": "smoke_fire"}, SceneContext(0, tmp_path)).capture
+    generator = torch.Generator().manual_seed(0)
+    means = 0.4 * torch.rand(30, 3, generator=generator) - 0.2
+    made = InitContext(
+        means, torch.full((30,), 0.15), torch.zeros(30, 3), generator, conditions={"time": torch.rand(30, generator=generator)}
+    )
+    model = Primitives.initialise(TimeDensity(2, "window+motion"), SphericalHarmonics(0), made)
+    wanted = compare_with_truth(model, capture, [0.0, 0.5, 1.0], per_third=1)
+    on_blocks(monkeypatch)
+    found = compare_with_truth(model, replace(capture), [0.0, 0.5, 1.0], per_third=1)
+    assert len(wanted["sigma_frames"]) == 3 and abs(wanted["sigma_correlation_middle"]) > 0.05
+    assert {k: v for k, v in found.items() if k != "sigma_frames"} == pytest.approx(
+        {k: v for k, v in wanted.items() if k != "sigma_frames"}, rel=1e-5
+    )

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -17,6 +16,9 @@ from torch import Tensor
 from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, View, ViewSet, camera_extent
 from neuprim.core.errors import DataError
 from neuprim.core.io import images
+from neuprim.core.io.npz import read_arrays
+from neuprim.core.io.store import Store
+from neuprim.core.notices import warn_once
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.source import placement_of
 from neuprim.tasks.dynamic.volume.voxels import FrameVoxels
@@ -39,7 +41,7 @@ class FrameViews(ViewSet):
     """
 
     def __init__(
-        self, capture: Capture, folder: Path, cameras: Sequence[int], exposure: float, every: int = 1, memory: int = MEMORY
+        self, capture: Capture, folder: Store, cameras: Sequence[int], exposure: float, every: int = 1, memory: int = MEMORY
     ) -> None:
         self.capture, self.folder, self.cameras, self.exposure, self.memory = capture, folder, list(cameras), exposure, memory
         self._kept: OrderedDict[int, Tensor] = OrderedDict()
@@ -65,11 +67,18 @@ class FrameViews(ViewSet):
             return self._kept[index]
         c, t = divmod(index, len(self.times))
         camera = self.capture.cameras[self.cameras[c]]
-        path = self.capture.image(self.folder, self.frames[t], self.cameras[c])
+        frame, number = self.frames[t], self.cameras[c]
+
+        def read() -> Tensor:
+            path = self.capture.image(self.folder, frame, number)
+            return images.read_image(path, (camera.width, camera.height))
+
         try:
-            rgba = images.read_image(path, (camera.width, camera.height))
+            rgba = self.folder.patiently(read, warn_once)
         except DataError as error:
-            raise DataError(f"{error}; delete the folder {path.parent} to render the frame again") from error
+            raise DataError(
+                f"{error}; delete the folder {self.folder.at(self.capture.name(frame)).address} to render the frame again"
+            ) from error
         self._kept[index] = rgba = rgba.half()
         while len(self._kept) > 1 and len(self._kept) * rgba.numel() * 2 > self.memory:
             self._kept.popitem(last=False)
@@ -82,7 +91,7 @@ class Recording:
 
     Attributes:
         name: of the data set.
-        folder: of the rendered images.
+        folder: of the rendered images, a folder or a place in an object store.
         exposure: the brightest value that any camera sees.
         weights: per frame, its share of the sequence's extinction.
         every: every n-th frame is learned from.
@@ -91,7 +100,7 @@ class Recording:
 
     name: str
     capture: Capture
-    folder: Path
+    folder: Store
     exposure: float
     weights: Sequence[float]
     every: int
@@ -112,7 +121,7 @@ class Recording:
         for t, wanted in enumerate(per_frame):
             if not wanted:
                 continue
-            stored = _stored(self.capture.points(self.folder, self.capture.frames[t]))
+            stored = _stored(self.capture.points(self.folder, self.capture.frames[t]), "means", "colors")
             points = torch.from_numpy(stored["means"])
             rows = torch.randperm(len(points), generator=generator)[torch.arange(wanted) % len(points)]
             place = points[rows]
@@ -139,7 +148,7 @@ class Recording:
 
 
 def volume_dataset(
-    name: str, source: DataSource, capture: Capture, folder: Path, held_out: Sequence[int], up: Tensor, every: int = 1
+    name: str, source: DataSource, capture: Capture, folder: Store, held_out: Sequence[int], up: Tensor, every: int = 1
 ) -> Dataset:
     """A volume sequence seen by cameras; colours are linear radiance over the exposure, the brightest value any camera sees.
 
@@ -150,7 +159,7 @@ def volume_dataset(
     Raises:
         DataError: every frame is black, or a file is damaged.
     """
-    stored = [_stored(capture.points(folder, frame)) for frame in capture.frames]
+    stored = [_stored(capture.points(folder, frame), "weight", "brightest") for frame in capture.frames]
     exposure = max(float(s["brightest"]) for s in stored)
     if not exposure > 0:
         raise DataError(f"{name}: every frame is black from every camera; expected light (check scene.look and scene.grids)")
@@ -181,9 +190,17 @@ def volume_dataset(
     )
 
 
-def _stored(path: Path) -> dict[str, Any]:
+_POINTS = {
+    "means": (np.float32, (None, 3)),
+    "colors": (np.float32, (None, 3)),
+    "weight": (np.float64, ()),
+    "brightest": (np.float32, ()),
+}
+
+
+def _stored(path: Path, *names: str) -> dict[str, Any]:
+    """What is asked for of a frame's points; of all frames together they would be large."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in ("means", "colors", "weight", "brightest")}
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-        raise DataError(f"{path}: damaged ({error}); delete its folder to render the frame again") from error
+        return read_arrays(path, {name: _POINTS[name] for name in names})
+    except DataError as error:
+        raise DataError(f"{error}; delete its folder to render the frame again") from error

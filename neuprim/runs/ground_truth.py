@@ -23,7 +23,7 @@ from neuprim.runs.launch.status import Status
 from neuprim.runs.launch.table import FOLDER, launch
 from neuprim.runs.open import LOGS
 
-__all__ = ["before_runs", "make_frames", "make_truth", "shares", "truth_of"]
+__all__ = ["before_runs", "before_search", "make_frames", "make_truth", "shares", "truth_of"]
 
 _MOST = 16
 """Frames that a worker takes at a time."""
@@ -95,6 +95,17 @@ def before_runs(configs: Sequence[RunConfig], settings: LauncherSettings, hear: 
 
         with suppress(NeuprimError):
             make_truth(configs[numbers[0]], settings, tell)
+
+
+def before_search(config: RunConfig, settings: LauncherSettings, progress: Callable[[str, float], None]) -> None:
+    """The ground truth of a search's trainings, as :func:`before_runs`; raises as :func:`make_truth`."""
+
+    def tell(event: object) -> None:
+        if isinstance(event, Preparing):
+            progress(event.text, event.fraction)
+
+    if settings.name != "inline":
+        make_truth(config, settings, tell)
 
 
 def shares(missing: Sequence[int], workers: int) -> Iterator[list[int]]:

@@ -23,13 +23,13 @@ from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.source import placement_of
 from neuprim.tasks.dynamic.volume.voxels import FrameVoxels
 
-__all__ = ["MEMORY", "MEMORY_TEST", "FrameViews", "Recording", "volume_dataset"]
+__all__ = ["MEMORY", "FrameViews", "Recording", "volume_dataset"]
 
-MEMORY = 3 * 2**28
-"""Bytes of decoded images that the training split keeps, 768 MiB; beyond them the oldest are read again when needed."""
+MEMORY = 11 * 2**27
+"""Bytes of decoded images and voxels that are kept, 1408 MiB; beyond them those not used for longest are read again when needed."""
 
-MEMORY_TEST = 2**27
-"""The same of the test split, which is gone through in order."""
+_TRAIN, _TEST, _VOXELS = 6 / 11, 1 / 11, 4 / 11
+"""Shares of the training images, of the test images, which are gone through in order, and of the voxels."""
 
 _MATTER = 1.0 / 255.0  # alpha from which a pixel belongs to the union mask
 
@@ -41,7 +41,7 @@ class FrameViews(ViewSet):
     """
 
     def __init__(
-        self, capture: Capture, folder: Store, cameras: Sequence[int], exposure: float, every: int = 1, memory: int = MEMORY
+        self, capture: Capture, folder: Store, cameras: Sequence[int], exposure: float, every: int = 1, memory: float = MEMORY
     ) -> None:
         self.capture, self.folder, self.cameras, self.exposure, self.memory = capture, folder, list(cameras), exposure, memory
         self._kept: OrderedDict[int, Tensor] = OrderedDict()
@@ -148,13 +148,21 @@ class Recording:
 
 
 def volume_dataset(
-    name: str, source: DataSource, capture: Capture, folder: Store, held_out: Sequence[int], up: Tensor, every: int = 1
+    name: str,
+    source: DataSource,
+    capture: Capture,
+    folder: Store,
+    held_out: Sequence[int],
+    up: Tensor,
+    every: int = 1,
+    memory: float = MEMORY,
 ) -> Dataset:
     """A volume sequence seen by cameras; colours are linear radiance over the exposure, the brightest value any camera sees.
 
     Args:
         folder: of the images that the capture took.
         held_out: indices of the cameras of the test split.
+        memory: bytes of decoded images and voxels that are kept.
 
     Raises:
         DataError: every frame is black, or a file is damaged.
@@ -164,8 +172,8 @@ def volume_dataset(
     if not exposure > 0:
         raise DataError(f"{name}: every frame is black from every camera; expected light (check scene.look and scene.grids)")
     learned = [c for c in range(len(capture.cameras)) if c not in held_out]
-    train = FrameViews(capture, folder, learned, exposure, every)
-    test = FrameViews(capture, folder, held_out, exposure, memory=MEMORY_TEST)
+    train = FrameViews(capture, folder, learned, exposure, every, memory * _TRAIN)
+    test = FrameViews(capture, folder, held_out, exposure, memory=memory * _TEST)
     weights = [float(s["weight"]) for s in stored]
     recording = Recording(name, capture, folder, exposure, weights, every, test)
     camera = capture.cameras[0]
@@ -185,7 +193,7 @@ def volume_dataset(
         bounds=torch.from_numpy(capture.bounds),
         exposure=exposure,
         placement=placement_of(capture),
-        points=FrameVoxels(capture, folder, train.frames, train.times, weights[::every], exposure),
+        points=FrameVoxels(capture, folder, train.frames, train.times, weights[::every], exposure, memory * _VOXELS),
         extra=recording,
     )
 

@@ -60,7 +60,7 @@ class RenderedFrames(GroundTruth):
         return [i for i, name in enumerate(self.frames) if name not in there]
 
     def begin(self) -> None:
-        with _told(self.place):
+        with _told(self.store):
             self.store.begin()
 
     def make(self, frame: int, tell: Callable[[str], None] = warn_once) -> None:
@@ -73,11 +73,11 @@ class RenderedFrames(GroundTruth):
         def attempt() -> None:
             self.store.publish(self.frames[frame], lambda folder: self.capture.render(self.capture.frames[frame], folder), LAST)
 
-        with _told(self.place):
+        with _told(self.store):
             self.store.patiently(attempt, tell)
 
     def complete(self) -> None:
-        with _told(self.place):
+        with _told(self.store):
             if not self.store.has(_SCENE):
                 self.store.put(_SCENE, lambda path: write_json(path, self.capture.describe()))
 
@@ -99,9 +99,13 @@ class RenderedFrames(GroundTruth):
 
 
 @contextmanager
-def _told(place: str) -> Iterator[None]:
-    """What a disk refuses, as an error of the data."""
+def _told(store: Store) -> Iterator[None]:
+    """What a disk refuses, as an error of the data in one line."""
     try:
         yield
-    except OSError as error:
-        raise DataError(f"cannot write the rendered images to {place}: {error}") from error
+    except (OSError, DataError) as error:
+        cause = error if isinstance(error, OSError) else error.__cause__
+        if not isinstance(cause, OSError) or (isinstance(error, DataError) and str(store.path) not in str(error)):
+            raise
+        why = cause.strerror or cause
+        raise DataError(f"cannot write the rendered images to {store.address}: {why}; frames that are there are kept") from error

@@ -45,7 +45,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     asked, name, source, capture, held_out = _prepare(settings, context)
     rendered = _rendered(asked, capture, context).take(context.progress)
     up = torch.tensor(AXES[asked.up], dtype=torch.float64)
-    return volume_dataset(name, source, capture, rendered, held_out, up, asked.train_every)
+    return volume_dataset(name, source, capture, rendered, held_out, up, asked.train_every, asked.memory * 2.0**20)
 
 
 def load_truth(settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None) -> RenderedFrames:

@@ -21,10 +21,7 @@ from neuprim.core.notices import warn_once
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.medium import Medium
 
-__all__ = ["MEMORY", "FrameVoxels", "Voxels"]
-
-MEMORY = 2**29
-"""Bytes of voxels that are kept, 512 MiB; beyond them those of the oldest frame are read again when needed."""
+__all__ = ["FrameVoxels", "Voxels"]
 
 _NEAR, _FAR = 0.2, 0.1
 """Shares of the points that are drawn around voxels with matter, and anywhere in the box."""
@@ -129,6 +126,7 @@ class FrameVoxels(PointSupervision):
         folder: of the capture's images; a frame's voxels are kept beside them once they were read, as the light in them may take long.
         frames, times, weights: those to learn from, and each one's extinction.
         exposure: what radiance is divided by.
+        memory: bytes of voxels that are kept; beyond them those of the oldest frame are read again when needed.
     """
 
     def __init__(
@@ -139,7 +137,7 @@ class FrameVoxels(PointSupervision):
         times: Sequence[Tensor],
         weights: Sequence[float],
         exposure: float,
-        memory: int = MEMORY,
+        memory: float,
     ) -> None:
         self.capture, self.folder, self.frames, self.times = capture, folder, list(frames), list(times)
         self.exposure, self.memory = exposure, memory

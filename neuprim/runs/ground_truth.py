@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from neuprim.config import RunConfig, scene_of, suspects_of, task_of
@@ -53,12 +54,14 @@ def make_truth(config: RunConfig, settings: LauncherSettings, events: Events = s
 
     Frames that are there are not made again, and each is kept as it is done. The launcher's files lie in the run's directory while it works.
 
+    The first frame that cannot be made ends the rest, as no run can do without it; what was made is kept.
+
     Args:
         events: told how far it is, and what became of workers.
 
     Raises:
         KeyboardInterrupt: Ctrl-C came; what was made is kept.
-        NeuprimError: what the launcher or the scene refuses, or a frame that cannot be made; the others are.
+        NeuprimError: what the launcher or the scene refuses, or a frame that cannot be made.
         RuntimeError: a bug in a worker, with its traceback.
     """
     truth = truth_of(config, lambda text, fraction: events(Preparing(text, fraction)))
@@ -119,7 +122,7 @@ def shares(missing: Sequence[int], workers: int) -> Iterator[list[int]]:
 
 
 def make_frames(data: Mapping[str, Any], attempt: int, events: Events) -> int:
-    """The function of a job; the number of frames. Those that are there, as of a worker that died, are not made again."""
+    """The function of a job; the number of its frames that are there then. Those that are, as of a worker that died, are not made again."""
     config = RunConfig.from_dict(data["config"])
     truth = _truth(config, data["known"])
     if truth.key != data["key"]:
@@ -127,6 +130,8 @@ def make_frames(data: Mapping[str, Any], attempt: int, events: Events) -> int:
             f"{truth.place}: the files of the scene differ where a worker is; expected the same ones as for the launcher, by name, size and time"
         )
     for done, frame in enumerate(data["frames"]):
+        if Path(data["stop"]).exists():  # another one cannot be made
+            return done
         events(Preparing(truth.frames[frame], done / len(data["frames"])))
         truth.make(frame, lambda text: events(Preparing(text)))
     return len(data["frames"])
@@ -135,17 +140,20 @@ def make_frames(data: Mapping[str, Any], attempt: int, events: Events) -> int:
 def _launched(config: RunConfig, truth: GroundTruth, missing: Sequence[int], settings: LauncherSettings, events: Events) -> None:
     workers, _ = at_once(settings, len(missing))
     parts = list(shares(missing, workers))
-    common = {"config": config.to_dict(), "known": dict(truth.known), "key": truth.key}
+    stop = (config.output_dir / FOLDER / "failed").absolute()
+    common = {"config": config.to_dict(), "known": dict(truth.known), "key": truth.key, "stop": str(stop)}
     jobs = [Job(truth.frames[part[0]], f"{__name__}:{make_frames.__name__}", {**common, "frames": part}) for part in parts]
-    told = _Told(truth, parts, len(missing), events)
+    told = _Told(truth, parts, len(missing), events, stop)
     _kept.clear()
     _kept[_scene(config)] = truth
     try:
         results = launch(jobs, settings, config.output_dir / FOLDER, told.hear, told.ended)
     finally:
         _kept.clear()
-        with suppress(OSError):  # a run's own files, or nothing
-            config.output_dir.rmdir()
+        stop.unlink(missing_ok=True)
+        for folder in (stop.parent, config.output_dir):
+            with suppress(OSError):  # it is gone already, or has logs of workers, or a run's own files
+                folder.rmdir()
     over = [result for result in results if result is not None and result.state != "interrupted"]
     failed = [result for result in over if result.state == "failed"]
     for result in failed:
@@ -154,15 +162,15 @@ def _launched(config: RunConfig, truth: GroundTruth, missing: Sequence[int], set
     if len(over) < len(jobs):
         raise KeyboardInterrupt
     if failed:
-        left = len(truth.missing())
-        raise DataError(f"{failed[0].line} ({left} of {len(truth.frames)} frames are not there; the others are kept)")
+        raise DataError(f"{failed[0].line} ({len(truth.missing()):,} of {len(truth.frames):,} frames are missing)")
 
 
 class _Told:
     """How far a launch is, as events."""
 
-    def __init__(self, truth: GroundTruth, parts: Sequence[Sequence[int]], count: int, events: Events) -> None:
+    def __init__(self, truth: GroundTruth, parts: Sequence[Sequence[int]], count: int, events: Events, stop: Path) -> None:
         self._truth, self._parts, self._events, self._done = truth, parts, events, len(truth.frames) - count
+        self._stop = stop
         self._said: set[str] = set()
         self._text = f"rendering the ground truth: {len(truth.frames):,} frames"
         self._progress()
@@ -177,8 +185,13 @@ class _Told:
             self._note(f"{name}: no sign of its worker for a minute")
 
     def ended(self, number: int, result: Result) -> None:
-        self._done += len(self._parts[number])
-        self._progress()
+        if result.state == "failed":
+            with suppress(OSError):  # then the others find out by themselves
+                self._stop.parent.mkdir(parents=True, exist_ok=True)
+                self._stop.touch()
+        elif result.state == "done":
+            self._done += result.value
+            self._progress()
 
     def _progress(self) -> None:
         self._events(Preparing(self._text, self._done / len(self._truth.frames)))

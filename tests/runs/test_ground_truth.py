@@ -114,6 +114,7 @@ def test_two_makers_at_once_and_a_job_that_is_done_twice(files: Path, tmp_path: 
     assert first is not None
     first.begin()
     data = {"config": there.to_dict(), "known": dict(first.known), "key": first.key, "frames": list(range(FRAMES))}
+    data["stop"] = str(tmp_path / "failed")
 
     def work() -> None:
         try:
@@ -143,11 +144,12 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_made(files: Path, tmp_p
 
     monkeypatch.setattr(capture.images, "write_exr", write)
     with pytest.raises(DataError) as caught:
-        made(config(files, tmp_path, "scene.frames='1:3'"))
+        made(config(files, tmp_path, "scene.frames='1:4'"))
     place = next((tmp_path / "cache" / "volumes").iterdir())
-    why = "No space left on device; frames that are there are kept (1 of 3 frames are not there; the others are kept)"
+    why = "No space left on device; frames that are there are kept (2 of 4 frames are missing)"
     assert str(caught.value) == f"cannot write the rendered images to {place}: {why}"
     assert sorted(f.name for f in place.iterdir()) == ["frame_00001", "frame_00002"]
+    assert not (tmp_path / "out").exists()
 
 
 @posix

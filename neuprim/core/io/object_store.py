@@ -15,6 +15,7 @@ from neuprim.core.io.store import LocalStore, Store, check_size
 
 __all__ = ["ObjectStore", "is_url", "store_at"]
 
+_BUCKETS = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl", "oss")
 _LOCAL = ("file://", "local://")
 
 
@@ -69,8 +70,10 @@ class ObjectStore(Store):
         return ObjectStore(f"{self.address}/{more}", self._system, f"{self._root}/{more}", self.path.joinpath(*names))
 
     def begin(self) -> None:
+        if self.address.partition("://")[0] in _BUCKETS:  # they have no folders, and a bucket is not made for a typing error
+            return
         with self._said("written"):
-            self._system.makedirs(self._root, exist_ok=True)  # which object stores need not
+            self._system.makedirs(self._root, exist_ok=True)
 
     def whole(self, last: str) -> set[str]:
         with self._said("read"):

@@ -99,6 +99,13 @@ def test_errors_of_a_client_are_ours(tmp_path: Path, monkeypatch: pytest.MonkeyP
         store.publish("x", two, "last")
 
 
+def test_no_bucket_is_made(tmp_path: Path) -> None:
+    """A typing error would make one."""
+    ObjectStore("s3://bukcet/x", None, "bukcet/x", tmp_path).begin()
+    with pytest.raises(DataError, match="cannot be written"):
+        ObjectStore("sftp://host/x", None, "x", tmp_path).begin()
+
+
 def test_addresses_that_nothing_can_be_made_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError, match=r"^nonsense://x: Protocol not known.*expected a folder or a URL that fsspec knows"):
         store_at("nonsense://x", tmp_path)

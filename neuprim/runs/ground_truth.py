@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -21,7 +22,7 @@ from neuprim.runs.launch.engine import Hear
 from neuprim.runs.launch.jobs import Job, Result
 from neuprim.runs.launch.share import at_once
 from neuprim.runs.launch.status import Status
-from neuprim.runs.launch.table import FOLDER, launch
+from neuprim.runs.launch.table import launch
 from neuprim.runs.open import LOGS
 
 __all__ = ["before_runs", "before_search", "make_frames", "make_truth", "shares", "truth_of"]
@@ -52,7 +53,7 @@ def truth_of(
 def make_truth(config: RunConfig, settings: LauncherSettings, events: Events = silent) -> GroundTruth | None:
     """Have what is missing of the ground truth made where the launcher says; None of a scene that renders none.
 
-    Frames that are there are not made again, and each is kept as it is done. The launcher's files lie in the run's directory while it works.
+    Frames that are there are not made again, and each is kept as it is done. The launcher's files lie beside the run's directory while it works.
 
     The first frame that cannot be made ends the rest, as no run can do without it; what was made is kept.
 
@@ -127,7 +128,7 @@ def make_frames(data: Mapping[str, Any], attempt: int, events: Events) -> int:
     truth = _truth(config, data["known"])
     if truth.key != data["key"]:
         raise DataError(
-            f"{truth.place}: the files of the scene differ where a worker is; expected the same ones as for the launcher, by name, size and time"
+            f"{truth.place}: a worker sees another scene; expected the launcher's files there, of the same names, sizes and times, and its neuprim"
         )
     for done, frame in enumerate(data["frames"]):
         if Path(data["stop"]).exists():  # another one cannot be made
@@ -140,20 +141,24 @@ def make_frames(data: Mapping[str, Any], attempt: int, events: Events) -> int:
 def _launched(config: RunConfig, truth: GroundTruth, missing: Sequence[int], settings: LauncherSettings, events: Events) -> None:
     workers, _ = at_once(settings, len(missing))
     parts = list(shares(missing, workers))
-    stop = (config.output_dir / FOLDER / "failed").absolute()
+    outputs = config.output_dir.parent.absolute()  # which every machine sees
+    new, folder = not outputs.exists(), outputs / f"truth-{uuid.uuid4().hex[:8]}"
+    stop = folder / "failed"
     common = {"config": config.to_dict(), "known": dict(truth.known), "key": truth.key, "stop": str(stop)}
     jobs = [Job(truth.frames[part[0]], f"{__name__}:{make_frames.__name__}", {**common, "frames": part}) for part in parts]
     told = _Told(truth, parts, len(missing), events, stop)
     _kept.clear()
     _kept[_scene(config)] = truth
     try:
-        results = launch(jobs, settings, config.output_dir / FOLDER, told.hear, told.ended)
+        results = launch(jobs, settings, folder, told.hear, told.ended)
     finally:
         _kept.clear()
         stop.unlink(missing_ok=True)
-        for folder in (stop.parent, config.output_dir):
-            with suppress(OSError):  # it is gone already, or has logs of workers, or a run's own files
-                folder.rmdir()
+        with suppress(OSError):  # gone already, or with logs of workers that printed something
+            folder.rmdir()
+        with suppress(OSError):
+            if new:
+                outputs.rmdir()
     over = [result for result in results if result is not None and result.state != "interrupted"]
     failed = [result for result in over if result.state == "failed"]
     for result in failed:

@@ -43,7 +43,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def words(files: Path, place: Path, *more: str) -> list[str]:
     scene = [f"scene.vdb='{files}'", "scene.look=smoke_fire", "scene.size=16", "scene.cameras=4", "scene.samples=1"]
-    return ["task=dynamic", "scene=vdb", *scene, f"scene.cache='{place / 'cache'}'", f"output_dir='{place / 'out'}'", *more]
+    return ["task=dynamic", "scene=vdb", *scene, f"scene.cache='{place / 'cache'}'", f"output_dir='{place / 'outputs' / 'run'}'", *more]
 
 
 def config(files: Path, place: Path, *more: str) -> RunConfig:
@@ -89,7 +89,7 @@ def test_a_killed_worker_loses_the_frame_it_was_at_and_a_slow_one_holds_up_nobod
     assert contents(tmp_path) == alone, "the same bytes, and nothing half made"
     assert ["its worker died" in e.text for e in heard if isinstance(e, Note)] == [True]
     assert [e.fraction for e in heard if isinstance(e, Preparing)][-1] == 1.0
-    assert not (tmp_path / "out").exists()
+    assert [f.name for f in tmp_path.iterdir()] == ["cache"]
 
 
 def test_what_is_there_is_not_made_again(files: Path, tmp_path: Path, alone: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,7 +149,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_made(files: Path, tmp_p
     why = "No space left on device; frames that are there are kept (2 of 4 frames are missing)"
     assert str(caught.value) == f"cannot write the rendered images to {place}: {why}"
     assert sorted(f.name for f in place.iterdir()) == ["frame_00001", "frame_00002"]
-    assert not (tmp_path / "out").exists()
+    assert [f.name for f in tmp_path.iterdir()] == ["cache"]
 
 
 @posix
@@ -200,7 +200,7 @@ def test_other_files_where_a_worker_is_are_refused(files: Path, tmp_path: Path) 
     there = config(files, tmp_path)
     truth = truth_of(there)
     assert truth is not None
-    with pytest.raises(DataError, match=r"the files of the scene differ where a worker is; expected the same ones as for the launcher"):
+    with pytest.raises(DataError, match=r"a worker sees another scene; expected the launcher's files there"):
         ground_truth.make_frames({"config": there.to_dict(), "known": truth.known, "key": "0" * 16, "frames": [0]}, 0, lambda event: None)
     ground_truth._kept.clear()
 

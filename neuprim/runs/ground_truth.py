@@ -93,9 +93,10 @@ def before_runs(configs: Sequence[RunConfig], settings: LauncherSettings, hear: 
 
         def tell(event: object, numbers: Sequence[int] = numbers) -> None:
             if isinstance(event, Preparing | Note):
-                share = f", {event.fraction:.0%}" if isinstance(event, Preparing) and event.fraction > 0 else ""
+                done = event.fraction if isinstance(event, Preparing) else 0.0
+                text = f"{event.text}, {done:.0%}" if done > 0 else event.text
                 for number in numbers:
-                    hear(number, Status("waiting", f"{event.text}{share}"))
+                    hear(number, Status("waiting", text, progress=done))
 
         with suppress(NeuprimError):
             make_truth(configs[numbers[0]], settings, tell)

@@ -221,7 +221,7 @@ def test_runs_that_share_a_scene_wait_for_it_together_and_a_broken_one_holds_up_
     heard: list[tuple[int, Status]] = []
     before_runs(configs, LauncherSettings("processes"), lambda number, status: heard.append((number, status)))
     assert [c.scene["size"] for c in asked] == [24, 16] and [n for n, _ in heard] == [0, 1, 2, 3]
-    assert {s for _, s in heard} == {Status("waiting", "rendering, 50%")}
+    assert {s for _, s in heard} == {Status("waiting", "rendering, 50%", progress=0.5)}
     before_runs(configs, INLINE, lambda number, status: pytest.fail("left to the runs"))
 
 

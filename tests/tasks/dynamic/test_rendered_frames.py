@@ -14,7 +14,8 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import write_vdb
 from neuprim.tasks.dynamic.volume import capture as capturing
 from neuprim.tasks.dynamic.volume import voxels as voxelling
-from neuprim.tasks.dynamic.volume.voxels import Voxels
+from neuprim.tasks.dynamic.volume.dataset import FrameViews
+from neuprim.tasks.dynamic.volume.voxels import FrameVoxels, Voxels
 from tests.tasks.dynamic.sequences import blob, dataset, recorded
 
 
@@ -88,3 +89,17 @@ def test_damage_and_strange_files_are_refused_by_name(files: Path, tmp_path: Pat
         with pytest.raises(DataError, match=r"voxels\.npz: damaged .*ascending places in it, and finite values"):
             Voxels.read(tmp_path / "voxels.npz")
     assert os.path.getsize(tmp_path / "voxels.npz") < voxelling._MOST
+
+
+def test_memory_is_bounded_by_the_setting_whatever_the_length(files: Path, tmp_path: Path) -> None:
+    data = dataset(files, tmp_path, memory=1, size=96, cameras=9)
+    assert isinstance(data.train, FrameViews) and isinstance(data.test, FrameViews) and isinstance(data.points, FrameVoxels)
+    assert data.train.memory + data.test.memory + data.points.memory == pytest.approx(2**20)
+    for views in (data.train, data.test):
+        for i in range(len(views)):
+            views.pixels(i)
+        assert 0 < sum(kept.nbytes for kept in views._kept.values()) <= max(views.memory, 96 * 96 * 8)
+    assert len(data.train._kept) < len(data.train)
+    usual = dataset(files, tmp_path)
+    assert isinstance(usual.train, FrameViews) and isinstance(usual.test, FrameViews) and isinstance(usual.points, FrameVoxels)
+    assert [round(part.memory) / 2**20 for part in (usual.train, usual.test, usual.points)] == [768, 128, 512]

@@ -21,6 +21,7 @@ from neuprim.cli.operating_words import DRAWN, OPERATING, operating_words
 from neuprim.cli.prune import for_prune, prune
 from neuprim.cli.run_help import COMMON_KEYS, EXAMPLES
 from neuprim.cli.tradeoff import FORMS, for_tradeoff, of_words, tradeoff
+from neuprim.cli.truth import TRUTH_HELP, for_truth, truth
 from neuprim.cli.view import for_view, view
 from neuprim.core.errors import ConfigError, NeuprimError, nearest, one_line
 from neuprim.core.notices import warnings_as_lines
@@ -69,7 +70,7 @@ def _dispatch(words: list[str]) -> int:
     if not words[0].startswith("-") and words[0] not in commands:
         raise ConfigError(f"{words[0]}: no such command{nearest(words[0], commands)}")
     args, rest = parser.parse_known_args(words)
-    if args.command in ("run", "bench"):
+    if args.command in ("run", "truth", "bench"):
         args.overrides += [word for word in rest if not word.startswith("-")]  # argparse gives up on words after a flag
         rest = [word for word in rest if word.startswith("-")]
     if args.command == "tradeoff" and of_words(args.run_dir):
@@ -108,6 +109,8 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
         "--config", type=Path, metavar="FILE", help="start with the settings of RUN_DIR/config.yaml; words beside it come first"
     )
     run.add_argument("--cfg", action="store_true", help="print the resolved configuration and stop")
+
+    for_truth(command("truth", truth, "render the ground truth of a scene before runs need it", TRUTH_HELP))
 
     evaluate = command("eval", _eval, "measure a run on its test views", OPERATING)
     evaluate.add_argument("run_dir", type=Path, metavar="RUN_DIR")

@@ -59,7 +59,8 @@ class LaunchProgress:
     def _line(self, number: int, status: Status) -> None:
         said = (
             status.state,
-            int(status.progress / _EVERY) if status.state == "training" else 0,
+            int(status.progress / _EVERY) if status.state in ("training", "waiting") else 0,
+            status.text.rpartition(", ")[0] or status.text if status.state == "waiting" else "",
             status.text.startswith("no sign"),
             status.attempt,
         )

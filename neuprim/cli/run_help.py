@@ -21,6 +21,7 @@ commonest keys:
                                        with target.megabytes=M and target.fps=F as limits, or these alone: the best within them
   launcher=inline|processes|ray|slurm  where runs work; launcher.workers=N launcher.threads=N launcher.retries=N
                                        launcher.address=... launcher.options.KEY=VALUE (docs/launching.md)
+  scene.cache=DIR|URL                  volumes: where their ground truth is kept (`neuprim truth` makes it before)
 `neuprim run task=NAME scene=NAME --cfg` shows every key with its value. A value that contains , = or brackets is quoted
 twice, for the shell and for the grammar: "scene.path='a=b, c'"."""
 

@@ -12,6 +12,7 @@ from neuprim.cli.launching import LaunchProgress
 from neuprim.config import RunConfig
 from neuprim.config.launcher import LauncherSettings
 from neuprim.config.overrides import Typed
+from neuprim.runs.ground_truth import before_runs
 from neuprim.runs.launch.jobs import Result
 from neuprim.runs.launch.status import Status
 from neuprim.runs.launch.table import FOLDER, launch
@@ -41,6 +42,7 @@ def launch_one(config: RunConfig, settings: LauncherSettings, typed: Typed) -> i
     """Launch one run somewhere else; the exit status."""
     shown = _Shown([config])
     with shown:
+        before_runs([config], settings, shown)
         results = launch([job_of(config)], settings, config.output_dir / FOLDER, shown)
     return _told([config], results, shown.live, typed)
 

@@ -41,7 +41,7 @@ DEFAULT_TASK = "static"
 CHOICES = ("task", "scene", "preset", EFFORT)
 PRESET_KEYS = ("model", "train", "renderer")
 PATHS = "_paths_"
-"""Key of a scene's YAML that lists which of its settings are paths: ``~`` is expanded and they are made absolute."""
+"""Key of a scene's YAML that lists which of its settings are paths: ``~`` is expanded and they are made absolute; URLs stay."""
 
 Files = dict[tuple[str, ...], Any]
 """Hydra's compositions by packages and group, so that a sweep reads each file once."""
@@ -365,7 +365,7 @@ def _scene(node: Mapping[str, Any], declared: Mapping[str, Any], paths: Sequence
         if key in paths and value is not None and value != REQUIRED:
             if not isinstance(value, (str, int)) or isinstance(value, bool) or not str(value).strip():
                 raise ConfigError(f"{where}={shown(value)}: expected a path (quote it: {where}='...')")
-            value = str(Path(str(value)).expanduser().absolute())
+            value = str(value) if "://" in str(value) else str(Path(str(value)).expanduser().absolute())
         if declared[key] == REQUIRED and (value is None or value == REQUIRED):
             expected = f"expected a directory or file, as {where}=PATH" if key in paths else f"expected {where}=VALUE"
             raise ConfigError(f"{where}: required and not given; {expected}")

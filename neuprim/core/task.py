@@ -11,6 +11,7 @@ from torch import Tensor
 from neuprim.core.checked import Option
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.context import SceneContext
+from neuprim.core.data.ground_truth import GroundTruth
 from neuprim.core.environment import Environment, Illumination
 from neuprim.core.layers import LayerSpec
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField, Field
@@ -59,12 +60,15 @@ class SceneSpec:
         summary: one line for ``neuprim tasks``.
         load: (scene settings, context) -> Dataset; raises :class:`~neuprim.core.errors.DataError` for bad input.
         volume: for scenes made of voxel files: (scene settings, context) -> these, without drawing anything.
+        truth: for scenes whose images are rendered frame by frame: (scene settings, context, what another process knows of them or None) ->
+            that work, which ``load`` does where nobody has done it before; see :class:`~neuprim.core.data.ground_truth.GroundTruth`.
     """
 
     name: str
     summary: str
     load: Callable[[Mapping[str, Any], SceneContext], Dataset]
     volume: Callable[[Mapping[str, Any], SceneContext], VolumeSource] | None = None
+    truth: Callable[[Mapping[str, Any], SceneContext, Mapping[str, Any] | None], GroundTruth] | None = None
 
 
 @dataclass(frozen=True)

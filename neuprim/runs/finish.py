@@ -11,6 +11,7 @@ from neuprim.core.data import Clip, View
 from neuprim.core.errors import CheckpointError, FormError
 from neuprim.core.io import images
 from neuprim.core.io.files import write_json
+from neuprim.core.io.reel import Reel
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.plugins.judging import clips_of, orbit_of
@@ -37,14 +38,15 @@ def finish(fitted: Fitted, directory: Path) -> None:
 
     clips = clips_of(task, dataset)
     reels = {i: clip for clip in clips if clip.source is None for i in clip.views}
-    pictures: list[torch.Tensor] = []
+    open_reel: list[Reel] = []
     regions = Regions(channels.display)
 
     def film(clip: Clip, index: int, rendered: torch.Tensor, truth: torch.Tensor) -> None:
-        pictures.append(images.to_uint8(torch.cat([channels.display(x) for x in (truth, rendered)], dim=1)))
+        if not open_reel:
+            open_reel.append(Reel(folder))
+        open_reel[0].add(torch.cat([channels.display(x) for x in (truth, rendered)], dim=1))
         if index == clip.views[-1]:
-            images.write_animation(folder / f"clip_{clip.name}.webp", pictures, clip.fps)
-            pictures.clear()
+            open_reel.pop().write(folder / f"clip_{clip.name}.webp", clip.fps)
 
     def keep(index: int, view: View, rendered: torch.Tensor, truth: torch.Tensor) -> None:
         regions.look(view.name, rendered, truth)

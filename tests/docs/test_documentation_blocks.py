@@ -202,6 +202,10 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
         if (args.multirun and not without_place(settings)) or args.config is not None:
             settings = ["task=static", *settings]  # the others are in a file
         (compose_all if args.multirun else compose)(settings, False)
+    if args.command == "truth":
+        rest += args.overrides
+        (compose_all if args.multirun else compose)(launcher_words([word for word in rest if not word.startswith("-")])[1], False)
+        rest = [word for word in rest if word.startswith("-")]
     if args.command == "bench":
         rest += args.overrides
         compose(["scene=blender", "scene.path=DIR", *(word for word in rest if not word.startswith("-"))], False)
@@ -242,6 +246,7 @@ def test_commands(block: Block, conditions: list[ConditionSpec], tmp_path: Path,
         "neuprim run -m task=static model.neurons=0,99",
         "neuprim run task=static --cgf",
         "neuprim run task=static viewer.prot=80",
+        "neuprim truth task=dynamic scene=vdb scene.vdb=DIR scene.cahce=DIR",
         "neuprim tradeoff task=static budget=5m model.primitive=3",
         "neuprim tradeoff task=static --seed 3",
         "neuprim render RUN_DIR --camera orbit --sise 3x3",

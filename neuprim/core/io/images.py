@@ -31,8 +31,10 @@ __all__ = [
     "exr_channels",
     "image_info",
     "linear_to_srgb",
+    "pillow_image",
     "read_image",
     "read_mask",
+    "save_animation",
     "srgb_to_linear",
     "to_uint8",
     "write_animation",
@@ -293,7 +295,8 @@ def to_uint8(image: Tensor) -> Tensor:
     return (image.detach().float().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
 
 
-def _pillow_image(path: Path, image: Tensor) -> Image.Image:
+def pillow_image(path: Path, image: Tensor) -> Image.Image:
+    """(H, W, 3 or 4) sRGB values as Pillow's image of 8 bits; ``path`` is for messages. Raises DataError: wrong shape, NaN values."""
     if image.ndim != 3 or image.shape[-1] not in (3, 4) or 0 in image.shape:
         raise DataError(f"{path}: image to write has shape {tuple(image.shape)}; expected (H, W, 3) or (H, W, 4)")
     try:
@@ -313,12 +316,12 @@ def write_png(path: Path, image: Tensor) -> None:
     Raises:
         DataError: wrong shape, NaN values, or the file cannot be written.
     """
-    _save(path, _pillow_image(path, image), "PNG")
+    _save(path, pillow_image(path, image), "PNG")
 
 
 def write_webp(path: Path, image: Tensor, quality: int = 90, lossless: bool = False) -> None:
     """Write (H, W, 3 or 4) sRGB values as a still WebP; arguments and errors as :func:`write_png`; atomic."""
-    _save(path, _pillow_image(path, image), "WEBP", quality=quality, lossless=lossless)
+    _save(path, pillow_image(path, image), "WEBP", quality=quality, lossless=lossless)
 
 
 def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: int = 80) -> None:
@@ -329,18 +332,23 @@ def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: i
     Raises:
         DataError: no frames, frames of different shapes, an unknown suffix, a rate that is not positive, or as :func:`write_png`.
     """
-    kind = {".webp": "WEBP", ".gif": "GIF"}.get(path.suffix.lower())
-    if kind is None:
-        raise DataError(f"{path}: unknown animation format {path.suffix!r}; expected .webp or .gif")
     if not frames or not 0.0 < fps < float("inf"):
         raise DataError(f"{path}: {len(frames)} frames at {fps} frames per second; expected at least one frame and a positive rate")
     shapes = sorted({tuple(f.shape) for f in frames})
     if len(shapes) != 1:
         raise DataError(f"{path}: frames have shapes {shapes}; expected one shape")
-    images = [_pillow_image(path, f) for f in frames]
+    images = [pillow_image(path, f) for f in frames]
+    save_animation(path, images[0], fps, quality, images[1:])
+
+
+def save_animation(path: Path, first: Image.Image, fps: float, quality: int = 80, rest: Sequence[Image.Image] = ()) -> None:
+    """Write Pillow's images, each with all of its own frames, as :func:`write_animation` does."""
+    kind = {".webp": "WEBP", ".gif": "GIF"}.get(path.suffix.lower())
+    if kind is None:
+        raise DataError(f"{path}: unknown animation format {path.suffix!r}; expected .webp or .gif")
     options: dict[str, Any] = {"quality": quality} if kind == "WEBP" else {"disposal": 2}
     duration = max(1, round(1000.0 / fps)) if kind == "WEBP" else 10 * max(1, round(100.0 / fps))
-    _save(path, images[0], kind, save_all=True, append_images=images[1:], duration=duration, loop=0, **options)
+    _save(path, first, kind, save_all=True, append_images=list(rest), duration=duration, loop=0, **options)
 
 
 # ---------------------------------------------------------------- transfer curve

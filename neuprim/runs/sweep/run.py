@@ -11,6 +11,7 @@ from neuprim.config import RunConfig
 from neuprim.config.launcher import LauncherSettings
 from neuprim.config.overrides import parse, swept_keys, without_place
 from neuprim.report.sweep import write_sweep
+from neuprim.runs.ground_truth import before_runs
 from neuprim.runs.launch.engine import Hear
 from neuprim.runs.launch.jobs import Result
 from neuprim.runs.launch.status import Status
@@ -68,6 +69,7 @@ def sweep_run(
 
         for number in todo:
             results[number] = None
+        before_runs([configs[n] for n in todo], settings, heard)
         launch([job_of(configs[n]) for n in todo], settings, folder / FOLDER, heard, ended)
         record = keeper.record
         record.write(folder)

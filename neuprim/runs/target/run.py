@@ -14,6 +14,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.data.check import check_dataset
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.runs.events import Events, Preparing, silent
+from neuprim.runs.ground_truth import before_search
 from neuprim.runs.launch.share import own_share
 from neuprim.runs.lock import held
 from neuprim.runs.open import LOGS, load_dataset
@@ -57,7 +58,12 @@ def target_run(
     begun = clock()
     with held(config.output_dir, "search"), suspects.watch(config.output_dir / LOGS), own_share(launcher):
         task = task_of(config)
-        dataset = load_dataset(config, task, lambda text, fraction: events(Preparing(text, fraction)))
+
+        def progress(text: str, fraction: float) -> None:
+            events(Preparing(text, fraction))
+
+        before_search(config, launcher, progress)
+        dataset = load_dataset(config, task, progress)
         suspects.know(dataset)
         check_dataset(dataset, task.conditions)
         record.hold_out = _hold_out(dataset)

@@ -7,6 +7,7 @@ from typing import Any
 
 from neuprim.core.checked import choose
 from neuprim.core.data import Dataset
+from neuprim.core.data.ground_truth import GroundTruth
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
@@ -65,6 +66,12 @@ def _files(settings: Mapping[str, Any], context: SceneContext) -> VolumeSource:
     return load_volume(settings, context)
 
 
+def _truth(settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None) -> GroundTruth:
+    from neuprim.tasks.dynamic.volume.scene import load_truth
+
+    return load_truth(settings, context, known)
+
+
 def _multiview(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     from neuprim.tasks.dynamic.multiview import load
 
@@ -77,11 +84,11 @@ TASK = TaskSpec(
     summary="Smoke and fire over time, from OpenVDB sequences or images with a time each (time inside the density)",
     config_package="neuprim.tasks.dynamic.conf",
     scenes=(
-        SceneSpec("smoke_fire", "fire under dark smoke, 100 timesteps; simulated, or scene.vdb=DIR", _volume, _files),
-        SceneSpec("colorful_smoke", "coloured smoke, 128 timesteps; simulated, or scene.vdb=DIR", _volume, _files),
-        SceneSpec("ground_explosion", "a blast and its cloud, 130 timesteps; simulated, or scene.vdb=DIR", _volume, _files),
-        SceneSpec("dust_tornado", "a column of dust, 100 timesteps; simulated, or scene.vdb=DIR", _volume, _files),
-        SceneSpec("vdb", "any sequence of .vdb files: scene.vdb=DIR", _volume, _files),
+        SceneSpec("smoke_fire", "fire under dark smoke, 100 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth),
+        SceneSpec("colorful_smoke", "coloured smoke, 128 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth),
+        SceneSpec("ground_explosion", "a blast and its cloud, 130 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth),
+        SceneSpec("dust_tornado", "a column of dust, 100 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth),
+        SceneSpec("vdb", "any sequence of .vdb files: scene.vdb=DIR", _volume, _files, _truth),
         SceneSpec("multiview", "images with a time per frame (D-NeRF layout): scene.path=DIR", _multiview),
     ),
     build=_build,

@@ -12,11 +12,13 @@ import torch
 
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.io.store import LocalStore
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.tasks.dynamic.volume.dataset import FrameViews
 from neuprim.tasks.dynamic.volume.looks import changed, named_look
 from neuprim.tasks.dynamic.volume.normalise import Normalisation
 from neuprim.tasks.dynamic.volume.optics import medium_of
+from neuprim.tasks.dynamic.volume.rendered import RenderedFrames
 from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, recorded
 
 
@@ -178,9 +180,9 @@ def test_two_runs_that_render_the_same_frame_do_not_disturb_each_other(
     recording = recorded(data)
     image = recording.capture.image(recording.folder, recording.capture.frames[0], 0)
     before = os.stat(image).st_ino
-    recording.capture._take_frame(recording.folder, recording.capture.frames[0])  # as the slower one of two does
+    RenderedFrames(recording.capture, LocalStore(tmp_path / "cache")).write(0)  # as the slower one of two does
     assert os.stat(image).st_ino == before
-    assert not list(recording.folder.glob(".*"))
+    assert not list(recording.folder.path.glob(".*"))
 
 
 def test_a_damaged_image_says_what_to_do(folder: Path, tmp_path: Path) -> None:

@@ -94,13 +94,13 @@ def test_a_second_call_renders_nothing_and_an_interrupted_one_goes_on(
     before = first.train.pixels(5).rgb
     second = dataset(folder, tmp_path)
     assert not calls and torch.equal(second.train.pixels(5).rgb, before)
-    shutil.rmtree(recorded(first).folder / "frame_00009")
+    shutil.rmtree(recorded(first).folder.path / "frame_00009")
     third = dataset(folder, tmp_path)
     assert len(calls) == 6 and torch.equal(third.train.pixels(5).rgb, before)
 
 
 def test_whatever_matters_is_part_of_the_key(folder: Path, tmp_path: Path) -> None:
-    names = {recorded(dataset(folder, tmp_path)).folder}
+    names = {recorded(dataset(folder, tmp_path)).folder.path}
     for change in (
         {"size": 20},
         {"samples": 2},
@@ -110,16 +110,16 @@ def test_whatever_matters_is_part_of_the_key(folder: Path, tmp_path: Path) -> No
         {"optics": {"extinction": 3.0}},
         {"frames": "9:11"},
     ):
-        names.add(recorded(dataset(folder, tmp_path, **change)).folder)
+        names.add(recorded(dataset(folder, tmp_path, **change)).folder.path)
     write_vdb(folder / "ball_11.vdb", blob(17.0))
-    names.add(recorded(dataset(folder, tmp_path)).folder)
+    names.add(recorded(dataset(folder, tmp_path)).folder.path)
     assert len(names) == 9
 
 
 def test_what_was_rendered_is_written_down(folder: Path, tmp_path: Path) -> None:
     data = dataset(folder, tmp_path)
     recording = recorded(data)
-    record = json.loads((recording.folder / "scene.json").read_text())
+    record = json.loads((recording.folder.path / "scene.json").read_text())
     assert [f["number"] for f in record["frames"]] == list(NUMBERS) and record["cameras"] == 6
     assert record["normalisation"] == recording.capture.normalisation.to_json()
 
@@ -230,7 +230,7 @@ def test_a_sequence_without_matter(tmp_path: Path) -> None:
 
 def test_damaged_points_say_what_to_do(folder: Path, tmp_path: Path) -> None:
     data = dataset(folder, tmp_path)
-    (recorded(data).folder / "frame_00010" / "points.npz").write_bytes(b"not a zip")
+    (recorded(data).folder.path / "frame_00010" / "points.npz").write_bytes(b"not a zip")
     with pytest.raises(DataError, match="delete its folder to render the frame again"):
         dataset(folder, tmp_path)
 

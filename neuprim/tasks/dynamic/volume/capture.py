@@ -1,20 +1,15 @@
-"""Images of every frame from every camera, rendered once and kept on disk.
+"""Images of every frame from every camera: what they depend on, and what is written of a frame.
 
-    volumes/KEY/scene.json                 what was rendered, and how scene units map to the files' world
-    volumes/KEY/frame_00012/cam_07.exr     linear RGB radiance and alpha, premultiplied, half floats
-    volumes/KEY/frame_00012/points.npz     where the frame's matter is, for starting points
-
-A frame's folder appears under its name only when complete, so an interrupted run goes on with the frames that are missing.
+volumes/KEY/scene.json                 what was rendered, and how scene units map to the files' world
+volumes/KEY/frame_00012/cam_07.exr     linear RGB radiance and alpha, premultiplied, half floats
+volumes/KEY/frame_00012/points.npz     where the frame's matter is, for starting points
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
-import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +21,7 @@ from neuprim.core.cameras import Camera
 from neuprim.core.compute import device as hardware
 from neuprim.core.errors import DataError
 from neuprim.core.io import images
-from neuprim.core.io.files import write_json
+from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.tasks.dynamic.volume.grids import GridReader
 from neuprim.tasks.dynamic.volume.march import integrate
@@ -34,7 +29,7 @@ from neuprim.tasks.dynamic.volume.medium import Medium
 from neuprim.tasks.dynamic.volume.normalise import Normalisation
 from neuprim.tasks.dynamic.volume.optics import Look, medium_of
 
-__all__ = ["RENDERER_VERSION", "Capture"]
+__all__ = ["LAST", "POINTS", "RENDERER_VERSION", "Capture"]
 
 RENDERER_VERSION = 1
 """Part of the cache's key: to be raised with every change to the march, the optics, the rig or the files' layout."""
@@ -42,7 +37,10 @@ RENDERER_VERSION = 1
 POINTS = 8192
 """Starting points kept per frame."""
 
-Progress = Callable[[str, float], None]
+LAST = "points.npz"
+"""The file of a frame that is written last."""
+
+_POINTS_BYTES = 2 * POINTS * 3 * 4 + 2**16
 
 
 @dataclass(frozen=True)
@@ -84,31 +82,18 @@ class Capture:
         except DataError as error:
             raise DataError(f"{frame.path}: {error}") from error
 
-    def image(self, folder: Path, frame: VdbFrame, camera: int) -> Path:
-        """File of one image."""
-        return folder / f"frame_{frame.number:05d}" / f"cam_{camera:02d}.exr"
+    def name(self, frame: VdbFrame) -> str:
+        """Of the folder of a frame's files."""
+        return f"frame_{frame.number:05d}"
 
-    def points(self, folder: Path, frame: VdbFrame) -> Path:
+    def image(self, store: Store, frame: VdbFrame, camera: int) -> Path:
+        """File of one image. Raises DataError where the store cannot be read."""
+        pixels = self.cameras[camera].width * self.cameras[camera].height
+        return store.fetch(f"{self.name(frame)}/cam_{camera:02d}.exr", pixels * 4 * 4 + 2**16)
+
+    def points(self, store: Store, frame: VdbFrame) -> Path:
         """File of a frame's points: means (M, 3) scene units, colors (M, 3) linear radiance, weight (), the frame's total extinction."""
-        return folder / f"frame_{frame.number:05d}" / "points.npz"
-
-    def take(self, cache_dir: Path, progress: Progress) -> Path:
-        """Render what is missing; returns the folder.
-
-        Raises:
-            DataError: a file cannot be read, or the cache cannot be written.
-        """
-        folder = cache_dir / "volumes" / self.key()
-        try:
-            for i, frame in enumerate(self.frames):
-                if not self.points(folder, frame).is_file():
-                    progress(f"rendering the ground truth: {len(self.frames)} frames, {len(self.cameras)} cameras", i / len(self.frames))
-                    self._take_frame(folder, frame)
-            if not (folder / "scene.json").is_file():
-                write_json(folder / "scene.json", self.describe())
-        except OSError as error:
-            raise DataError(f"cannot write the rendered images to {folder}: {error}") from error
-        return folder
+        return store.fetch(f"{self.name(frame)}/{LAST}", _POINTS_BYTES)
 
     def describe(self) -> dict[str, Any]:
         """What ``scene.json`` holds."""
@@ -123,39 +108,26 @@ class Capture:
             "normalisation": self.normalisation.to_json(),
         }
 
-    def _take_frame(self, folder: Path, frame: VdbFrame) -> None:
-        medium = self.medium(frame)
-        final = folder / f"frame_{frame.number:05d}"
-        folder.mkdir(parents=True, exist_ok=True)
-        draft = Path(tempfile.mkdtemp(prefix=f".{final.name}-", dir=folder))
-        try:
-            draft.chmod(0o755)
-            brightest = 0.0
-            for c, camera in enumerate(self.cameras):
-                rgba = integrate(medium, camera, samples=self.samples, where=self.device)
-                peak = float(rgba[..., :3].max().half())  # as it is stored: what half floats round to 0 is no light
-                if not np.isfinite(peak):
-                    raise DataError(
-                        f"{frame.path}: a radiance of {float(rgba[..., :3].max()):.3g} does not fit the images' half floats; "
-                        "expected at most 65504 (scene.optics.emission, ambient and light set it)"
-                    )
-                brightest = max(brightest, peak)
-                images.write_exr(draft / f"cam_{c:02d}.exr", rgba, half=True)
-            np.savez(draft / "points.npz", brightest=np.float32(brightest), **_points(medium, frame.number))
-            self._publish(draft, final, frame)
-        finally:
-            shutil.rmtree(draft, ignore_errors=True)
+    def render(self, frame: VdbFrame, folder: Path) -> None:
+        """Write all files of a frame into a folder.
 
-    def _publish(self, draft: Path, final: Path, frame: VdbFrame) -> None:
-        """Give the draft its name, unless another run was faster: its images are the same, and it may be reading them."""
-        done = self.points(final.parent, frame)
-        if final.exists() and not done.is_file():  # somebody deleted part of it
-            shutil.rmtree(final)
-        try:
-            os.replace(draft, final)
-        except OSError:
-            if not done.is_file():
-                raise
+        Raises:
+            DataError: the frame's file cannot be read, or its light does not fit half floats.
+            OSError: a file cannot be written.
+        """
+        medium = self.medium(frame)
+        brightest = 0.0
+        for c, camera in enumerate(self.cameras):
+            rgba = integrate(medium, camera, samples=self.samples, where=self.device)
+            peak = float(rgba[..., :3].max().half())  # as it is stored: what half floats round to 0 is no light
+            if not np.isfinite(peak):
+                raise DataError(
+                    f"{frame.path}: a radiance of {float(rgba[..., :3].max()):.3g} does not fit the images' half floats; "
+                    "expected at most 65504 (scene.optics.emission, ambient and light set it)"
+                )
+            brightest = max(brightest, peak)
+            images.write_exr(folder / f"cam_{c:02d}.exr", rgba, half=True)
+        np.savez(folder / LAST, brightest=np.float32(brightest), **_points(medium, frame.number))
 
 
 def _points(medium: Medium, seed: int) -> dict[str, Any]:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -17,17 +16,20 @@ from torch import Tensor
 from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, View, ViewSet, camera_extent
 from neuprim.core.errors import DataError
 from neuprim.core.io import images
+from neuprim.core.io.npz import read_arrays
+from neuprim.core.io.store import Store
+from neuprim.core.notices import warn_once
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.source import placement_of
 from neuprim.tasks.dynamic.volume.voxels import FrameVoxels
 
-__all__ = ["MEMORY", "MEMORY_TEST", "FrameViews", "Recording", "volume_dataset"]
+__all__ = ["MEMORY", "FrameViews", "Recording", "volume_dataset"]
 
-MEMORY = 3 * 2**28
-"""Bytes of decoded images that the training split keeps, 768 MiB; beyond them the oldest are read again when needed."""
+MEMORY = 11 * 2**27
+"""Bytes of decoded images and voxels that are kept, 1408 MiB; beyond them those not used for longest are read again when needed."""
 
-MEMORY_TEST = 2**27
-"""The same of the test split, which is gone through in order."""
+_TRAIN, _TEST, _VOXELS = 6 / 11, 1 / 11, 4 / 11
+"""Shares of the training images, of the test images, which are gone through in order, and of the voxels."""
 
 _MATTER = 1.0 / 255.0  # alpha from which a pixel belongs to the union mask
 
@@ -39,7 +41,7 @@ class FrameViews(ViewSet):
     """
 
     def __init__(
-        self, capture: Capture, folder: Path, cameras: Sequence[int], exposure: float, every: int = 1, memory: int = MEMORY
+        self, capture: Capture, folder: Store, cameras: Sequence[int], exposure: float, every: int = 1, memory: float = MEMORY
     ) -> None:
         self.capture, self.folder, self.cameras, self.exposure, self.memory = capture, folder, list(cameras), exposure, memory
         self._kept: OrderedDict[int, Tensor] = OrderedDict()
@@ -65,11 +67,18 @@ class FrameViews(ViewSet):
             return self._kept[index]
         c, t = divmod(index, len(self.times))
         camera = self.capture.cameras[self.cameras[c]]
-        path = self.capture.image(self.folder, self.frames[t], self.cameras[c])
+        frame, number = self.frames[t], self.cameras[c]
+
+        def read() -> Tensor:
+            path = self.capture.image(self.folder, frame, number)
+            return images.read_image(path, (camera.width, camera.height))
+
         try:
-            rgba = images.read_image(path, (camera.width, camera.height))
+            rgba = self.folder.patiently(read, warn_once)
         except DataError as error:
-            raise DataError(f"{error}; delete the folder {path.parent} to render the frame again") from error
+            raise DataError(
+                f"{error}; delete the folder {self.folder.at(self.capture.name(frame)).address} to render the frame again"
+            ) from error
         self._kept[index] = rgba = rgba.half()
         while len(self._kept) > 1 and len(self._kept) * rgba.numel() * 2 > self.memory:
             self._kept.popitem(last=False)
@@ -82,7 +91,7 @@ class Recording:
 
     Attributes:
         name: of the data set.
-        folder: of the rendered images.
+        folder: of the rendered images, a folder or a place in an object store.
         exposure: the brightest value that any camera sees.
         weights: per frame, its share of the sequence's extinction.
         every: every n-th frame is learned from.
@@ -91,7 +100,7 @@ class Recording:
 
     name: str
     capture: Capture
-    folder: Path
+    folder: Store
     exposure: float
     weights: Sequence[float]
     every: int
@@ -112,7 +121,7 @@ class Recording:
         for t, wanted in enumerate(per_frame):
             if not wanted:
                 continue
-            stored = _stored(self.capture.points(self.folder, self.capture.frames[t]))
+            stored = _stored(self.capture.points(self.folder, self.capture.frames[t]), "means", "colors")
             points = torch.from_numpy(stored["means"])
             rows = torch.randperm(len(points), generator=generator)[torch.arange(wanted) % len(points)]
             place = points[rows]
@@ -139,24 +148,32 @@ class Recording:
 
 
 def volume_dataset(
-    name: str, source: DataSource, capture: Capture, folder: Path, held_out: Sequence[int], up: Tensor, every: int = 1
+    name: str,
+    source: DataSource,
+    capture: Capture,
+    folder: Store,
+    held_out: Sequence[int],
+    up: Tensor,
+    every: int = 1,
+    memory: float = MEMORY,
 ) -> Dataset:
     """A volume sequence seen by cameras; colours are linear radiance over the exposure, the brightest value any camera sees.
 
     Args:
         folder: of the images that the capture took.
         held_out: indices of the cameras of the test split.
+        memory: bytes of decoded images and voxels that are kept.
 
     Raises:
         DataError: every frame is black, or a file is damaged.
     """
-    stored = [_stored(capture.points(folder, frame)) for frame in capture.frames]
+    stored = [_stored(capture.points(folder, frame), "weight", "brightest") for frame in capture.frames]
     exposure = max(float(s["brightest"]) for s in stored)
     if not exposure > 0:
         raise DataError(f"{name}: every frame is black from every camera; expected light (check scene.look and scene.grids)")
     learned = [c for c in range(len(capture.cameras)) if c not in held_out]
-    train = FrameViews(capture, folder, learned, exposure, every)
-    test = FrameViews(capture, folder, held_out, exposure, memory=MEMORY_TEST)
+    train = FrameViews(capture, folder, learned, exposure, every, memory * _TRAIN)
+    test = FrameViews(capture, folder, held_out, exposure, memory=memory * _TEST)
     weights = [float(s["weight"]) for s in stored]
     recording = Recording(name, capture, folder, exposure, weights, every, test)
     camera = capture.cameras[0]
@@ -176,14 +193,22 @@ def volume_dataset(
         bounds=torch.from_numpy(capture.bounds),
         exposure=exposure,
         placement=placement_of(capture),
-        points=FrameVoxels(capture, folder, train.frames, train.times, weights[::every], exposure),
+        points=FrameVoxels(capture, folder, train.frames, train.times, weights[::every], exposure, memory * _VOXELS),
         extra=recording,
     )
 
 
-def _stored(path: Path) -> dict[str, Any]:
+_POINTS = {
+    "means": (np.float32, (None, 3)),
+    "colors": (np.float32, (None, 3)),
+    "weight": (np.float64, ()),
+    "brightest": (np.float32, ()),
+}
+
+
+def _stored(path: Path, *names: str) -> dict[str, Any]:
+    """What is asked for of a frame's points; of all frames together they would be large."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in ("means", "colors", "weight", "brightest")}
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-        raise DataError(f"{path}: damaged ({error}); delete its folder to render the frame again") from error
+        return read_arrays(path, {name: _POINTS[name] for name in names})
+    except DataError as error:
+        raise DataError(f"{error}; delete its folder to render the frame again") from error

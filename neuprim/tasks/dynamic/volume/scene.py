@@ -14,6 +14,8 @@ import torch
 from neuprim.core.checked import checked
 from neuprim.core.data import Dataset, DataSource
 from neuprim.core.errors import DataError
+from neuprim.core.io.object_store import store_at
+from neuprim.core.io.store import LocalStore
 from neuprim.core.io.vdb import VdbFrame, sequence
 from neuprim.core.task import SceneContext
 from neuprim.tasks.dynamic.simulation import simulate
@@ -23,11 +25,12 @@ from neuprim.tasks.dynamic.volume.grids import GridReader, find_grids
 from neuprim.tasks.dynamic.volume.looks import changed, named_look
 from neuprim.tasks.dynamic.volume.normalise import Normalisation
 from neuprim.tasks.dynamic.volume.optics import Look
+from neuprim.tasks.dynamic.volume.rendered import RenderedFrames
 from neuprim.tasks.dynamic.volume.rig import AXES, rig
 from neuprim.tasks.dynamic.volume.settings import VolumeSettings, choose_frames
 from neuprim.tasks.dynamic.volume.source import CaptureSource
 
-__all__ = ["load", "load_volume"]
+__all__ = ["load", "load_truth", "load_volume"]
 
 Progress = Callable[[str, float], None]
 
@@ -40,9 +43,24 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         DataError: files that are missing, damaged, or without a usable grid; a cache that cannot be written.
     """
     asked, name, source, capture, held_out = _prepare(settings, context)
-    rendered = capture.take(context.cache_dir, context.progress)
+    rendered = _rendered(asked, capture, context).take(context.progress)
     up = torch.tensor(AXES[asked.up], dtype=torch.float64)
-    return volume_dataset(name, source, capture, rendered, held_out, up, asked.train_every)
+    return volume_dataset(name, source, capture, rendered, held_out, up, asked.train_every, asked.memory * 2.0**20)
+
+
+def load_truth(settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None) -> RenderedFrames:
+    """The same scene's images as work to be done; raises as :func:`load`.
+
+    Args:
+        known: of the same scene's ground truth in another process, which has surveyed the files.
+    """
+    asked, _, _, capture, _ = _prepare(settings, context, known)
+    return _rendered(asked, capture, context)
+
+
+def _rendered(asked: VolumeSettings, capture: Capture, context: SceneContext) -> RenderedFrames:
+    store = LocalStore(context.cache_dir) if asked.cache is None else store_at(asked.cache, context.cache_dir / "copies")
+    return RenderedFrames(capture, store)
 
 
 def load_volume(settings: Mapping[str, Any], context: SceneContext) -> CaptureSource:
@@ -50,7 +68,9 @@ def load_volume(settings: Mapping[str, Any], context: SceneContext) -> CaptureSo
     return CaptureSource(_prepare(settings, context)[3])
 
 
-def _prepare(settings: Mapping[str, Any], context: SceneContext) -> tuple[VolumeSettings, str, DataSource, Capture, range]:
+def _prepare(
+    settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None
+) -> tuple[VolumeSettings, str, DataSource, Capture, range]:
     """All that is known before anything is rendered: settings, name, origin, what to render, and the cameras held out."""
     asked = checked(VolumeSettings, settings, "scene")
     _look(asked, AUTO[0])  # a typing error shows before anything is simulated
@@ -59,13 +79,17 @@ def _prepare(settings: Mapping[str, Any], context: SceneContext) -> tuple[Volume
     reader = find_grids(frames, {str(meaning): name for meaning, name in asked.grids.items()})
     look = _look(asked, AUTO["density" not in reader.names])
     reader = reader.absorbing(look.extinction_grids, folder)
-    box, hottest = _survey(frames, reader, context.progress)
-    if "flame_range" not in asked.optics and source == "real":
-        look = dataclasses.replace(look, flame_range=(0.0, hottest)) if hottest > 0 else look
-    normalisation = Normalisation.from_bounds(box)
+    if known is None:
+        box, hottest = _survey(frames, reader, context.progress)
+        if "flame_range" not in asked.optics and source == "real":
+            look = dataclasses.replace(look, flame_range=(0.0, hottest)) if hottest > 0 else look
+        normalisation = Normalisation.from_bounds(box)
+        bounds = normalisation.to_scene(box)
+    else:
+        look = dataclasses.replace(look, flame_range=tuple(known["flame_range"]))
+        normalisation, bounds = Normalisation.from_json(known["normalisation"]), np.array(known["bounds"])
     train, test = rig(asked.size, asked.cameras, up=asked.up, field_of_view=asked.field_of_view)
-    box = normalisation.to_scene(box)
-    capture = Capture(frames, reader, look, [*train, *test], asked.samples, normalisation, box, context.device)
+    capture = Capture(frames, reader, look, [*train, *test], asked.samples, normalisation, bounds, context.device)
     return asked, name, source, capture, range(len(train), len(train) + len(test))
 
 

@@ -52,6 +52,8 @@ class VolumeSettings:
         samples: rays per pixel side.
         train_every: learn from every n-th frame only; the test views keep all.
         up: "y" or "z", the upward axis of the files.
+        cache: folder or URL where the ground truth is kept; None: the cache of this machine's user.
+        memory: MiB of decoded images and voxels that stay in memory, however long the sequence is; beyond them they are read again when needed.
     """
 
     vdb: Annotated[Path, text("a folder of .vdb files")] | None = None
@@ -68,6 +70,8 @@ class VolumeSettings:
     samples: Annotated[int, Range(1, 16)] = 2
     train_every: Annotated[int, Range(1, 1000)] = 1
     up: Axis = "z"
+    cache: Annotated[str, text("a folder, or a URL as s3://BUCKET/FOLDER")] | None = None
+    memory: Annotated[int, Range(1, 2**20)] = 1408
 
     def __post_init__(self) -> None:
         verify(self, "scene")

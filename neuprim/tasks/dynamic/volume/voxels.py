@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -15,15 +14,14 @@ from torch import Tensor
 
 from neuprim.core.data.points import PointSamples, PointSupervision
 from neuprim.core.errors import DataError
-from neuprim.core.io.files import atomic_path
+from neuprim.core.io.npz import read_arrays
+from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
+from neuprim.core.notices import warn_once
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.medium import Medium
 
-__all__ = ["MEMORY", "FrameVoxels", "Voxels"]
-
-MEMORY = 2**29
-"""Bytes of voxels that are kept, 512 MiB; beyond them those of the oldest frame are read again when needed."""
+__all__ = ["FrameVoxels", "Voxels"]
 
 _NEAR, _FAR = 0.2, 0.1
 """Shares of the points that are drawn around voxels with matter, and anywhere in the box."""
@@ -36,6 +34,17 @@ _AROUND = 6
 
 _MARGIN = 0.1
 """How much larger than the sequence's box the one is that points are drawn in, on each side, in its longest sides."""
+
+
+_ARRAYS = {
+    "index": (np.int64, (None,)),
+    "values": (np.float32, (None, 4)),
+    "shape": (np.int64, (3,)),
+    "scene_from_index": (np.float64, (4, 4)),
+}
+
+_MOST = 4 * 2**30
+"""Bytes of a frame's voxels: more than the largest grid that is read has."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +82,28 @@ class Voxels:
     def bytes(self) -> int:
         return self.index.nbytes + self.values.nbytes
 
+    def write(self, path: Path) -> None:
+        """As a file of arrays. Raises OSError."""
+        with open(path, "wb") as file:
+            np.savez(file, index=self.index, values=self.values, shape=np.array(self.shape), scene_from_index=self.scene_from_index)
+
+    @staticmethod
+    def read(path: Path) -> Voxels:
+        """What :meth:`write` wrote.
+
+        Raises:
+            DataError: damaged, or voxels that are not those of any grid.
+        """
+        found = read_arrays(path, _ARRAYS)
+        index, values, matrix = found["index"], found["values"], found["scene_from_index"]
+        x, y, z = (int(n) for n in found["shape"])
+        inside = min(x, y, z) >= 0 and (not len(index) or (index[0] >= 0 and index[-1] < x * y * z and bool((np.diff(index) > 0).all())))
+        if len(index) != len(values) or not inside or not np.isfinite(values).all() or not np.isfinite(matrix).all():
+            raise DataError(
+                f"{path}: damaged ({len(index)} voxels of a grid of {x}x{y}x{z}; expected ascending places in it, and finite values)"
+            )
+        return Voxels(index, values, (x, y, z), matrix)
+
     def at(self, cells: np.ndarray) -> np.ndarray:
         """(M, 4) values at (M, 3) integer indices; 0 outside."""
         found = np.zeros((len(cells), 4), np.float32)
@@ -95,17 +126,18 @@ class FrameVoxels(PointSupervision):
         folder: of the capture's images; a frame's voxels are kept beside them once they were read, as the light in them may take long.
         frames, times, weights: those to learn from, and each one's extinction.
         exposure: what radiance is divided by.
+        memory: bytes of voxels that are kept; beyond them those of the oldest frame are read again when needed.
     """
 
     def __init__(
         self,
         capture: Capture,
-        folder: Path,
+        folder: Store,
         frames: Sequence[VdbFrame],
         times: Sequence[Tensor],
         weights: Sequence[float],
         exposure: float,
-        memory: int = MEMORY,
+        memory: float,
     ) -> None:
         self.capture, self.folder, self.frames, self.times = capture, folder, list(frames), list(times)
         self.exposure, self.memory = exposure, memory
@@ -155,18 +187,19 @@ class FrameVoxels(PointSupervision):
         return found
 
     def _read(self, frame: VdbFrame) -> Voxels:
-        path = self.capture.points(self.folder, frame).with_name("voxels.npz")
+        return self.folder.patiently(lambda: self._read_or_make(frame), warn_once)
+
+    def _read_or_make(self, frame: VdbFrame) -> Voxels:
+        name = f"{self.capture.name(frame)}/voxels.npz"
+        path = self.folder.fetch(name, _MOST)
         if not path.is_file():
             made = Voxels.of(self.capture.medium(frame))
             try:
-                with atomic_path(path) as draft, open(draft, "wb") as file:
-                    np.savez(file, index=made.index, values=made.values, shape=np.array(made.shape), scene_from_index=made.scene_from_index)
+                self.folder.put(name, made.write)
             except OSError as error:
                 raise DataError(f"cannot write the voxels of {frame.path} to {path}: {error}") from error
             return made
         try:
-            with np.load(path, allow_pickle=False) as file:
-                x, y, z = (int(n) for n in file["shape"])
-                return Voxels(file["index"], file["values"], (x, y, z), file["scene_from_index"])
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-            raise DataError(f"{path}: damaged ({error}); delete it to read the frame again") from error
+            return Voxels.read(path)
+        except DataError as error:
+            raise DataError(f"{error}; delete it to read the frame again") from error

@@ -1,0 +1,46 @@
+"""``neuprim truth``: the ground truth of a scene before runs need it."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+
+from neuprim.core.errors import ConfigError
+
+__all__ = ["TRUTH_HELP", "for_truth", "truth"]
+
+TRUTH_HELP = """Frames that are there are not made again; a run with the same scene reads them. With a launcher they are made side by side:
+  neuprim truth task=dynamic scene=vdb scene.vdb=DIR launcher=processes
+  neuprim truth task=dynamic scene=vdb scene.vdb=DIR scene.cache=DIR launcher=slurm
+Prints where they are."""
+
+
+def for_truth(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of ``neuprim truth``."""
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings of the scene and of the launcher, as of neuprim run")
+    parser.add_argument("-m", "--multirun", action="store_true", help="of every combination of values separated by commas")
+
+
+def truth(args: argparse.Namespace) -> int:
+    """Render what is missing; the exit status."""
+    from neuprim.cli.console import plain_console
+    from neuprim.cli.progress import RunProgress
+    from neuprim.config import compose, compose_all
+    from neuprim.config.launcher import launcher_words
+    from neuprim.runs.ground_truth import make_truth
+
+    launcher, rest = launcher_words(args.overrides)
+    configs = compose_all(rest) if args.multirun else [compose(rest)]
+    try:
+        for config in configs:
+            with RunProgress(plain_console(stderr=True), f"{config.task}/{config.scene_name}") as events:
+                made = make_truth(config, launcher, events)
+            if made is None:
+                raise ConfigError(
+                    f"scene={config.scene_name}: its images are not rendered frame by frame; expected a scene of volumes, as task=dynamic scene=vdb"
+                )
+            print(made.place, flush=True)
+    except KeyboardInterrupt:
+        command = shlex.join(["neuprim", "truth", *(["-m"] if args.multirun else []), *args.overrides])
+        raise KeyboardInterrupt(f"; frames made so far are kept; to go on:\n  {command}") from None
+    return 0

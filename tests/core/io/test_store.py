@@ -1,0 +1,193 @@
+"""Folders and object stores as places of files: whole or not at all, found again, and never larger than what belongs there."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
+from neuprim.core.io import store as stores
+from neuprim.core.io.npz import read_arrays
+from neuprim.core.io.object_store import ObjectStore, store_at
+from neuprim.core.io.store import LocalStore, Store
+
+Make = Callable[[], Store]
+
+
+@pytest.fixture(params=["folder", "file://", "memory://"])
+def make(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Make]:
+    """The same place, as another process would open it."""
+    address = {"folder": str(tmp_path / "s"), "file://": f"file://{tmp_path}/s", "memory://": "memory://neuprim-tests/s"}[request.param]
+    copies = iter(range(100))
+    yield lambda: store_at(address, tmp_path / f"copies-{next(copies)}").at("volumes", "key")
+    if request.param == "memory://":
+        import fsspec
+
+        fsspec.filesystem("memory").rm("/neuprim-tests", recursive=True)
+
+
+def two(folder: Path) -> None:
+    (folder / "a").write_text("first")
+    (folder / "last").write_text("second")
+
+
+def test_a_folder_is_there_when_its_last_file_is(make: Make) -> None:
+    store = make()
+    store.begin()
+    assert store.whole("last") == set() and not store.has("x/last")
+    store.publish("x", two, "last")
+    other = make()
+    assert other.whole("last") == {"x"} and other.has("x/a")
+    assert other.fetch("x/a", 100).read_text() == "first" and not other.fetch("x/none", 100).exists()
+    store.publish("x", two, "last")
+    store.put("note", lambda path: path.write_text("n") and None)
+    assert make().fetch("note", 1).read_text() == "n" and other.whole("last") == {"x"}
+
+
+def test_what_fails_half_way_leaves_nothing(make: Make) -> None:
+    store = make()
+    store.begin()
+
+    def fails(folder: Path) -> None:
+        (folder / "last").write_text("half")
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left"):
+        store.publish("x", fails, "last")
+    assert make().whole("last") == set()
+    if isinstance(store, LocalStore):
+        assert list(store.path.iterdir()) == []
+
+
+def test_a_file_larger_than_what_belongs_there_is_not_read(make: Make) -> None:
+    store = make()
+    store.begin()
+    store.put("big", lambda path: path.write_bytes(bytes(1000)) and None)
+    with pytest.raises(DataError, match=r"big: 1,000 bytes; expected at most 999$"):
+        make().fetch("big", 999)
+
+
+def test_a_folder_without_its_last_file_is_made_anew(tmp_path: Path) -> None:
+    store = LocalStore(tmp_path)
+    (tmp_path / "x").mkdir()
+    (tmp_path / "x" / "rest").touch()
+    (tmp_path / ".x-killed").mkdir()
+    assert store.whole("last") == set()
+    store.publish("x", two, "last")
+    assert sorted(f.name for f in tmp_path.rglob("*")) == ["a", "last", "x"]
+
+
+def test_errors_of_a_client_are_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = store_at("memory://neuprim-tests/x", tmp_path)
+    assert isinstance(store, ObjectStore)
+
+    class Broken:
+        def __getattr__(self, name: str) -> Any:
+            raise RuntimeError("no\ncredentials")
+
+    monkeypatch.setattr(store, "_system", Broken())
+    for call in (lambda: store.whole("a"), lambda: store.has("a"), lambda: store.fetch("a", 1)):
+        with pytest.raises(DataError, match=r"^memory://neuprim-tests/x: cannot be read \(no credentials\)$"):
+            call()
+    with pytest.raises(DataError, match=r"cannot be written \(no credentials\)"):
+        store.publish("x", two, "last")
+
+
+def test_no_bucket_is_made(tmp_path: Path) -> None:
+    """A typing error would make one."""
+    ObjectStore("s3://bukcet/x", None, "bukcet/x", tmp_path).begin()
+    with pytest.raises(DataError, match="cannot be written"):
+        ObjectStore("sftp://host/x", None, "x", tmp_path).begin()
+
+
+def test_addresses_that_nothing_can_be_made_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError, match=r"^nonsense://x: Protocol not known.*expected a folder or a URL that fsspec knows"):
+        store_at("nonsense://x", tmp_path)
+    monkeypatch.setitem(sys.modules, "s3fs", None)
+    with pytest.raises(BackendUnavailable, match=r"^s3://bucket: s3:// needs a package .*: pip install 'neuprim\[s3\]'$"):
+        store_at("s3://bucket", tmp_path)
+
+
+def test_a_moments_absence_is_survived_and_other_errors_are_not_tried_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stores, "EVERY", 0.01)
+    store, calls = LocalStore(tmp_path / "s"), []
+    store.begin()
+
+    def away() -> str:
+        calls.append("away")
+        if len(calls) == 1:
+            raise FileNotFoundError(2, "No such file or directory", str(store.path / "f"))
+        if len(calls) == 2:
+            (tmp_path / "s").rename(tmp_path / "t")
+            threading.Timer(0.1, (tmp_path / "t").rename, (tmp_path / "s",)).start()
+            raise DataError(f"{store.path}: cannot be written")
+        return "done"
+
+    said: list[str] = []
+    assert store.patiently(away, said.append) == "done" and len(calls) == 3
+    assert said == [f"waiting for {store.path}, which is gone"]
+
+    def full() -> None:
+        calls.append("full")
+        raise OSError(28, "No space left on device", str(store.path / "f"))
+
+    with pytest.raises(OSError, match="No space left"):
+        store.patiently(full, said.append)
+    assert calls.count("full") == 1
+
+
+# ---------------------------------------------------------------- arrays
+
+WANTED = {"a": (np.float32, (None, 3)), "b": (np.float64, ())}
+
+
+def test_arrays_are_read_back(tmp_path: Path) -> None:
+    a = np.arange(6, dtype=np.float32).reshape(2, 3)
+    np.savez(tmp_path / "f.npz", a=a, b=np.float64(2), more=np.array(["text"]))
+    found = read_arrays(tmp_path / "f.npz", WANTED)
+    assert found.keys() == {"a", "b"} and np.array_equal(found["a"], a) and float(found["b"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"a": np.zeros((2, 3), np.float32)}, r"no array 'b'"),
+        ({"a": np.zeros((2, 3)), "b": np.float64(1)}, r"a is float64 of shape \(2, 3\); expected float32 of \(N, 3\)"),
+        ({"a": np.zeros((2, 4), np.float32), "b": np.float64(1)}, r"a is float32 of shape \(2, 4\)"),
+        ({"a": np.array([[{}] * 3]), "b": np.float64(1)}, r"a is object"),
+    ],
+)
+def test_arrays_of_another_form_are_refused(tmp_path: Path, arrays: dict[str, Any], message: str) -> None:
+    np.savez(tmp_path / "f.npz", **arrays)
+    with pytest.raises(DataError, match=rf"f\.npz: damaged \({message}"):
+        read_arrays(tmp_path / "f.npz", WANTED)
+
+
+def test_a_header_that_claims_more_than_there_is(tmp_path: Path) -> None:
+    file = tmp_path / "f.npz"
+    np.savez(file, a=np.zeros((2, 3), np.float32), b=np.float64(1))
+    data = file.read_bytes()
+    assert data.count(b"(2, 3), }                       ") == 1
+    import zipfile
+
+    with zipfile.ZipFile(file) as archive:
+        array = archive.read("a.npy").replace(b"(2, 3), }           ", b"(9000000000, 3), }  ")
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("a.npy", array)
+    with pytest.raises(DataError, match=r"a claims shape \(9000000000, 3\), and has \d+ bytes"):
+        read_arrays(file, {"a": WANTED["a"]})
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.npy", array + bytes(10**7))
+    with pytest.raises(DataError, match=r"a claims 10,?\d+ bytes of a file of"):
+        read_arrays(file, {"a": WANTED["a"]})
+    file.write_bytes(data[:100])
+    with pytest.raises(DataError, match=r"f\.npz: damaged"):
+        read_arrays(file, WANTED)
+    with pytest.raises(DataError, match=r"none\.npz: damaged \(.*No such file"):
+        read_arrays(tmp_path / "none.npz", WANTED)

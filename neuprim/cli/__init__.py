@@ -229,7 +229,7 @@ def _run(args: argparse.Namespace) -> int:
         return launch_one(configs[0], launcher, typed)
     from neuprim.cli.one_run import one_run
 
-    print(one_run(configs[0], typed, launcher, viewer))
+    print(one_run(configs[0], typed, viewer, launcher))
     return 0
 
 

@@ -16,7 +16,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import Loss, TaskSpec
 from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.blame import Suspects, blamed
-from neuprim.runs.chunks.plan import FOLDER, Plan, chunks_of, plan_of
+from neuprim.runs.chunks.plan import Plan, chunks_of, plan_of
 from neuprim.runs.chunks.record import ChunkRecord, recorded
 from neuprim.runs.events import Events, Note, Preparing, silent
 from neuprim.runs.finetune import fine_tuner, steps_in

@@ -7,6 +7,7 @@ has it whose own it is. Times, box, cameras and exposure are those of the whole 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -75,7 +76,7 @@ def planned(capture: Capture, every: int, count: int, weight: Callable[[VdbFrame
     begins = [number * len(frames) // count for number in range(count + 1)]
     times = [float(torch.tensor(capture.time(frame))) for frame in frames]  # as views have them, so that no share is nearly 0 or 1
     seams = tuple((times[begin - 1], times[begin]) for begin in begins[1:-1])
-    seen = [frames[max(begin - _BEYOND, 0) : end + _BEYOND] for begin, end in zip(begins, begins[1:], strict=False)]
+    seen = [frames[max(begin - _BEYOND, 0) : end + _BEYOND] for begin, end in itertools.pairwise(begins)]
     weights = [sum(map(weight, own)) for own in seen]
     lit = [number for number in range(count) if weights[number] > 0]  # in a chunk without any matter there is nothing to fit
     if not lit:

@@ -14,13 +14,16 @@ from neuprim.core.io.files import cache_directory
 from neuprim.core.task import Chunks, SceneContext
 from neuprim.plugins.blame import blamed
 from neuprim.runs.events import Events, Preparing
-from neuprim.runs.finetune import BEGIN
 from neuprim.runs.open import LOGS
 
-__all__ = ["FOLDER", "Plan", "chunks_of", "plan_of"]
+__all__ = ["FOLDER", "TOGETHER", "Plan", "chunks_of", "plan_of"]
 
 FOLDER = "chunks"
 """Of a run directory: the runs of its chunks."""
+
+TOGETHER = 0.1
+"""Share of the budget in which the joined model is trained as one: what lies on both sides of a seam gets used to each other, and numbers settle.
+More of it is a loss, as chunks are what learns (docs/dynamic.md)."""
 
 _FEWEST = 8
 """Primitives of a chunk, at least: their sizes follow from the distances between them."""
@@ -81,12 +84,12 @@ def plan_of(config: RunConfig, chunks: Chunks) -> Plan:
     primitives = _shared(config.model.primitives - least, [part.primitives for part in chunks.parts])
     configs = []
     for part, own in zip(chunks.parts, primitives, strict=True):
-        share = BEGIN * part.steps
+        share = (1 - TOGETHER) * part.steps
         settings = {**part.settings, "model.primitives": own + _FEWEST, **_schedule(config, share)}
         configs.append(_changed(config, settings, config.output_dir / FOLDER / part.name))
     train = config.train
-    steps = None if train.iterations is None else round((1 - BEGIN) * train.iterations)
-    return Plan(chunks, tuple(configs), steps, None if train.max_seconds is None else (1 - BEGIN) * train.max_seconds)
+    steps = None if train.iterations is None else round(TOGETHER * train.iterations)
+    return Plan(chunks, tuple(configs), steps, None if train.max_seconds is None else TOGETHER * train.max_seconds)
 
 
 def _schedule(config: RunConfig, share: float) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import Loss, TaskSpec
 from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.blame import Suspects, blamed
-from neuprim.runs.chunks.plan import Plan, chunks_of, plan_of
+from neuprim.runs.chunks.plan import TOGETHER, Plan, chunks_of, plan_of
 from neuprim.runs.chunks.record import ChunkRecord, recorded
 from neuprim.runs.events import Events, Note, Preparing, silent
 from neuprim.runs.finetune import fine_tuner, steps_in
@@ -72,7 +72,7 @@ def train_in_chunks(
             assert plan.seconds is not None, "a budget is in steps, in seconds or both"
             steps = min(steps_in(plan.seconds, config, task, dataset, model), plan.steps or 2**62)
             replace(record, joined_steps=steps).write(config.output_dir)
-        trainer = fine_tuner(config, task, dataset, model, max(steps, 1))
+        trainer = fine_tuner(config, task, dataset, model, max(steps, 1), 1 - TOGETHER)
         trainer.elapsed = sum(float(read_metrics(own.output_dir)["train_seconds"]) for own in plan.configs)
         return trainer
 

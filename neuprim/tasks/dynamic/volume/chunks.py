@@ -1,8 +1,7 @@
 """A long sequence in chunks of time: which frames each sees, what share of the work it gets, and how their models become one.
 
-Chunks share out the frames that are learned from, in order and evenly. Each also sees one more frame beyond its ends, so that across a seam two
-chunks know both frames, and between these one hands over to the other (:mod:`neuprim.tasks.dynamic.seams`): every frame is drawn as the chunk
-has it whose own it is. Times, box, cameras and exposure are those of the whole sequence, so that nothing has to be converted.
+Chunks share out the frames that are learned from, in order and evenly. Each also sees a few frames beyond its ends, so that across a seam two
+chunks know the same frames, and over these one hands over to the other (:mod:`neuprim.tasks.dynamic.seams`). Times, box, cameras and exposure are those of the whole sequence, so that nothing has to be converted.
 """
 
 from __future__ import annotations
@@ -33,8 +32,9 @@ FEWEST = 25
 _IN_TIME = {"window_center": 1, "velocity": -1, "acceleration": -2, "W_t": -1}
 """Parameters that are measured in the sequence's time, and the power of time in them."""
 
-_BEYOND = 1
-"""Frames beyond its ends that a chunk sees."""
+_BEYOND, _MOST_BEYOND = 10, 3
+"""A chunk sees beyond its ends one frame for so many of its own, one at least and so many at most: a hand-over of one step in time is sudden
+where little moves, and frames that two chunks learn cost both."""
 
 
 def number_of_chunks(asked: int | str | None, frames: int, images: int, memory: int) -> int:
@@ -75,8 +75,9 @@ def planned(capture: Capture, every: int, count: int, weight: Callable[[VdbFrame
     frames = capture.frames[::every]
     begins = [number * len(frames) // count for number in range(count + 1)]
     times = [float(torch.tensor(capture.time(frame))) for frame in frames]  # as views have them, so that no share is nearly 0 or 1
-    seams = tuple((times[begin - 1], times[begin]) for begin in begins[1:-1])
-    seen = [frames[max(begin - _BEYOND, 0) : end + _BEYOND] for begin, end in itertools.pairwise(begins)]
+    beyond = min(max(len(frames) // count // _BEYOND, 1), _MOST_BEYOND)
+    seams = tuple((times[begin - beyond], times[begin + beyond - 1]) for begin in begins[1:-1])
+    seen = [frames[max(begin - beyond, 0) : end + beyond] for begin, end in itertools.pairwise(begins)]
     weights = [sum(map(weight, own)) for own in seen]
     lit = [number for number in range(count) if weights[number] > 0]  # in a chunk without any matter there is nothing to fit
     if not lit:

@@ -21,7 +21,7 @@ __all__ = ["FOLDER", "TOGETHER", "Plan", "chunks_of", "plan_of"]
 FOLDER = "chunks"
 """Of a run directory: the runs of its chunks."""
 
-TOGETHER = 0.1
+TOGETHER = 0.2
 """Share of the budget in which the joined model is trained as one: what lies on both sides of a seam gets used to each other, and numbers settle.
 More of it is a loss, as chunks are what learns (docs/dynamic.md)."""
 

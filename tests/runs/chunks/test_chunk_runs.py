@@ -72,12 +72,12 @@ def test_one_model_of_two_chunks_with_the_whole_number_of_primitives(finished: P
     counts = [int((model.params["chunk"] == number).sum()) for number in range(2)]
     assert counts == [chunk.count for _, _, chunk, _ in own]
     assert header["iterations"] == STEPS
-    assert [chunk.train.iterations for chunk, *_ in own] == [45, 45] and [chunk.train.population.every for chunk, *_ in own] == [4, 4]
+    assert [chunk.train.iterations for chunk, *_ in own] == [40, 40] and [chunk.train.population.every for chunk, *_ in own] == [4, 4]
 
 
 def test_it_is_judged_on_all_frames_and_has_learned(finished: Path) -> None:
     metrics = read_metrics(finished)
-    assert len(metrics["per_frame"]) == 6 and metrics["psnr_mask"] > metrics["psnr_black_image_mask"] + 4
+    assert len(metrics["per_frame"]) == 6 and metrics["psnr_mask"] > metrics["psnr_black_image_mask"] + 2
     assert len(read_metrics(finished / "chunks" / NAMES[0])["per_frame"]) == 4
     assert metrics["train_seconds"] > sum(read_metrics(finished / "chunks" / name)["train_seconds"] for name in NAMES)
     assert (finished / "report.html").is_file() and (finished / "renders" / "clip_cam_04.webp").is_file()
@@ -88,7 +88,7 @@ def test_progress_is_that_of_all_chunks_and_then_of_the_joined_model(finished: P
     assert said[0].text == "fitting 2 chunks (1 at work, 1 waiting)" and said[-1].text == "fitting 2 chunks (2 done)"
     assert [event.fraction for event in said] == sorted(event.fraction for event in said) and said[-1].fraction == 1.0
     steps = [event.report.step for event in told if isinstance(event, Step)]
-    assert steps == list(range(91, 101))
+    assert steps == list(range(81, 101))
 
 
 def test_a_chunk_is_a_run_that_can_be_made_by_hand(finished: Path, tmp_path: Path) -> None:
@@ -174,7 +174,7 @@ def test_a_killed_chunk_is_made_anew_by_the_command_that_goes_on(
 
 def test_other_chunks_than_it_was_begun_with_are_refused(finished: Path, files: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "copy")
-    with pytest.raises(ConfigError, match=r"chunks.json: begun with frames_1-4 \(\d+ primitives, 45 steps\), .* expected the same words"):
+    with pytest.raises(ConfigError, match=r"chunks.json: begun with frames_1-4 \(\d+ primitives, 40 steps\), .* expected the same words"):
         run(compose(words(files, tmp_path / "copy", "scene.chunks=3", "resume=true")))
     (tmp_path / "copy" / "chunks.json").write_text("{}")
     with pytest.raises(DataError, match=r"chunks.json: not the record of a run in chunks"):
@@ -184,8 +184,8 @@ def test_other_chunks_than_it_was_begun_with_are_refused(finished: Path, files: 
 def test_a_budget_in_seconds_is_shared_out_and_the_joined_steps_are_kept(files: Path, tmp_path: Path) -> None:
     out = run(compose(words(files, tmp_path / "run", "train.iterations=null", "train.max_seconds=0.5")))
     record = json.loads((out / "chunks.json").read_text())
-    assert [row["max_seconds"] for row in record["chunks"]] == [0.225, 0.225] and record["joined_steps"] >= 1
-    assert read_metrics(out)["iterations"] == round(record["joined_steps"] / 0.1)
+    assert [row["max_seconds"] for row in record["chunks"]] == [0.2, 0.2] and record["joined_steps"] >= 1
+    assert read_metrics(out)["iterations"] == round(record["joined_steps"] / 0.2)
 
 
 # ---------------------------------------------------------------- when it is not

@@ -29,7 +29,15 @@ _WARM, _PACED = 5, 20
 """Steps before the pace is taken, and those that it is taken of."""
 
 
-def fine_tuner(config: RunConfig, task: TaskSpec, dataset: Dataset, model: Primitives, steps: int, begin: float = BEGIN) -> Trainer:
+def fine_tuner(
+    config: RunConfig,
+    task: TaskSpec,
+    dataset: Dataset,
+    model: Primitives,
+    steps: int,
+    begin: float = BEGIN,
+    voxels_every: int = VOXELS_EVERY,
+) -> Trainer:
     """A trainer of a copy of a finished run's model that is ``steps`` steps before the end of its budget.
 
     Schedules are those of a run from the progress ``begin`` on, but for the rates (:data:`START`, :data:`COOL`); nothing is born, moves or is removed, and
@@ -49,7 +57,7 @@ def fine_tuner(config: RunConfig, task: TaskSpec, dataset: Dataset, model: Primi
         max_seconds=None,
         coarse=1,
         warmup_steps=0,
-        voxels_every=min(usual.voxels_every, VOXELS_EVERY),
+        voxels_every=min(usual.voxels_every, voxels_every),
         population=replace(config.train.population, strategy="fixed", grow_from=1.0),
     )
     trainer = Trainer(copy, dataset, make_loss(config, task), settings, config.renderer, config.seed)

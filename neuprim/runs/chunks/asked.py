@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from neuprim.config import RunConfig
+from neuprim.config import RunConfig, scene_of, task_of
 from neuprim.core.errors import ConfigError
 
 __all__ = ["asked", "refuse_chunks"]
 
 
 def asked(config: RunConfig) -> bool:
-    """Whether a scene is to be fitted in chunks; only scenes that can be have the setting."""
-    return config.scene.get("chunks") not in (None, 1)
+    """Whether a scene that can be fitted in chunks is to be; of another one the setting means something else."""
+    return config.scene.get("chunks") not in (None, 1) and scene_of(config, task_of(config)).spec.chunks is not None
 
 
 def refuse_chunks(config: RunConfig, what: str) -> None:

@@ -64,8 +64,7 @@ def chunks_of(config: RunConfig, events: Events) -> Chunks | None:
         NeuprimError: what the scene refuses.
     """
     load = scene_of(config, task_of(config)).spec.chunks
-    if load is None:
-        raise ConfigError(f"scene.chunks={config.scene['chunks']}: scene {config.scene_name!r} cannot be fitted in chunks; expected null")
+    assert load is not None, "somebody asked for chunks"
     context = SceneContext(config.seed, cache_directory() / "scenes", lambda text, fraction: events(Preparing(text, fraction)))
     scene = suspects_of(config).scene
     with blamed(scene.origin, f"chunks of {scene.what}", config.output_dir / LOGS):

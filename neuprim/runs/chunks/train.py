@@ -72,7 +72,7 @@ def train_in_chunks(
             assert plan.seconds is not None, "a budget is in steps, in seconds or both"
             steps = min(steps_in(plan.seconds, config, task, dataset, model), plan.steps or 2**62)
             replace(record, joined_steps=steps).write(config.output_dir)
-        trainer = fine_tuner(config, task, dataset, model, max(steps, 1), 1 - TOGETHER)
+        trainer = fine_tuner(config, task, dataset, model, max(steps, 1), 1 - TOGETHER, config.train.voxels_every)
         trainer.elapsed = sum(float(read_metrics(own.output_dir)["train_seconds"]) for own in plan.configs)
         return trainer
 

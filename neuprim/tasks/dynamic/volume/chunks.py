@@ -32,7 +32,7 @@ FEWEST = 25
 _IN_TIME = {"window_center": 1, "velocity": -1, "acceleration": -2, "W_t": -1}
 """Parameters that are measured in the sequence's time, and the power of time in them."""
 
-_BEYOND, _MOST_BEYOND = 20, 3
+_BEYOND, _MOST_BEYOND = 8, 3
 """A chunk sees beyond its ends one frame for so many of its own, one at least and so many at most: a hand-over of one step in time is sudden
 where little moves, and frames that two chunks learn cost both."""
 

@@ -94,6 +94,8 @@ def word(key: str, value: Any) -> str:
     """``key=value`` as the grammar of words reads it back."""
     if isinstance(value, str):
         return assigned(key, value)
+    if value is None:
+        return f"{key}=null"
     return f"{key}={str(value).lower() if isinstance(value, bool) else repr(value)}"
 
 

@@ -18,7 +18,7 @@ from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField, 
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.source import VolumeSource
 
-__all__ = ["API_VERSION", "Illuminate", "Loss", "SceneContext", "SceneSpec", "Supervision", "TaskSpec"]
+__all__ = ["API_VERSION", "Chunk", "Chunks", "Illuminate", "Loss", "SceneContext", "SceneSpec", "Supervision", "TaskSpec"]
 
 API_VERSION = 1
 """Version of the interfaces in ``neuprim.core``; a plugin names the one it was written for."""
@@ -52,6 +52,35 @@ Illuminate = Callable[[Environment, int, Mapping[str, Any]], Illumination]
 
 
 @dataclass(frozen=True)
+class Chunk:
+    """A part of a scene that is fitted as a run of its own.
+
+    Attributes:
+        name: good as a folder's name.
+        settings: dotted key -> value of what its run has other than the whole's: ``{"scene.span": "0:20"}``.
+        primitives, steps: its shares of the whole's; those of all chunks add up to 1.
+    """
+
+    name: str
+    settings: Mapping[str, Any]
+    primitives: float
+    steps: float
+
+
+@dataclass(frozen=True)
+class Chunks:
+    """How a scene is fitted in chunks.
+
+    Attributes:
+        parts: two or more.
+        join: the models of all parts, in their order, on the processor -> one model of the whole scene.
+    """
+
+    parts: tuple[Chunk, ...]
+    join: Callable[[Sequence[Primitives]], Primitives]
+
+
+@dataclass(frozen=True)
 class SceneSpec:
     """One scene of a task.
 
@@ -62,6 +91,8 @@ class SceneSpec:
         volume: for scenes made of voxel files: (scene settings, context) -> these, without drawing anything.
         truth: for scenes whose images are rendered frame by frame: (scene settings, context, what another process knows of them or None) ->
             that work, which ``load`` does where nobody has done it before; see :class:`~neuprim.core.data.ground_truth.GroundTruth`.
+        chunks: for scenes that can be fitted in chunks, which their setting ``chunks`` asks for: (the run's configuration in the layout of the
+            command line's keys, context) -> how, or None where one run is better.
     """
 
     name: str
@@ -69,6 +100,7 @@ class SceneSpec:
     load: Callable[[Mapping[str, Any], SceneContext], Dataset]
     volume: Callable[[Mapping[str, Any], SceneContext], VolumeSource] | None = None
     truth: Callable[[Mapping[str, Any], SceneContext, Mapping[str, Any] | None], GroundTruth] | None = None
+    chunks: Callable[[Mapping[str, Any], SceneContext], Chunks | None] | None = None
 
 
 @dataclass(frozen=True)

@@ -29,17 +29,25 @@ _WARM, _PACED = 5, 20
 """Steps before the pace is taken, and those that it is taken of."""
 
 
-def fine_tuner(config: RunConfig, task: TaskSpec, dataset: Dataset, model: Primitives, steps: int) -> Trainer:
+def fine_tuner(
+    config: RunConfig,
+    task: TaskSpec,
+    dataset: Dataset,
+    model: Primitives,
+    steps: int,
+    begin: float = BEGIN,
+    voxels_every: int = VOXELS_EVERY,
+) -> Trainer:
     """A trainer of a copy of a finished run's model that is ``steps`` steps before the end of its budget.
 
-    Schedules are those of a run from :data:`BEGIN` on, but for the rates (:data:`START`, :data:`COOL`); nothing is born, moves or is removed, and
+    Schedules are those of a run from the progress ``begin`` on, but for the rates (:data:`START`, :data:`COOL`); nothing is born, moves or is removed, and
     views are as they are. Gains of photographs' exposures go on from the run's checkpoint, where there is one.
     """
     copy = Primitives(model.density, model.colour, {name: value.detach().clone() for name, value in model.params.items()})
-    whole = round(steps / (1 - BEGIN))
+    whole = round(steps / (1 - begin))
     usual = settings_for(config.train, task, copy)
-    final = COOL ** (1 / (1 - BEGIN))  # a rate's factor is final ** progress
-    scale = START * usual.final_rate / final**BEGIN
+    final = COOL ** (1 / (1 - begin))  # a rate's factor is final ** progress
+    scale = START * usual.final_rate / final**begin
     settings = replace(
         usual,
         iterations=whole,
@@ -49,7 +57,7 @@ def fine_tuner(config: RunConfig, task: TaskSpec, dataset: Dataset, model: Primi
         max_seconds=None,
         coarse=1,
         warmup_steps=0,
-        voxels_every=min(usual.voxels_every, VOXELS_EVERY),
+        voxels_every=min(usual.voxels_every, voxels_every),
         population=replace(config.train.population, strategy="fixed", grow_from=1.0),
     )
     trainer = Trainer(copy, dataset, make_loss(config, task), settings, config.renderer, config.seed)

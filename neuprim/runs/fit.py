@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -29,12 +29,17 @@ from neuprim.plugins.checked import check_fields, checked_loss
 from neuprim.plugins.judging import clips_of, facts_of
 from neuprim.plugins.mechanism import PluginError
 from neuprim.plugins.registry import load_loss
+from neuprim.runs.chunks.asked import refuse_chunks
 from neuprim.runs.curve import curve_psnr, next_evaluation
 from neuprim.runs.events import Evaluated, Events, Note, Preparing, Step, silent
 from neuprim.runs.measure import measure, summary
 from neuprim.runs.open import LOGS, load_dataset
 
-__all__ = ["Fitted", "complete", "fit", "make_loss", "make_trainer", "one_torch_thread", "start", "steps", "compile_kernels"]
+__all__ = ["Fitted", "Make", "complete", "fit", "make_loss", "make_trainer", "one_torch_thread", "start", "steps", "compile_kernels"]
+
+
+Make = Callable[[RunConfig, TaskSpec, Dataset, Loss], Trainer]
+"""(configuration, its task, its data, its loss) -> the trainer of a model that is there already."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +104,12 @@ def complete(fitted: Fitted, events: Events = silent) -> Fitted:
 
 
 def start(
-    config: RunConfig, events: Events = silent, dataset: Dataset | None = None, suspects: Suspects | None = None, hold_out: int = 0
+    config: RunConfig,
+    events: Events = silent,
+    dataset: Dataset | None = None,
+    suspects: Suspects | None = None,
+    hold_out: int = 0,
+    make: Make | None = None,
 ) -> Fitted:
     """Everything up to the first step. Raises as :func:`fit`.
 
@@ -107,7 +117,10 @@ def start(
         suspects: who is watched for crashes around this call; told whose code the data set is.
         hold_out: n > 1: every n-th training view takes the place of the test views; 0: the data are taken as they are. What a task knows of
             its test views, and checks here, is of those that the data set came with.
+        make: what makes the trainer; None: :func:`make_trainer`, of a fresh model.
     """
+    if make is None:
+        refuse_chunks(config, "this trains one model at once, and only a whole run can be fitted in chunks")
     backends.check_device(config.renderer)
     task = task_of(config)
     config = replace(config, made_by=made_now(config, task))
@@ -125,6 +138,8 @@ def start(
         events(Note(f"shown: {channels.shown}; task {task.name!r} has no display that shows them all"))
     if hold_out:
         dataset = held_out(dataset, hold_out)
+    if make is not None:
+        return Fitted(config, task, dataset, channels, make(config, task, dataset, loss), lpips)
     events(Preparing("starting points"))
     trainer = make_trainer(config, task, dataset, loss)
     asked, found = config.model.primitives, trainer.model.count

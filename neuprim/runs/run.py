@@ -6,7 +6,10 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from neuprim.config import RunConfig, suspects_of
+from neuprim.config.launcher import LauncherSettings
 from neuprim.core.train.ranks import ALONE, Alone
+from neuprim.runs.chunks.asked import asked, refuse_chunks
+from neuprim.runs.chunks.train import train_in_chunks
 from neuprim.runs.events import Events, Finishing, silent
 from neuprim.runs.finish import finish
 from neuprim.runs.lock import held
@@ -17,7 +20,13 @@ from neuprim.runs.training import Between, alone, train
 __all__ = ["run"]
 
 
-def run(config: RunConfig, events: Events = silent, between: Between = alone, ranks: Alone = ALONE) -> Path:
+def run(
+    config: RunConfig,
+    events: Events = silent,
+    between: Between = alone,
+    ranks: Alone = ALONE,
+    launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
+) -> Path:
     """Fit, measure and report; returns the run directory.
 
     Ctrl-C finishes the step, writes a checkpoint and a report, and raises KeyboardInterrupt; a second one stops at once.
@@ -26,6 +35,7 @@ def run(config: RunConfig, events: Events = silent, between: Between = alone, ra
         events: told what happens.
         between: called between training steps, see :data:`~neuprim.runs.training.Between`.
         ranks: the processes that train this model, each of which calls this with the same configuration; the first one alone writes files.
+        launcher: where the chunks of a scene are fitted, if it is fitted in chunks.
 
     Raises:
         NeuprimError: the input's fault, another process that is at work there, or numbers that left the finite; whatever was on disk before
@@ -33,9 +43,14 @@ def run(config: RunConfig, events: Events = silent, between: Between = alone, ra
         RankError: another rank is gone; what was trained is in the checkpoint.
     """
     directory = config.output_dir
+    if ranks.size > 1:
+        refuse_chunks(config, "several ranks train one model together")
     suspects = suspects_of(config)
     with held(directory) if ranks.first else nullcontext(), suspects.watch(directory / LOGS):
-        fitted, interrupted = train(config, suspects, events, between=between, ranks=ranks)
+        if asked(config):
+            fitted, interrupted = train_in_chunks(config, suspects, events, launcher, between)
+        else:
+            fitted, interrupted = train(config, suspects, events, between=between, ranks=ranks)
         if ranks.first:
             events(Finishing("measuring held-out views"))
             assemble(fitted, directory)

@@ -25,7 +25,7 @@ from neuprim.plugins.provenance import check_resumed
 from neuprim.runs.compile import compiled, compiling, mark_compiled, variant
 from neuprim.runs.curve import open_curve
 from neuprim.runs.events import Events, Note, Preparing, silent
-from neuprim.runs.fit import Fitted, compile_kernels, one_torch_thread, start, steps
+from neuprim.runs.fit import Fitted, Make, compile_kernels, one_torch_thread, start, steps
 from neuprim.runs.interrupt import interruptible
 from neuprim.runs.parts import in_parts, read_part, write_parts
 
@@ -50,6 +50,7 @@ def train(
     hold_out: int = 0,
     between: Between = alone,
     ranks: Alone = ALONE,
+    make: Make | None = None,
 ) -> tuple[Fitted, bool]:
     """Train until the budget is used or Ctrl-C, which finishes the step; leaves configuration, curve, checkpoint and model in the run's
     directory either way. Of several ranks the first one writes them.
@@ -59,6 +60,7 @@ def train(
         dataset: the scene of the configuration, if it is loaded already.
         hold_out: n > 1: every n-th training view is a test view, and no other is; see :func:`~neuprim.core.data.held_out.held_out`.
         between: called between steps, see :data:`Between`.
+        make: what makes the trainer of a model that is there already; None: a fresh model is trained.
 
     Returns:
         what was trained, and whether Ctrl-C ended it.
@@ -71,7 +73,7 @@ def train(
     ahead = compiled_ahead(config.renderer) if dataset is None else None  # beside loading; of data that are there nothing is waited for
     edge = config.model.density.get("edge", 0)  # of a density of ours; of another's, whatever the word means there
     with ranks.in_turn(), compiling(None if ahead is None else ahead.name, edge if edge in EDGES else 0) as kernels:
-        fitted = start(config, events, dataset, suspects, hold_out)
+        fitted = start(config, events, dataset, suspects, hold_out, make)
         begun = _begun(fitted.trainer) if ranks.parts else {}  # while the model is whole
         fitted.trainer.join(ranks)
         _resume(fitted, events)

@@ -87,6 +87,19 @@ def test_dynamic_models(time: str, colour: TimeHarmonics, chromium: Any, tmp_pat
         assert tab.faults == []
 
 
+@pytest.mark.parametrize("time", ["phase", "window+motion"])
+def test_models_joined_from_chunks(time: str, chromium: Any, tmp_path: Path) -> None:
+    """Before, in and after the seams."""
+    seams = ((0.25, 0.375), (0.625, 0.75))
+    model = random_model(TimeDensity(3, time, edge=2, gain=True, seams=seams), TimeHarmonics(0, powers=0, waves=0), count=90)
+    model.params["chunk"] = torch.arange(90.0)[:, None] % 3
+    page_of(model, tmp_path / "p.html", {"time": torch.tensor(0.3)})
+    with open_tab(chromium, tmp_path / "p.html") as tab:
+        for moment in (0.1, 0.3, 0.5, 0.75, 1.0):
+            assert error(tab, model, camera_at(EYES[0]), {"time": torch.tensor(moment, dtype=torch.float64)}) < ERROR
+        assert tab.faults == []
+
+
 @pytest.mark.parametrize("visibility", ["none", "primitive", "pixel"])
 @pytest.mark.parametrize(("form", "falloff"), [("additive", False), ("multiplicative", True)])
 def test_relit_models(visibility: str, form: str, falloff: bool, chromium: Any, tmp_path: Path) -> None:

@@ -38,6 +38,9 @@ class Stored:
 _SPIKY = 12.0
 """Columns whose error is more times the usual one than this get twice the bits: a few of their numbers lie far from all others."""
 
+_LABEL = 16
+"""Bits of a number that is not learned, at every level: it tells one thing from another, and half of it says nothing."""
+
 _WORTH_A_MASK = 0.02
 """Share of the primitives without a piece from which on a bit for each says so."""
 
@@ -80,6 +83,8 @@ def schemes(model: Primitives, table: BitTable) -> Schemes:
         x, bits = model.params[spec.name].reshape(model.count, spec.size), table.of(spec.name, spec.shape)
         if spec.name == "quats":
             found[spec.name] = Rotations(bits[0])
+        elif spec.fixed:
+            found[spec.name] = fit_columns(x, [_LABEL] * spec.size, clips=(0.0,))
         elif spec.name == "means":
             found[spec.name] = _positions(model, x, bits[0], spec.name in table.exact)
         else:

@@ -95,7 +95,7 @@ class ParameterSpec:
     Attributes:
         name: unique within a model; the key in checkpoints, rates and exports.
         shape: shape per primitive, ``()`` for a scalar.
-        lr: base learning rate; ``train.rates.NAME`` overrides it.
+        lr: base learning rate; ``train.rates.NAME`` overrides it. 0: a label, which is not learned, has no gradient and is kept in every file.
         init: draws the (N, *shape) float32 start value.
         lr_unit: what ``lr`` and ``train.rates.NAME`` are multiplied by: "absolute", nothing, so that a position's rate is in scene units
             a step; "extent", the data set's :attr:`~neuprim.core.data.Dataset.extent` (positions). ``train.rate_units.NAME`` overrides it.
@@ -106,6 +106,11 @@ class ParameterSpec:
     lr: float
     init: Callable[[InitContext], Tensor]
     lr_unit: RateUnit = "absolute"
+
+    @property
+    def fixed(self) -> bool:
+        """Whether it is a label that is not learned."""
+        return self.lr == 0
 
     @property
     def size(self) -> int:

@@ -45,5 +45,5 @@ def at_once(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
 
 
 def own_share(settings: LauncherSettings) -> AbstractContextManager[None]:
-    """Inside, this process has the threads that runs in it shall have; all, where they work elsewhere."""
-    return sharing(settings.threads or 0) if settings.name == "inline" else nullcontext()
+    """Inside, this process has the threads that runs in it shall have; where nothing is said, or they work elsewhere, those that it has."""
+    return sharing(settings.threads) if settings.name == "inline" and settings.threads is not None else nullcontext()

@@ -11,7 +11,7 @@ from neuprim.core.data.ground_truth import GroundTruth
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
-from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
+from neuprim.core.task import API_VERSION, Chunks, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim.core.volumes.source import VolumeSource
 from neuprim.tasks.dynamic import judging
@@ -72,6 +72,12 @@ def _truth(settings: Mapping[str, Any], context: SceneContext, known: Mapping[st
     return load_truth(settings, context, known)
 
 
+def _chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
+    from neuprim.tasks.dynamic.volume.scene import load_chunks
+
+    return load_chunks(config, context)
+
+
 def _multiview(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     from neuprim.tasks.dynamic.multiview import load
 
@@ -84,11 +90,13 @@ TASK = TaskSpec(
     summary="Smoke and fire over time, from OpenVDB sequences or images with a time each (time inside the density)",
     config_package="neuprim.tasks.dynamic.conf",
     scenes=(
-        SceneSpec("smoke_fire", "fire under dark smoke, 100 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth),
-        SceneSpec("colorful_smoke", "coloured smoke, 128 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth),
-        SceneSpec("ground_explosion", "a blast and its cloud, 130 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth),
-        SceneSpec("dust_tornado", "a column of dust, 100 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth),
-        SceneSpec("vdb", "any sequence of .vdb files: scene.vdb=DIR", _volume, _files, _truth),
+        SceneSpec("smoke_fire", "fire under dark smoke, 100 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth, _chunks),
+        SceneSpec("colorful_smoke", "coloured smoke, 128 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth, _chunks),
+        SceneSpec(
+            "ground_explosion", "a blast and its cloud, 130 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth, _chunks
+        ),
+        SceneSpec("dust_tornado", "a column of dust, 100 timesteps; simulated, or scene.vdb=DIR", _volume, _files, _truth, _chunks),
+        SceneSpec("vdb", "any sequence of .vdb files: scene.vdb=DIR", _volume, _files, _truth, _chunks),
         SceneSpec("multiview", "images with a time per frame (D-NeRF layout): scene.path=DIR", _multiview),
     ),
     build=_build,

@@ -8,11 +8,15 @@ What varies is chosen by name, several joined by "+":
     motion   mu + v (xi - c) + a (xi - c)^2                     c of the window, else 1/2; 6 parameters
 
 xi is time over the sequence, 0..1. Primitives outside their window are left out of a frame before anything is computed.
+
+A model joined from chunks of a sequence has seams between them, and for every primitive the chunk that it was fitted in, a number that is not
+learned: what it lives of its own accord counts within its chunk alone, and is faded over at the seams (:mod:`neuprim.tasks.dynamic.seams`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -28,6 +32,7 @@ from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.scripts import script_beside
 from neuprim.core.train.population import SPLIT_LONG, SPLIT_SHIFT
+from neuprim.tasks.dynamic.seams import checked_seams, shares
 from neuprim.tasks.dynamic.stilled import stilled
 
 __all__ = ["PARTS", "TimeDensity", "time_of"]
@@ -54,6 +59,9 @@ class TimeDensity(DensityField):
 
     ``init`` of the model settings: as :class:`~neuprim.core.model.densities.cosine.CosineDensity`, and ``window``, the half width tau of a fresh
     window in units of the sequence, and ``rate``, the bound of U(-rate, rate) that W_t starts from.
+
+    Args:
+        seams: (from, to) of the times over which one chunk of the sequence hands over to the next, ascending; none: the model is of one piece.
     """
 
     init_settings = (*CosineDensity.init_settings, "window", "rate")
@@ -66,6 +74,7 @@ class TimeDensity(DensityField):
         omega0: float = OMEGA0,
         edge: int = 0,
         gain: bool = False,
+        seams: Sequence[Sequence[float]] = (),
     ) -> None:
         parts = time.split("+") if isinstance(time, str) and time != "none" else []
         if not isinstance(time, str) or any(p not in PARTS for p in parts) or len(set(parts)) != len(parts):
@@ -73,13 +82,15 @@ class TimeDensity(DensityField):
         self.static, self.divide_above = CosineDensity(neurons, omega0, edge, gain), divide_above
         self.exact_split = self.static.exact_split
         self.time, self.parts = "+".join(p for p in PARTS if p in parts) or "none", frozenset(parts)
+        self.seams = checked_seams(seams)
 
     def settings(self) -> dict[str, Any]:
-        return {**self.static.settings(), "time": self.time}
+        joined = {"seams": [list(seam) for seam in self.seams]} if self.seams else {}
+        return {**self.static.settings(), "time": self.time, **joined}
 
     @classmethod
     def every_parameter(cls) -> list[ParameterSpec]:
-        return cls(time="+".join(PARTS), gain=True).parameters()
+        return cls(time="+".join(PARTS), gain=True, seams=[(0.0, 1.0)]).parameters()
 
     def parameters(self) -> list[ParameterSpec]:
         K = self.static.neurons
@@ -93,15 +104,21 @@ class TimeDensity(DensityField):
             specs.append(ParameterSpec("log_window", (1,), 1e-2, lambda c: torch.full((c.count, 1), math.log(c.number("window", 0.2, 0)))))
         if "motion" in self.parts:
             specs += [ParameterSpec(name, (3,), 1e-2, _zeros(3), lr_unit="extent") for name in ("velocity", "acceleration")]
+        if self.seams:
+            specs.append(ParameterSpec("chunk", (1,), 0.0, _zeros(1)))
         return specs
 
     # ------------------------------------------------------------ one frame
 
     def alive(self, params: Params, conditions: Conditions) -> Tensor | None:
-        if "window" not in self.parts:
-            return None
-        center, tau = params["window_center"].detach()[:, 0].double(), params["log_window"].detach()[:, 0].double().exp()
-        return ((time_of(conditions) - center).abs() < tau).nonzero()[:, 0]
+        xi, lives = time_of(conditions), None
+        if "window" in self.parts:
+            center, tau = params["window_center"].detach()[:, 0].double(), params["log_window"].detach()[:, 0].double().exp()
+            lives = (xi - center).abs() < tau
+        if self.seams:
+            own = shares(params["chunk"], self.seams, xi)[:, 0] > 0
+            lives = own if lives is None else lives & own
+        return None if lives is None else lives.nonzero()[:, 0]
 
     def move(self, params: Params, geometry: Geometry, conditions: Conditions) -> Geometry:
         if "motion" not in self.parts:
@@ -130,6 +147,9 @@ class TimeDensity(DensityField):
             from neuprim.tasks.dynamic.frame_cpu import fused_window  # numba, loaded when first needed
 
             w2, b2 = fused_window(w2, b2, params["window_center"], params["log_window"], xi)
+        if self.seams:
+            share = shares(params["chunk"], self.seams, xi).to(b2)
+            w2, b2 = w2 * share, b2 * share
         return Cosine(params["W1"], b1, w2, b2, self.static.omega0, self.static.edge)
 
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:

@@ -12,11 +12,13 @@ import pytest
 import torch
 
 from neuprim.config import compose
+from neuprim.config.launcher import LauncherSettings
 from neuprim.core import checkpoint
+from neuprim.core.compute.threads import core_count, sharing
 from neuprim.core.errors import ConfigError
 from neuprim.runs.launch import engine
 from neuprim.runs.launch.jobs import Result
-from neuprim.runs.launch.share import shared_out
+from neuprim.runs.launch.share import own_share, shared_out
 from neuprim.runs.launch.status import ENDED, Status
 from neuprim.runs.launch.table import launch
 from tests.core import tiny
@@ -134,3 +136,11 @@ def test_cores_are_shared_out_and_never_promised_twice(asked: dict[str, int], jo
         with pytest.raises(ConfigError) as error:
             shared_out(settings, jobs)
         assert str(error.value).startswith(str(expected))
+
+
+def test_jobs_in_a_worker_keep_its_share_of_the_cores() -> None:
+    """As the chunks of a run that is itself one of a sweep."""
+    with sharing(1), own_share(LauncherSettings()):
+        assert core_count() == 1
+    with own_share(LauncherSettings(threads=1)):
+        assert core_count() == 1

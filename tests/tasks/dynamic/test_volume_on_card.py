@@ -51,7 +51,8 @@ def test_a_sequence_is_the_processors_and_lies_in_a_folder_of_its_own(
         on_blocks(patch)
         other = dataset(folder, tmp_path, **changes)
         again = dataset(folder, tmp_path / "again", **changes)
-    assert recorded(own).folder != recorded(other).folder and recorded(own).folder.parent == recorded(other).folder.parent
+    mine, theirs = (Path(recorded(data).folder.address) for data in (own, other))
+    assert mine != theirs and mine.parent == theirs.parent
     assert own.exposure == pytest.approx(other.exposure, rel=1e-3)
     for i in range(len(own.test)):
         mine, theirs, rerun = (data.test.pixels(i) for data in (own, other, again))

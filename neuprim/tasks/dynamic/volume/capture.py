@@ -53,6 +53,7 @@ class Capture:
         cameras: all of them, those held out included.
         bounds: (2, 3) box around all matter, scene units.
         device: what renders them. A card's images have a folder of their own, as they differ in their last bits.
+        ends: numbers whose times are 0 and 1; None: the first and the last frame's.
     """
 
     frames: Sequence[VdbFrame]
@@ -63,6 +64,21 @@ class Capture:
     normalisation: Normalisation
     bounds: np.ndarray
     device: torch.device = hardware.HOST
+    ends: tuple[int, int] | None = None
+
+    @property
+    def clock(self) -> tuple[int, int]:
+        """Numbers whose times are 0 and 1."""
+        return self.ends or (self.frames[0].number, self.frames[-1].number)
+
+    def time(self, frame: VdbFrame) -> float:
+        """A frame's time; numbers are time: a gap in them is one in time."""
+        first, last = self.clock
+        return (frame.number - first) / max(last - first, 1)
+
+    def within(self, first: int, last: int) -> Capture:
+        """The frames with these numbers and between them; their times stay, and the folder of the images is that of all frames."""
+        return replace(self, frames=[frame for frame in self.frames if first <= frame.number <= last], ends=self.clock)
 
     def key(self) -> str:
         """A short hash of all of it; files count by name, size and time of change."""

@@ -23,12 +23,12 @@ from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.source import placement_of
 from neuprim.tasks.dynamic.volume.voxels import FrameVoxels
 
-__all__ = ["MEMORY", "FrameViews", "Recording", "volume_dataset"]
+__all__ = ["MEMORY", "TRAINING", "FrameViews", "Recording", "stored_points", "volume_dataset"]
 
 MEMORY = 11 * 2**27
 """Bytes of decoded images and voxels that are kept, 1408 MiB; beyond them those not used for longest are read again when needed."""
 
-_TRAIN, _TEST, _VOXELS = 6 / 11, 1 / 11, 4 / 11
+TRAINING, _TEST, _VOXELS = 6 / 11, 1 / 11, 4 / 11
 """Shares of the training images, of the test images, which are gone through in order, and of the voxels."""
 
 _MATTER = 1.0 / 255.0  # alpha from which a pixel belongs to the union mask
@@ -46,8 +46,7 @@ class FrameViews(ViewSet):
         self.capture, self.folder, self.cameras, self.exposure, self.memory = capture, folder, list(cameras), exposure, memory
         self._kept: OrderedDict[int, Tensor] = OrderedDict()
         self.frames = capture.frames[::every]
-        first, last = capture.frames[0].number, capture.frames[-1].number  # numbers are time: a gap in them is one in time
-        self.times = [torch.tensor((frame.number - first) / max(last - first, 1)) for frame in self.frames]
+        self.times = [torch.tensor(capture.time(frame)) for frame in self.frames]
 
     def __len__(self) -> int:
         return len(self.cameras) * len(self.times)
@@ -121,7 +120,7 @@ class Recording:
         for t, wanted in enumerate(per_frame):
             if not wanted:
                 continue
-            stored = _stored(self.capture.points(self.folder, self.capture.frames[t]), "means", "colors")
+            stored = stored_points(self.capture.points(self.folder, self.capture.frames[t]), "means", "colors")
             points = torch.from_numpy(stored["means"])
             rows = torch.randperm(len(points), generator=generator)[torch.arange(wanted) % len(points)]
             place = points[rows]
@@ -155,6 +154,7 @@ def volume_dataset(
     held_out: Sequence[int],
     up: Tensor,
     every: int = 1,
+    span: tuple[int, int] | None = None,
     memory: float = MEMORY,
 ) -> Dataset:
     """A volume sequence seen by cameras; colours are linear radiance over the exposure, the brightest value any camera sees.
@@ -162,19 +162,21 @@ def volume_dataset(
     Args:
         folder: of the images that the capture took.
         held_out: indices of the cameras of the test split.
+        span: numbers of the first and the last frame that are learned from and judged; the exposure is that of all. None: all.
         memory: bytes of decoded images and voxels that are kept.
 
     Raises:
         DataError: every frame is black, or a file is damaged.
     """
-    stored = [_stored(capture.points(folder, frame), "weight", "brightest") for frame in capture.frames]
-    exposure = max(float(s["brightest"]) for s in stored)
+    exposure = max(float(stored_points(capture.points(folder, frame), "brightest")["brightest"]) for frame in capture.frames)
     if not exposure > 0:
         raise DataError(f"{name}: every frame is black from every camera; expected light (check scene.look and scene.grids)")
+    if span is not None:
+        capture = capture.within(*span)
     learned = [c for c in range(len(capture.cameras)) if c not in held_out]
-    train = FrameViews(capture, folder, learned, exposure, every, memory * _TRAIN)
+    train = FrameViews(capture, folder, learned, exposure, every, memory * TRAINING)
     test = FrameViews(capture, folder, held_out, exposure, memory=memory * _TEST)
-    weights = [float(s["weight"]) for s in stored]
+    weights = [float(stored_points(capture.points(folder, frame), "weight")["weight"]) for frame in capture.frames]
     recording = Recording(name, capture, folder, exposure, weights, every, test)
     camera = capture.cameras[0]
     return Dataset(
@@ -206,7 +208,7 @@ _POINTS = {
 }
 
 
-def _stored(path: Path, *names: str) -> dict[str, Any]:
+def stored_points(path: Path, *names: str) -> dict[str, Any]:
     """What is asked for of a frame's points; of all frames together they would be large."""
     try:
         return read_arrays(path, {name: _POINTS[name] for name in names})

@@ -17,10 +17,11 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.object_store import store_at
 from neuprim.core.io.store import LocalStore
 from neuprim.core.io.vdb import VdbFrame, sequence
-from neuprim.core.task import SceneContext
+from neuprim.core.task import Chunks, SceneContext
 from neuprim.tasks.dynamic.simulation import simulate
 from neuprim.tasks.dynamic.volume.capture import Capture
-from neuprim.tasks.dynamic.volume.dataset import volume_dataset
+from neuprim.tasks.dynamic.volume.chunks import number_of_chunks, planned
+from neuprim.tasks.dynamic.volume.dataset import TRAINING, stored_points, volume_dataset
 from neuprim.tasks.dynamic.volume.grids import GridReader, find_grids
 from neuprim.tasks.dynamic.volume.looks import changed, named_look
 from neuprim.tasks.dynamic.volume.normalise import Normalisation
@@ -30,7 +31,7 @@ from neuprim.tasks.dynamic.volume.rig import AXES, rig
 from neuprim.tasks.dynamic.volume.settings import VolumeSettings, choose_frames
 from neuprim.tasks.dynamic.volume.source import CaptureSource
 
-__all__ = ["load", "load_truth", "load_volume"]
+__all__ = ["load", "load_chunks", "load_truth", "load_volume"]
 
 Progress = Callable[[str, float], None]
 
@@ -43,9 +44,10 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         DataError: files that are missing, damaged, or without a usable grid; a cache that cannot be written.
     """
     asked, name, source, capture, held_out = _prepare(settings, context)
+    span = _span(asked, capture)
     rendered = _rendered(asked, capture, context).take(context.progress)
     up = torch.tensor(AXES[asked.up], dtype=torch.float64)
-    return volume_dataset(name, source, capture, rendered, held_out, up, asked.train_every, asked.memory * 2.0**20)
+    return volume_dataset(name, source, capture, rendered, held_out, up, asked.train_every, span, asked.memory * 2.0**20)
 
 
 def load_truth(settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None) -> RenderedFrames:
@@ -65,7 +67,30 @@ def _rendered(asked: VolumeSettings, capture: Capture, context: SceneContext) ->
 
 def load_volume(settings: Mapping[str, Any], context: SceneContext) -> CaptureSource:
     """The same scene's files without any image. Raises as :func:`load`."""
-    return CaptureSource(_prepare(settings, context)[3])
+    asked, _, _, capture, _ = _prepare(settings, context)
+    span = _span(asked, capture)
+    return CaptureSource(capture if span is None else capture.within(*span))
+
+
+def load_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
+    """The chunks that ``scene.chunks`` asks for, with the ground truth of all frames rendered, as their exposure is one; None for one run.
+
+    Raises:
+        ConfigError: more chunks than the frames allow. And as :func:`load`.
+    """
+    settings = {name: value for name, value in config["scene"].items() if name != "name"}
+    asked, _, _, capture, held_out = _prepare(settings, context)
+    learned, camera = len(capture.frames[:: asked.train_every]), capture.cameras[0]
+    images = learned * (len(capture.cameras) - len(held_out)) * camera.width * camera.height * 4 * 2  # RGBA, half floats
+    count = number_of_chunks(asked.chunks, learned, images, asked.memory * 2.0**20 * TRAINING)
+    if count == 1:
+        return None
+    store = _rendered(asked, capture, context).take(context.progress)
+
+    def weight(frame: VdbFrame) -> float:
+        return float(stored_points(capture.points(store, frame), "weight")["weight"])
+
+    return planned(capture, asked.train_every, count, weight, config)
 
 
 def _prepare(
@@ -91,6 +116,18 @@ def _prepare(
     train, test = rig(asked.size, asked.cameras, up=asked.up, field_of_view=asked.field_of_view)
     capture = Capture(frames, reader, look, [*train, *test], asked.samples, normalisation, bounds, context.device)
     return asked, name, source, capture, range(len(train), len(train) + len(test))
+
+
+def _span(asked: VolumeSettings, capture: Capture) -> tuple[int, int] | None:
+    """First and last number of the chosen frames that ``scene.span`` names; None for all of them."""
+    if asked.span is None:
+        return None
+    first, last = asked.span_numbers
+    own = [frame.number for frame in capture.frames if first <= frame.number <= last]
+    if not own:
+        begin, end = capture.clock
+        raise DataError(f"scene.span={asked.span}: the chosen frames are {begin} to {end}, and none of these")
+    return own[0], own[-1]
 
 
 def _files(asked: VolumeSettings, context: SceneContext) -> tuple[Path, str, DataSource]:

@@ -31,6 +31,7 @@ def _span(frames: str) -> range | None:
     return range(int(match[1]), int(match[2]) + 1, step)
 
 
+Span = Annotated[str, Accepts(lambda v: v.count(":") == 1 and _span(v) is not None, "FIRST:LAST, as 0:19")]
 Frames = Annotated[str, Accepts(lambda v: v == "all" or _span(v) is not None, "all, FIRST:LAST or FIRST:LAST:STEP, as 0:100:2")]
 
 
@@ -44,6 +45,10 @@ class VolumeSettings:
         resolution: voxels across the simulation's box.
         timesteps: of the simulation; None: as many as the scene has.
         frames: "all", "FIRST:LAST" or "FIRST:LAST:STEP" by number, LAST included.
+        span: "FIRST:LAST" by number, the frames to learn from and to be judged by; times, box, exposure and images stay those of all ``frames``.
+            None: all.
+        chunks: in how many chunks of time the sequence is fitted, each a run of its own; "auto": see
+            :func:`~neuprim.tasks.dynamic.volume.chunks.number_of_chunks`; None or 1: in one.
         grids: meaning -> name in the files.
         look: name of a preset of the optics, or "auto"; optics: changes to its settings.
         size: width and height of the images in pixels.
@@ -61,6 +66,8 @@ class VolumeSettings:
     resolution: Resolution = 64
     timesteps: Annotated[int, Range(2, TIMESTEPS[1])] | None = None
     frames: Frames = "all"
+    span: Span | None = None
+    chunks: Annotated[int, Range(1, 1000)] | Literal["auto"] | None = None
     grids: Mapping[Meaning, Annotated[str, text("the name of a grid")]] = field(default_factory=dict)
     look: str = "auto"
     optics: Mapping[str, Any] = field(default_factory=dict)
@@ -77,6 +84,17 @@ class VolumeSettings:
         verify(self, "scene")
         if self.vdb is None and self.simulation is None:
             raise ConfigError("scene.vdb: required and not given; expected a folder of .vdb files")
+        if self.span is not None and self.chunks is not None:
+            raise ConfigError(
+                f"scene.chunks={self.chunks}: chunks are spans of all chosen frames; expected no scene.span beside it, but scene.frames"
+            )
+
+    @property
+    def span_numbers(self) -> tuple[int, int]:
+        """First and last number of ``span``, which is given."""
+        assert self.span is not None
+        first, _, last = self.span.partition(":")
+        return int(first), int(last)
 
 
 def choose_frames(frames: str, numbers: Sequence[int], where: str = "the sequence") -> list[int]:

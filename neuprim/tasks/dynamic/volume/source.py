@@ -15,13 +15,12 @@ __all__ = ["CaptureSource", "placement_of"]
 
 def placement_of(capture: Capture) -> Placement:
     """How the scene lies in the world of its files; times as the data set has them."""
-    numbers = [frame.number for frame in capture.frames]
     look, names = capture.look, capture.reader.names
     glows = look.flame_extinction > 0 and look.flame_grid in names
     return Placement(
         capture.normalisation.matrix(),
-        numbers,
-        {"time": [(n - numbers[0]) / max(numbers[-1] - numbers[0], 1) for n in numbers]},
+        [frame.number for frame in capture.frames],
+        {"time": [capture.time(frame) for frame in capture.frames]},
         look.extinction or 1.0,
         names[capture.reader.extinction],
         exact=not glows and look.extinction > 0,

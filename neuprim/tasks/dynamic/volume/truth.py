@@ -49,7 +49,7 @@ class VolumeTruth(DensityTruth):
 
     def __init__(self, capture: Capture, path: Path | None = None) -> None:
         self.capture, self.bounds = capture, torch.from_numpy(capture.bounds).double()
-        first, last = capture.frames[0].number, capture.frames[-1].number
+        first, last = capture.clock
         if path is None:
             found = list(capture.frames)
         elif path.is_dir():
@@ -61,13 +61,10 @@ class VolumeTruth(DensityTruth):
             found = [VdbFrame(int(number[-1]) if number else -1, path)]
         self._files = found
         self._last: tuple[int, Medium] | None = None
-        self.frames = [self._named(frame, first, last) for frame in found]
+        self.frames = [self._named(frame, first <= frame.number <= last) for frame in found]
 
-    @staticmethod
-    def _named(frame: VdbFrame, first: int, last: int) -> TruthFrame:
-        inside = first <= frame.number <= last
-        times = {"time": torch.tensor((frame.number - first) / max(last - first, 1))} if inside else {}
-        return TruthFrame(frame.path.name, times)
+    def _named(self, frame: VdbFrame, inside: bool) -> TruthFrame:
+        return TruthFrame(frame.path.name, {"time": torch.tensor(self.capture.time(frame))} if inside else {})
 
     def medium(self, frame: int) -> Medium:
         """A frame's file as extinction and radiance; the last one stays in memory, as grids are asked for in parts."""

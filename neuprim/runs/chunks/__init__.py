@@ -1,0 +1,1 @@
+"""A scene fitted in chunks, each a run of its own, and joined into one model."""

@@ -1,0 +1,172 @@
+"""Models joined from chunks of a sequence: what counts when, exactly; and what is done with such a model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from neuprim.core import checkpoint
+from neuprim.core.compressed.bits import LEVELS
+from neuprim.core.compressed.codec import folded, rounded, schemes
+from neuprim.core.errors import ConfigError
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import RenderSettings, render
+from neuprim.core.train.population import split
+from neuprim.core.volumes.points import values_at
+from neuprim.tasks.dynamic import TASK
+from neuprim.tasks.dynamic.density import TimeDensity
+from neuprim.tasks.dynamic.seams import checked_seams, shares
+from neuprim.tasks.dynamic.volume.chunks import joined
+from tests import scenes
+from tests.timed_models import model
+
+SEAMS = ((0.25, 0.375), (0.625, 0.75))
+CHUNKS = torch.arange(3.0)[:, None]
+TIMES = (0.0, 0.2, 0.25, 0.3, 0.375, 0.5, 0.7, 0.75, 1.0)
+EXACT = RenderSettings(backend="reference", alpha_min=0.0, transmittance_min=0.0)
+
+
+def at(time: float) -> dict[str, Tensor]:
+    return {"time": torch.tensor(time)}
+
+
+def three(time: str = "phase+window+motion") -> list[Primitives]:
+    """Of one form, with windows that reach far beyond any chunk."""
+    models = []
+    for seed in range(3):
+        one = model(time, neurons=2, dtype=torch.float32)
+        generator = torch.Generator().manual_seed(seed)
+        one.params["means"] = one.params["means"].detach() + 0.2 * torch.rand(one.params["means"].shape, generator=generator)
+        if "window" in time:
+            one.params["log_window"] = torch.full_like(one.params["log_window"], 1.0)
+        models.append(one)
+    return models
+
+
+# ---------------------------------------------------------------- shares
+
+
+def test_shares_add_up_to_one_at_every_time_and_at_most_two_count() -> None:
+    for time in torch.linspace(-0.5, 1.5, 401, dtype=torch.float64):
+        own = shares(CHUNKS, SEAMS, time)[:, 0]
+        assert float(own.sum()) == pytest.approx(1.0, abs=1e-15) and int((own > 0).sum()) <= 2
+
+
+def test_a_chunk_is_all_or_nothing_at_the_frames_beside_a_seam() -> None:
+    for (begin, end), chunk in zip(SEAMS, range(2), strict=True):
+        for time, expected in ((begin, chunk), (end, chunk + 1)):
+            assert shares(CHUNKS, SEAMS, torch.tensor(time))[:, 0].tolist() == [float(c == expected) for c in range(3)]
+    assert shares(CHUNKS, SEAMS, torch.tensor(0.3125))[:, 0].tolist() == [0.5, 0.5, 0.0]
+
+
+def test_labels_that_come_back_a_little_off_are_the_same_labels() -> None:
+    assert torch.equal(shares(CHUNKS + 0.3, SEAMS, torch.tensor(0.3)), shares(CHUNKS, SEAMS, torch.tensor(0.3)))
+
+
+@pytest.mark.parametrize("wrong", [[(0.5, 0.5)], [(0.5, 0.4)], [(0.1, 0.3), (0.2, 0.4)], [(0.1,)], [("a", 0.2)], [(0.1, float("nan"))], 3])
+def test_other_seams_are_refused(wrong: object) -> None:
+    with pytest.raises(ValueError, match="expected pairs of"):
+        checked_seams(wrong)  # type: ignore[arg-type]
+
+
+# ---------------------------------------------------------------- joining
+
+
+@pytest.mark.parametrize("time", ["phase", "window+motion", "phase+offset+window+motion"])
+def test_a_joined_field_is_the_sum_of_the_chunks_by_their_shares(time: str) -> None:
+    models = three(time=time)
+    whole = joined(models, [0, 1, 2], SEAMS)
+    points = torch.rand((200, 3), generator=torch.Generator().manual_seed(5)) - 0.5
+    for moment in TIMES:
+        own = shares(CHUNKS, SEAMS, torch.tensor(moment))[:, 0]
+        parts = [_sums(m, points, moment) for m in models]
+        found = _sums(whole, points, moment)
+        assert float(found.abs().max()) > 0
+        assert torch.allclose(found, sum(share * part for share, part in zip(own, parts, strict=True)), rtol=1e-5, atol=1e-5)
+
+
+def _sums(m: Primitives, points: Tensor, time: float) -> Tensor:
+    """(4, M) extinction and source of all primitives at some points."""
+    values = values_at(m, at(time), points, True, 1)
+    return torch.cat([values.sigma[None], values.source.T]).detach()
+
+
+def test_a_frame_of_one_chunk_is_that_chunks_own_image_to_the_bit() -> None:
+    models = three()
+    whole, camera = joined(models, [0, 1, 2], SEAMS), scenes.camera()
+    for moment, chunk in ((0.0, 0), (0.25, 0), (0.375, 1), (0.625, 1), (0.75, 2), (1.0, 2)):
+        expected = render(models[chunk], camera, at(moment)).rgb
+        assert torch.equal(render(whole, camera, at(moment)).rgb, expected)
+        assert len(whole.density.alive(whole.of(whole.density), at(moment))) <= models[chunk].count  # type: ignore[arg-type]
+
+
+def test_nothing_lives_where_its_chunk_has_seen_nothing_however_long_its_window() -> None:
+    whole = joined(three(), [0, 1, 2], SEAMS)
+    for moment in torch.linspace(0, 1, 101).tolist():
+        alive = whole.density.alive(whole.of(whole.density), at(moment))
+        assert alive is not None and len(alive)
+        for chunk in whole.params["chunk"][alive, 0].unique().tolist():
+            begin = SEAMS[int(chunk) - 1][0] if chunk > 0 else 0.0
+            end = SEAMS[int(chunk)][1] if chunk < 2 else 1.0
+            assert begin - 1e-7 <= moment <= end + 1e-7
+    assert float(whole.params["log_window"].exp().min()) > 1  # of its own accord all would live for ever
+
+
+def test_a_chunk_that_holds_nothing_leaves_its_time_empty() -> None:
+    first, _, last = three()
+    whole = joined([first, last], [0, 2], SEAMS)
+    alive = whole.density.alive(whole.of(whole.density), at(0.5))
+    assert alive is not None and len(alive) == 0
+    assert not bool(render(whole, scenes.camera(), at(0.5)).alpha.any())
+
+
+def test_models_of_other_forms_are_refused() -> None:
+    with pytest.raises(ConfigError, match="different forms"):
+        joined([three()[0], *three(time="window+motion")[1:]], [0, 1, 2], SEAMS)
+    whole = joined(three(), [0, 1, 2], SEAMS)
+    with pytest.raises(ConfigError, match="expected a TimeDensity without seams"):
+        joined([whole, whole, whole], [0, 1, 2], SEAMS)
+
+
+# ---------------------------------------------------------------- what is done with it
+
+
+def test_the_reference_agrees_and_labels_have_no_gradient() -> None:
+    whole, camera = joined(three(), [0, 1, 2], SEAMS), scenes.camera()
+    whole.params = {name: value.requires_grad_() for name, value in whole.params.items()}
+    for moment in (0.3, 0.7):
+        image = render(whole, camera, at(moment), RenderSettings(alpha_min=0.0, transmittance_min=0.0)).rgb
+        assert torch.allclose(image.double(), render(whole, camera, at(moment), EXACT).rgb.double(), atol=2e-5)
+    image.sum().backward()
+    assert whole.params["chunk"].grad is None and bool(whole.params["means"].grad.any())  # type: ignore[union-attr]
+
+
+def test_children_are_of_their_parents_chunk() -> None:
+    whole = joined(three(), [0, 1, 2], SEAMS)
+    parents = torch.arange(0, whole.count, 7)
+    assert torch.equal(split(whole, parents, 0.5, 0.6, 0.9)["chunk"], whole.params["chunk"][parents].repeat(2, 1))
+
+
+def test_a_part_of_time_can_be_taken_away() -> None:
+    whole = joined(three(), [0, 1, 2], SEAMS)
+    field, fewer = whole.density.reduced(whole.of(whole.density), whole.geometry, "phase", 0)
+    assert isinstance(field, TimeDensity) and field.seams == SEAMS and torch.equal(fewer["chunk"], whole.params["chunk"])
+
+
+def test_files_keep_seams_and_labels(tmp_path: Path) -> None:
+    whole = joined(three(), [0, 1, 2], SEAMS)
+    checkpoint.save_model(tmp_path / "model.safetensors", whole, "dynamic", {})
+    again, _ = checkpoint.load_model(tmp_path / "model.safetensors", TASK)
+    assert again.density.settings() == whole.density.settings() and torch.equal(again.params["chunk"], whole.params["chunk"])
+
+
+def test_labels_survive_every_level_of_compression() -> None:
+    count = 40
+    whole = joined([three()[0]] * count, range(count), tuple((n / count, (n + 0.5) / count) for n in range(1, count)))
+    small = folded(whole)
+    for table in LEVELS.values():
+        back = rounded(small.params, schemes(small, table))["chunk"]
+        assert torch.equal(back.round(), small.params["chunk"])

@@ -1,0 +1,180 @@
+"""A sequence in chunks of time: how many, which frames each sees, and that all of them have the whole sequence's times, box and light."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from neuprim.config import compose
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.task import Chunks, SceneContext
+from neuprim.tasks.dynamic import judging
+from neuprim.tasks.dynamic.volume.chunks import FEWEST, FRAMES, number_of_chunks
+from neuprim.tasks.dynamic.volume.scene import load_chunks, load_volume
+from tests.tasks.dynamic.sequences import VOXEL, blob, dataset, recorded
+
+NUMBERS = (2, 3, 5, 6, 7, 8, 10, 11, 12)
+EMPTY = 3
+SEEN = ["2:6", "5:10", "8:12"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Nine frames with gaps, the first three of which are empty."""
+    made = tmp_path_factory.mktemp("files")
+    for step, number in enumerate(NUMBERS):
+        empty = [Grid.from_dense("density", np.zeros((8, 8, 8), np.float32), transform=scale_transform(VOXEL))]
+        write_vdb(made / f"ball_{number}.vdb", empty if step < EMPTY else blob(6.0 + step))
+    return made
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cached")
+
+
+def chunks(folder: Path, cache: Path, *words: str) -> Chunks | None:
+    config = config_of(folder, *words)
+    return load_chunks(config, SceneContext(0, cache / "cache"))
+
+
+def config_of(folder: Path, *words: str) -> dict[str, Any]:
+    scene = [
+        "task=dynamic",
+        "scene=vdb",
+        f"scene.vdb='{folder}'",
+        "scene.size=24",
+        "scene.cameras=6",
+        "scene.samples=1",
+        "scene.look=smoke_fire",
+    ]
+    return compose([*scene, *words], check_output=False).to_dict()
+
+
+# ---------------------------------------------------------------- how many
+
+
+@pytest.mark.parametrize(
+    ("asked", "frames", "images", "expected"),
+    [
+        (None, 500, 0, 1),
+        (1, 500, 0, 1),
+        (7, 500, 0, 7),
+        ("auto", FRAMES, 0, 1),
+        ("auto", FRAMES + 1, 0, 2),
+        ("auto", 10 * FRAMES, 0, 10),
+        ("auto", 100, 3, 3),
+        ("auto", 100, 1000, 100 // FEWEST),
+        ("auto", FEWEST - 1, 1000, 1),
+    ],
+)
+def test_the_number_follows_from_frames_and_memory(asked: int | str | None, frames: int, images: int, expected: int) -> None:
+    assert number_of_chunks(asked, frames, images, 1) == expected
+
+
+@pytest.mark.parametrize(
+    ("asked", "frames", "said"),
+    [
+        (5, 9, "scene.chunks=5: there are 9 frames to learn from; expected at most 4, as a chunk has at least two of its own"),
+        (2, 3, "scene.chunks=2: there are 3 frames to learn from; expected null: a chunk has at least two of its own"),
+        (2, 1, "scene.chunks=2: there is 1 frame to learn from; expected null: a chunk has at least two of its own"),
+    ],
+)
+def test_more_than_the_frames_allow_is_refused(asked: int, frames: int, said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        number_of_chunks(asked, frames, 0, 1)
+    assert str(caught.value) == said
+
+
+@pytest.mark.parametrize("word", ["scene.chunks=0", "scene.chunks=many", "scene.chunks=2.5", "scene.span=3", "scene.span=5:2"])
+def test_other_words_are_refused_in_one_line_with_their_key(word: str, folder: Path, cache: Path) -> None:
+    with pytest.raises(ConfigError, match=word.partition("=")[0]) as caught:
+        chunks(folder, cache, word)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_span_in_chunks_is_refused(folder: Path, cache: Path) -> None:
+    with pytest.raises(ConfigError, match=r"expected no scene.span beside it, but scene.frames"):
+        chunks(folder, cache, "scene.chunks=2", "scene.span=3:8")
+
+
+# ---------------------------------------------------------------- which frames
+
+
+def test_chunks_share_out_frames_and_see_one_more_at_each_seam(folder: Path, cache: Path) -> None:
+    found = chunks(folder, cache, "scene.chunks=3")
+    assert found is not None
+    assert [part.settings["scene.span"] for part in found.parts] == SEEN and found.parts[0].name == "frames_02-06"
+    assert sum(part.primitives for part in found.parts) == pytest.approx(1) and sum(part.steps for part in found.parts) == pytest.approx(1)
+    assert [part.steps for part in found.parts] == pytest.approx([4 / 13, 5 / 13, 4 / 13])
+    shares = [part.primitives for part in found.parts]  # by the matter that they see: in one frame, four and four
+    assert shares == pytest.approx([1 / 9, 4 / 9, 4 / 9], rel=0.05)
+
+
+def test_learning_from_every_second_frame_alone(folder: Path, cache: Path) -> None:
+    found = chunks(folder, cache, "scene.chunks=2", "scene.train_every=2")
+    assert found is not None
+    assert [part.settings["scene.span"] for part in found.parts] == ["2:7", "5:12"]  # of 2, 5, 7, 10 and 12
+
+
+def test_time_goes_faster_in_a_chunk(folder: Path, cache: Path) -> None:
+    """As windows and rates say that are measured in the whole sequence's time."""
+    found = chunks(folder, cache, "scene.chunks=3", "model.init.window=0.9")
+    assert found is not None
+    usual = config_of(folder)["train"]["rates"]
+    own, length = found.parts[0].settings, 4 / 10
+    assert own["model.init.window"] == pytest.approx(length)
+    assert own["train.rates.window_center"] == pytest.approx(length * usual["window_center"])
+    assert own["train.rates.velocity"] == pytest.approx(usual["velocity"] / length)
+    assert own["train.rates.acceleration"] == pytest.approx(usual["acceleration"] / length**2)
+    assert "train.rates.W_t" not in own  # which this form does not have
+    assert "model.init.window" not in chunks(folder, cache, "scene.chunks=3", "model.init.window=0.1").parts[0].settings  # type: ignore[union-attr]
+
+
+def test_nothing_is_fitted_where_there_is_nothing(folder: Path, cache: Path) -> None:
+    found = chunks(folder, cache, "scene.frames=2:8", "scene.chunks=3")
+    assert found is not None and [part.settings["scene.span"] for part in found.parts] == ["3:7", "6:8"]
+    assert [part.steps for part in found.parts] == pytest.approx([4 / 7, 3 / 7])
+    with pytest.raises(DataError):  # and nowhere anything
+        chunks(folder, cache, "scene.frames=2:3")
+
+
+# ---------------------------------------------------------------- what a chunk sees
+
+
+def test_a_span_has_the_whole_sequences_times_box_light_and_images(folder: Path, tmp_path: Path) -> None:
+    whole, part = dataset(folder, tmp_path), dataset(folder, tmp_path, span="5:10")
+    assert [f.number for f in recorded(part).capture.frames] == [5, 6, 7, 8, 10]
+    assert part.exposure == whole.exposure and torch.equal(part.bounds, whole.bounds)  # type: ignore[arg-type]
+    assert recorded(part).folder == recorded(whole).folder
+    assert len(part.train) == 4 * 5 and len(part.test) == 2 * 5
+    named = {whole.test.view(i).name: i for i in range(len(whole.test))}
+    for i in range(len(part.test)):
+        view = part.test.view(i)
+        same = named[view.name]
+        assert torch.equal(view.conditions["time"], whole.test.view(same).conditions["time"])
+        assert torch.equal(part.test.pixels(i).rgb, whole.test.pixels(same).rgb)
+    times = part.initial_points(200, torch.Generator().manual_seed(0)).conditions["time"]
+    assert 0.3 - 1e-6 <= float(times.min()) and float(times.max()) <= 0.8 + 1e-6
+    assert part.points is not None
+    drawn = part.points.draw(50, torch.Generator().manual_seed(1))
+    assert 0.3 - 1e-6 <= float(drawn.conditions["time"]) <= 0.8 + 1e-6
+    assert [clip.views for clip in judging.clips(part)] == [range(5), range(5, 10)]
+
+
+def test_files_of_a_span_are_its_frames_in_the_sequences_time(folder: Path, tmp_path: Path) -> None:
+    settings: Mapping[str, Any] = {"vdb": str(folder), "size": 24, "cameras": 6, "samples": 1, "look": "smoke_fire", "span": "5:10"}
+    source = load_volume(settings, SceneContext(0, tmp_path / "cache"))
+    assert list(source.placement.numbers) == [5, 6, 7, 8, 10]
+    assert source.placement.times["time"] == pytest.approx([0.3, 0.4, 0.5, 0.6, 0.8])
+
+
+def test_a_span_without_a_frame_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"scene.span=4:4: the chosen frames are 2 to 12, and none of these"):
+        dataset(folder, tmp_path, span="4:4")

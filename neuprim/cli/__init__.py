@@ -186,7 +186,7 @@ def _run(args: argparse.Namespace) -> int:
     from neuprim.config.target import target_words
     from neuprim.config.viewer import viewer_words
     from neuprim.core.train.ranks.place import place_of
-    from neuprim.runs.chunks.asked import asked
+    from neuprim.runs.chunks.asked import asked, refuse_chunks
 
     place = place_of()
     if place is not None:
@@ -223,10 +223,9 @@ def _run(args: argparse.Namespace) -> int:
         from neuprim.cli.sweep import sweep
 
         return sweep(configs, words, launcher, typed)
-    in_chunks = asked(configs[0])
-    if in_chunks and viewer is not None:
-        raise ConfigError("viewer=true: shows one training; expected no scene.chunks beside it")
-    if elsewhere and not in_chunks:  # of a run in chunks these are what works elsewhere
+    if viewer is not None:
+        refuse_chunks(configs[0], "viewer=true shows one training")
+    if elsewhere and not asked(configs[0]):  # of a run in chunks these are what works elsewhere
         from neuprim.cli.sweep import launch_one
 
         return launch_one(configs[0], launcher, typed)

@@ -209,7 +209,7 @@ def test_few_frames_in_auto_are_one_run(files: Path, tmp_path: Path) -> None:
             "scene.chunks=4: there are 6 frames to learn from; expected at most 3, as a chunk has at least two of its own",
         ),
         (["model.primitives=9"], "model.primitives=9: expected at least 16 for 2 chunks"),
-        (["scene.chunks=2", "viewer=true"], "viewer=true: shows one training; expected no scene.chunks beside it"),
+        (["scene.chunks=2", "viewer=true"], "scene.chunks=2: viewer=true shows one training; expected scene.chunks=null"),
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(

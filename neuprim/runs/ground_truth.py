@@ -13,9 +13,7 @@ from neuprim.config import RunConfig, scene_of, suspects_of, task_of
 from neuprim.config.launcher import LauncherSettings
 from neuprim.core.data.ground_truth import GroundTruth
 from neuprim.core.errors import DataError, NeuprimError
-from neuprim.core.io.files import cache_directory
 from neuprim.core.io.store import WAITING
-from neuprim.core.task import SceneContext
 from neuprim.plugins.blame import blamed
 from neuprim.runs.events import Events, Note, Preparing, silent
 from neuprim.runs.launch.engine import Hear
@@ -23,7 +21,7 @@ from neuprim.runs.launch.jobs import Job, Result
 from neuprim.runs.launch.share import at_once
 from neuprim.runs.launch.status import Status
 from neuprim.runs.launch.table import launch
-from neuprim.runs.open import LOGS
+from neuprim.runs.open import LOGS, context_of
 
 __all__ = ["before_runs", "before_search", "make_frames", "make_truth", "shares", "truth_of"]
 
@@ -47,7 +45,7 @@ def truth_of(
         return None
     scene = suspects_of(config).scene
     with blamed(scene.origin, f"ground truth of {scene.what}", config.output_dir / LOGS):
-        return make(config.scene, SceneContext(config.seed, cache_directory() / "scenes", progress), known)
+        return make(config.scene, context_of(config, progress), known)
 
 
 def make_truth(config: RunConfig, settings: LauncherSettings, events: Events = silent) -> GroundTruth | None:

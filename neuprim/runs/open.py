@@ -25,7 +25,7 @@ from neuprim.plugins.blame import blamed
 from neuprim.plugins.mechanism import PluginError
 from neuprim.plugins.provenance import warn_of_neuprim
 
-__all__ = ["COMPRESSED", "LOGS", "load_dataset", "load_run", "model_file", "open_run", "placed", "read_metrics"]
+__all__ = ["COMPRESSED", "LOGS", "context_of", "load_dataset", "load_run", "model_file", "open_run", "placed", "read_metrics"]
 
 LOGS = "logs"
 """Folder of a run directory for tracebacks of plugins."""
@@ -57,7 +57,7 @@ def load_dataset(
     Raises:
         NeuprimError: what the loader refuses, or that it crashed.
     """
-    context = SceneContext(config.seed, cache_directory() / "scenes", progress, computing_device(config.renderer))
+    context = context_of(config, progress)
     load = scene_of(config, task, None if run_dir is None else run_dir / "config.yaml").spec.load
     scene = suspects_of(config).scene
     with blamed(scene.origin, scene.what, (config.output_dir if run_dir is None else run_dir) / LOGS):
@@ -93,6 +93,11 @@ def placed(model: Primitives, settings: RenderSettings, view: View) -> Primitive
     return model.to(device_of(model, settings, view.camera, view.conditions))
 
 
+def context_of(config: RunConfig, progress: Progress) -> SceneContext:
+    """What a run's scene is loaded with."""
+    return SceneContext(config.seed, cache_directory() / "scenes", progress, computing_device(config.renderer))
+
+
 def open_run(run_dir: Path, progress: Progress = lambda text, fraction: None) -> TrainedModel:
     """The model of a run directory; its scene is loaded only when asked for.
 
@@ -108,8 +113,7 @@ def open_run(run_dir: Path, progress: Progress = lambda text, fraction: None) ->
             return None
         scene = suspects_of(config).scene
         with blamed(scene.origin, f"volume of {scene.what}", run_dir / LOGS):
-            where = computing_device(config.renderer)
-            return load(config.scene, SceneContext(config.seed, cache_directory() / "scenes", progress, where))
+            return load(config.scene, context_of(config, progress))
 
     def dataset() -> Dataset:
         return load_dataset(config, task, progress, run_dir)

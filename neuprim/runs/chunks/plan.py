@@ -10,11 +10,10 @@ from typing import Any
 from neuprim.config import RunConfig, scene_of, suspects_of, task_of
 from neuprim.config.overrides import without_place, word
 from neuprim.core.errors import ConfigError
-from neuprim.core.io.files import cache_directory
-from neuprim.core.task import Chunks, SceneContext
+from neuprim.core.task import Chunks
 from neuprim.plugins.blame import blamed
 from neuprim.runs.events import Events, Preparing
-from neuprim.runs.open import LOGS
+from neuprim.runs.open import LOGS, context_of
 
 __all__ = ["FOLDER", "TOGETHER", "Plan", "chunks_of", "plan_of"]
 
@@ -65,7 +64,7 @@ def chunks_of(config: RunConfig, events: Events) -> Chunks | None:
     """
     load = scene_of(config, task_of(config)).spec.chunks
     assert load is not None, "somebody asked for chunks"
-    context = SceneContext(config.seed, cache_directory() / "scenes", lambda text, fraction: events(Preparing(text, fraction)))
+    context = context_of(config, lambda text, fraction: events(Preparing(text, fraction)))
     scene = suspects_of(config).scene
     with blamed(scene.origin, f"chunks of {scene.what}", config.output_dir / LOGS):
         return load(config.to_dict(), context)

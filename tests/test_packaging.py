@@ -52,7 +52,7 @@ def test_the_wheel_holds_the_whole_package(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "old", "new", "message"),
     [
-        ("pyproject.toml", ', "**/*.html"', "", "none-any.whl lacks neuprim/report/template.html"),
+        pytest.param("pyproject.toml", ', "**/*.html"', "", "none-any.whl lacks neuprim/report/template.html", marks=pytest.mark.slow),
         ("pyproject.toml", 'include = ["neuprim*"]', 'include = ["neuprim*", "tests"]', "which is not the package's"),
         ("MANIFEST.in", "graft tests\n", "", ".tar.gz lacks tests/conftest.py"),
     ],

@@ -101,7 +101,7 @@ def before_runs(configs: Sequence[RunConfig], settings: LauncherSettings, hear: 
 
 
 def before_search(config: RunConfig, settings: LauncherSettings, progress: Callable[[str, float], None]) -> None:
-    """The ground truth of a search's trainings, as :func:`before_runs`; raises as :func:`make_truth`."""
+    """The ground truth of the trainings of one scene, as :func:`before_runs`; raises as :func:`make_truth`."""
 
     def tell(event: object) -> None:
         if isinstance(event, Preparing):

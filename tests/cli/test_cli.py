@@ -26,7 +26,7 @@ def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Stand-ins for the modules that do the work; they record what they were asked."""
     made: list[Any] = []
 
-    def run(config: RunConfig, events: Events) -> Path:
+    def run(config: RunConfig, events: Events, launcher: Any = None) -> Path:
         made.append(config)
         config.output_dir.mkdir(parents=True)
         (config.output_dir / "config.yaml").write_text(config.to_yaml())
@@ -90,7 +90,7 @@ def test_a_failing_combination_does_not_lose_the_others(
 ) -> None:
     ran = []
 
-    def run(config: RunConfig, events: Events) -> Path:
+    def run(config: RunConfig, events: Events, launcher: Any = None) -> Path:
         ran.append(config.seed)
         if config.seed == 1:
             raise NonFiniteError("w2 of primitive 3")
@@ -138,7 +138,7 @@ def test_one_line_and_status_2(calls: list[Any], capsys: pytest.CaptureFixture[s
 
 
 def test_errors_of_many_lines_become_one(calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    def run(config: RunConfig, events: Events) -> Path:
+    def run(config: RunConfig, events: Events, launcher: Any = None) -> Path:
         raise DataError("missing images:\n  a.png\n  b.png")
 
     monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", run)
@@ -147,10 +147,10 @@ def test_errors_of_many_lines_become_one(calls: list[Any], capsys: pytest.Captur
 
 
 def test_interrupt_is_130_and_a_bug_keeps_its_traceback(calls: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop(config: RunConfig, events: Events) -> Path:
+    def stop(config: RunConfig, events: Events, launcher: Any = None) -> Path:
         raise KeyboardInterrupt
 
-    def bug(config: RunConfig, events: Events) -> Path:
+    def bug(config: RunConfig, events: Events, launcher: Any = None) -> Path:
         raise ZeroDivisionError
 
     monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", stop)
@@ -166,7 +166,7 @@ def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
     """The words that it prints, read by a shell, are a command that resumes."""
     started: list[RunConfig] = []
 
-    def stop(config: RunConfig, events: Events) -> Path:
+    def stop(config: RunConfig, events: Events, launcher: Any = None) -> Path:
         config.output_dir.mkdir(parents=True, exist_ok=True)
         if config.seed == 3:
             (config.output_dir / "checkpoint.safetensors").touch()
@@ -202,7 +202,7 @@ def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
 
 
 def test_a_disk_that_refuses_is_no_bug(calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(config: RunConfig, events: Events) -> Path:
+    def full(config: RunConfig, events: Events, launcher: Any = None) -> Path:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", full)

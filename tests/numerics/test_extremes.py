@@ -12,8 +12,16 @@ from tests.numerics.extremes.regions import REGIONS, Region
 from tests.numerics.extremes.sweep import measure
 
 COARSE = 3
-EVERY = [(r, edge) for edge in EDGES for r in REGIONS if edge in r.edges]
-SINGLE = [r for r in REGIONS if not r.whole and not r.name.startswith("colour network")]  # those have no densities of their own
+NETWORKS = [r for r in REGIONS if r.name.startswith("colour network")]
+SINGLE = [r for r in REGIONS if not r.whole and r not in NETWORKS]  # those have no densities of their own
+EVERY = [
+    pytest.param(
+        r, edge, marks=[pytest.mark.slow] if edge == 1 and r in NETWORKS else []
+    )  # their kernels are those of edge 2 but for a polynomial
+    for edge in EDGES
+    for r in REGIONS
+    if edge in r.edges
+]
 
 
 @pytest.mark.parametrize(("region", "edge"), EVERY, ids=lambda x: getattr(x, "name", f"edge {x}"))

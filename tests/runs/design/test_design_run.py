@@ -172,6 +172,7 @@ def test_a_word_that_changes_nothing_is_no_model(scene: Path, tmp_path: Path) ->
     assert (("model.density.edge=0",), "the same model as the centre") in [(one.words, one.reason) for one in record.left_out]
 
 
+@pytest.mark.slow
 def test_several_are_trained_together_and_the_set_is_the_same(
     scene: Path, measured: tuple[Path, Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -81,6 +81,7 @@ def trainings(record: Record) -> list[tuple[Any, ...]]:
     return [(a.purpose, a.words, a.primitives, a.steps, a.quality("psnr")) for a in record.attempts]
 
 
+@pytest.mark.slow
 def test_launched_it_trains_two_lengths_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By a launcher that works here, at the pace that the clock says."""
     asked: list[list[str]] = []

@@ -9,25 +9,36 @@
   };
   const shadow = visibility === "none" ? null : { where: visibility, light: ({ light }) => light, size: 192, layers: 4, bias: 1 / 20, softness: 1 / 20 };
   const view = new Float64Array(3), towards = new Float64Array(3);
+  // What the light alone decides, kept while nothing but the camera moves: of each primitive its part of the phases, and what it gets of the light.
+  const lit = new Float64Array(count * hidden), share = new Float64Array(count), done = new Int32Array(count);
+  let known = "", turn = 0;
 
-  function at({ light, light_intensity }, eye) {
+  function illuminate(i, centre, light) {
+    for (let a = 0; a < 3; a++) towards[a] = light[a] - centre[a];
+    share[i] = 1 / typical / (falloff ? Math.max(lib.dot(towards, towards), 1e-12) : 1);
+    lib.unit(towards);
+    for (let h = 0, o = 3 * hidden * i; h < hidden; h++, o += 3) {
+      lit[i * hidden + h] = net_phase[i * hidden + h] + net_light[o] * towards[0] + net_light[o + 1] * towards[1] + net_light[o + 2] * towards[2];
+    }
+    done[i] = turn;
+  }
+
+  function at(conditions, eye) {
+    const { light, light_intensity } = conditions, words = JSON.stringify(conditions);
+    if (words !== known) {
+      known = words;
+      turn++;
+    }
     function look(i, centre, out) {
-      for (let a = 0; a < 3; a++) {
-        view[a] = centre[a] - eye[a];
-        towards[a] = light[a] - centre[a];
-      }
-      const squared = Math.max(lib.dot(towards, towards), 1e-12);
+      if (done[i] !== turn) illuminate(i, centre, light);
+      for (let a = 0; a < 3; a++) view[a] = centre[a] - eye[a];
       lib.unit(view);
-      lib.unit(towards);
       for (let c = 0; c < channels; c++) {
         out.base[c] = base(i, c);
-        out.factor[c] = light_intensity[c] / typical / (falloff ? squared : 1);
+        out.factor[c] = light_intensity[c] * share[i];
       }
-      for (let h = 0; h < hidden; h++) {
-        const o = (i * hidden + h) * 3;
-        let phase = net_phase[i * hidden + h];
-        for (let a = 0; a < 3; a++) phase += net_view[o + a] * view[a] + net_light[o + a] * towards[a];
-        out.phases[h] = boost * phase;
+      for (let h = 0, o = 3 * hidden * i; h < hidden; h++, o += 3) {
+        out.phases[h] = boost * (lit[i * hidden + h] + net_view[o] * view[0] + net_view[o + 1] * view[1] + net_view[o + 2] * view[2]);
       }
     }
     return { look };

@@ -23,7 +23,7 @@ from neuprim.runs.launch.status import Status
 from neuprim.runs.launch.table import launch
 from neuprim.runs.open import LOGS, context_of
 
-__all__ = ["before_runs", "before_search", "make_frames", "make_truth", "shares", "truth_of"]
+__all__ = ["before_runs", "before_training", "make_frames", "make_truth", "shares", "truth_of"]
 
 _MOST = 16
 """Frames that a worker takes at a time."""
@@ -100,7 +100,7 @@ def before_runs(configs: Sequence[RunConfig], settings: LauncherSettings, hear: 
             make_truth(configs[numbers[0]], settings, tell)
 
 
-def before_search(config: RunConfig, settings: LauncherSettings, progress: Callable[[str, float], None]) -> None:
+def before_training(config: RunConfig, settings: LauncherSettings, progress: Callable[[str, float], None]) -> None:
     """The ground truth of the trainings of one scene, as :func:`before_runs`; raises as :func:`make_truth`."""
 
     def tell(event: object) -> None:

@@ -21,7 +21,7 @@ from neuprim.runs.chunks.record import ChunkRecord, recorded
 from neuprim.runs.events import Events, Note, Preparing, silent
 from neuprim.runs.finetune import fine_tuner, steps_in
 from neuprim.runs.fit import Fitted
-from neuprim.runs.ground_truth import before_search
+from neuprim.runs.ground_truth import before_training
 from neuprim.runs.launch.jobs import Job, Result
 from neuprim.runs.launch.status import ENDED, Status
 from neuprim.runs.launch.table import FOLDER as LAUNCH
@@ -59,7 +59,7 @@ def train_in_chunks(
         KeyboardInterrupt: Ctrl-C came before all chunks were there; those at work have their checkpoints.
         NeuprimError: what a run may raise, a launcher that cannot work here, or chunks other than those that the run was begun with.
     """
-    before_search(config, launcher, lambda text, fraction: events(Preparing(text, fraction)))
+    before_training(config, launcher, lambda text, fraction: events(Preparing(text, fraction)))
     chunks = chunks_of(config, events)
     if chunks is None:
         events(Note(f"scene.chunks={config.scene['chunks']}: fitted as one run"))

@@ -20,7 +20,7 @@ from neuprim.runs.design.request import DesignRequest, Progress, Tell
 from neuprim.runs.design.session import Session
 from neuprim.runs.design.variants import CENTRE, Variant, check_knobs, in_turn, singles
 from neuprim.runs.fit import one_torch_thread
-from neuprim.runs.ground_truth import before_search
+from neuprim.runs.ground_truth import before_training
 from neuprim.runs.launch.share import own_share
 from neuprim.runs.lock import held
 from neuprim.runs.open import LOGS, load_dataset
@@ -63,7 +63,7 @@ def design_run(
         check_folder(folder, before, centre, request)
         stack.enter_context(held(folder, "set"))
         plan = old_plan(folder, before)
-        before_search(centre, request.launcher, progress)
+        before_training(centre, request.launcher, progress)
         dataset = load_dataset(centre, task, progress)
         check_dataset(dataset, task.conditions)
         record = kept_record(folder, before, same_of(centre, dataset, request), tell)

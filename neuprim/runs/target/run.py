@@ -14,7 +14,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.data.check import check_dataset
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.runs.events import Events, Preparing, silent
-from neuprim.runs.ground_truth import before_search
+from neuprim.runs.ground_truth import before_training
 from neuprim.runs.launch.share import own_share
 from neuprim.runs.lock import held
 from neuprim.runs.open import LOGS, load_dataset
@@ -62,7 +62,7 @@ def target_run(
         def progress(text: str, fraction: float) -> None:
             events(Preparing(text, fraction))
 
-        before_search(config, launcher, progress)
+        before_training(config, launcher, progress)
         dataset = load_dataset(config, task, progress)
         suspects.know(dataset)
         check_dataset(dataset, task.conditions)

@@ -194,7 +194,7 @@ def document(record: dict[str, Any]) -> str:
     said = (
         f"{s['count']:,} primitives at {s['size']} × {s['size']}: {s['hits']:,} hits in {s['slots']:,} slots of {s['pairs']:,} pairs; what forward keeps "
         f"of them for backward is {(8 * s['slots'] + 36 * s['pairs']) / 1e6:.0f} MB. Warp {record['warp']}, sm_{record['arch']}; measured on the H100 that "
-        "the record names, before the pairs' kernel kept fewer numbers."
+        "the record names, before kernels took the instructions that stand here."
     )
     return f"{said}\n\n" + "\n".join(lines)
 

@@ -15,9 +15,10 @@ from typing import Any
 from neuprim.core.compute.warp import FAST, wp
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.chord import chord, ray_of, through_chord, xyz
+from neuprim.core.render.cuda.chord import chord, phase, ray_of, through_chord, xyz
 from neuprim.core.render.cuda.forms import Form
 from neuprim.core.render.cuda.functions import TAU, band_of, cos_turns, sin_turns
+from neuprim.core.render.cuda.memory import element, hit_at, number
 from neuprim.core.render.cuda.together import row_sums, row_type
 
 __all__ = ["pairs_kernel", "pixel_of_slot", "sum_pairs"]
@@ -32,11 +33,6 @@ def pixel_of_slot(spans: Any, n: int, s: int):
             y += 8 >> b
     row = int(spans[n, y])
     return wp.vec2i((row & 15) + s - (row >> 8), y)
-
-
-@wp.func_native("return numbers.data[size_t(row) * size_t(width) + column];")
-def _element(numbers: wp.array(dtype=wp.float32), row: int, width: int, column: int) -> float:
-    """Of an array of rows, without the strides that an array of two dimensions keeps in registers."""
 
 
 @functools.cache
@@ -101,7 +97,7 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
                 begin = offsets[n]
                 count = offsets[n + 1] - begin
                 for s in range(lane, count, wp.static(L.WARP)):
-                    hit = hits[begin + s]
+                    hit = hit_at(hits, begin + s)
                     if hit[1] > 0.0:
                         at = pixel_of_slot(own, 0, s)
                         X = (corner & 65535) * L.TILE + at[0]
@@ -111,9 +107,9 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
                         py = float(Y) + 0.5
                         norm = mean * wp.length(wp.vec3((px - lens[2]) / lens[0], (py - lens[3]) / lens[1], 1.0))
                         g_weight += hit[1]
-                        g_error += hit[1] * error[pixel]
+                        g_error += hit[1] * number(error, pixel)
                         for k in range(wp.static(C)):
-                            g_colour[k] += hit[1] * _element(g_rgb, pixel, wp.static(C), k)
+                            g_colour[k] += hit[1] * element(g_rgb, pixel, wp.static(C), k)
                         c = chord(ray_of(row, 0), px, py)
                         q = c.x + (c.h - c.half) * c.e
                         scale = float(norm)  # I = scale half field
@@ -134,7 +130,7 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
                             w = row[0, wp.static(L.NEURONS + k)]
                             z = c.half * wp.dot(c.e, xyz(w))
                             band = pair(z)
-                            u = wp.dot(q, xyz(w)) + w[3]
+                            u = phase(q, w)
                             r = u - wp.rint(u)
                             cosine = cos_turns(r * r)
                             one = cosine * band[0]
@@ -159,7 +155,7 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
                         g_half = wp.dot(gv, c.e) + gs * field
                         g_mid = wp.dot(gq, c.e)
                         if wp.static(depth):
-                            g_mid += hit[1] * g_z[pixel] * row[0, L.REST][1]
+                            g_mid += hit[1] * number(g_z, pixel) * row[0, L.REST][1]
                         gD = float(0.0)
                         by_depth = 0.5 * c.h / D
                         if wp.static(P == 0):

@@ -10,6 +10,7 @@ from neuprim.core.compute.warp import FAST, wp
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.chord import pixel, place
 from neuprim.core.render.cuda.forms import Form
+from neuprim.core.render.cuda.memory import column_of, hit_at, leave_hit, span_of, whole
 
 __all__ = ["pixels_kernel"]
 
@@ -18,7 +19,8 @@ __all__ = ["pixels_kernel"]
 def pixels_kernel(form: Form, depth: bool) -> Any:
     """Of a form; ``depth``: a gradient of the sum of w z arrives, too."""
     C, H = form.channels, form.hidden
-    colours = L.colours(form.neurons)
+    colours, width = L.colours(form.neurons), L.columns(form.neurons, C)
+    vecC = wp.types.vector(length=C, dtype=wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
     def backward_pixels(
@@ -48,27 +50,30 @@ def pixels_kernel(form: Form, depth: bool) -> Any:
         if X < size[0] and Y < size[1]:
             n = Y * size[0] + X
             behind = transmittance[n] * g_transmittance[n]
+            own = vecC()
+            for k in range(wp.static(C)):
+                own[k] = g_rgb[n, k]
             first = starts[tile]
             count = reached[tile] - first
             for back in range(count):
                 p = first + count - 1 - back
-                slot = place(int(spans[p, at[1]]), offsets[p], at[0])
+                slot = place(span_of(spans, p, at[1]), whole(offsets, p), at[0])
                 if slot >= 0:
-                    hit = hits[slot]
+                    hit = hit_at(hits, slot)
                     alpha = hit[0]
                     out = wp.vec2()
                     if alpha > 0.0:
-                        i = ids[p]
+                        i = whole(ids, p)
                         weight = alpha * hit[1]
                         by_weight = float(0.0)
                         hue = wp.vec4()
                         for k in range(wp.static(C)):
                             if wp.static(H >= 0):
-                                by_weight += wp.max(hues[slot, k], 0.0) * g_rgb[n, k]
+                                by_weight += wp.max(hues[slot, k], 0.0) * own[k]
                             else:
                                 if wp.static(k % 4 == 0):
-                                    hue = rows[i, wp.static(colours + k // 4)]
-                                by_weight += hue[wp.static(k % 4)] * g_rgb[n, k]
+                                    hue = column_of(rows, i, wp.static(width), wp.static(colours + k // 4))
+                                by_weight += hue[wp.static(k % 4)] * own[k]
                         if wp.static(depth):
                             by_weight += g_z[n] * depths[slot]
                         slope = float(0.0)
@@ -76,6 +81,6 @@ def pixels_kernel(form: Form, depth: bool) -> Any:
                             slope = (1.0 - alpha) * hit[1] * by_weight - behind
                         behind += weight * by_weight
                         out = wp.vec2(slope, weight)
-                    hits[slot] = out
+                    leave_hit(hits, slot, out)
 
     return backward_pixels

@@ -14,9 +14,10 @@ from typing import Any
 from neuprim.core.compute.warp import FAST, wp
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.chord import chord, pixel, place, ray_of, xyz
+from neuprim.core.render.cuda.chord import chord, phase, pixel, place, ray_of, xyz
 from neuprim.core.render.cuda.forms import Form
 from neuprim.core.render.cuda.functions import band_of, cos_turns, opacity
+from neuprim.core.render.cuda.memory import hit_at, leave_hit, span_of, whole
 from neuprim.core.render.cuda.together import any_thread
 
 __all__ = ["BATCH", "CUT_AT", "forward_kernel"]
@@ -108,7 +109,7 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
                 units = wp.tile_load_indexed(net, indices=which, shape=(BATCH, net_width), axis=0, storage="shared")
             count = wp.min(BATCH, end - base)
             for j in range(count):
-                slot = place(int(spans[base + j, at[1]]), offsets[base + j], at[0])
+                slot = place(span_of(spans, base + j, at[1]), whole(offsets, base + j), at[0])
                 if slot >= 0:
                     alpha = float(0.0)
                     before = float(T)
@@ -126,11 +127,11 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
                         if wp.static(keep):
                             known = staged[j, L.REST][3]
                         if known > 0.0:
-                            alpha = hits[slot][0]
+                            alpha = hit_at(hits, slot)[0]
                             if wp.static(depth):
                                 mid = depths[slot]
                             if wp.static(listing):
-                                entry = hits[slot][1]
+                                entry = hit_at(hits, slot)[1]
                             if wp.static(H > 0):
                                 for k in range(wp.static(C)):
                                     tint[k] = hues[slot, k]
@@ -145,7 +146,7 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
                                     if wp.static(k % 4 == 0):
                                         w2 = staged[j, wp.static(amplitudes + k // 4)]
                                     w = staged[j, wp.static(L.NEURONS + k)]
-                                    u = wp.dot(q, xyz(w)) + w[3]
+                                    u = phase(q, w)
                                     r = u - wp.rint(u)
                                     field += w2[wp.static(k % 4)] * cos_turns(r * r) * value(wp.dot(v, xyz(w)))
                                 I = field * c.half * norm
@@ -160,7 +161,7 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
                                 if wp.static(H > 0):
                                     for h in range(wp.static(H)):
                                         w = units[j, wp.static(each * h)]
-                                        u = wp.dot(q, xyz(w)) + w[3]
+                                        u = phase(q, w)
                                         r = u - wp.rint(u)
                                         wave = cos_turns(r * r)
                                         for k in range(wp.static(C)):
@@ -195,7 +196,7 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
                                 depths[slot] = mid
                         T -= weight
                     if wp.static(keep):
-                        hits[slot] = wp.vec2(alpha, before)
+                        leave_hit(hits, slot, wp.vec2(alpha, before))
             done = base + count
             if any_thread(int(T >= limits[2])) == 0:
                 break

@@ -64,11 +64,10 @@ def band_of(edge: int) -> tuple[Function, Function]:
 
     @wp.func
     def value(v: float):
-        k = wp.rint(v)
-        r = v - k
+        if wp.abs(v) <= 0.5:
+            return low(v * v)
+        r = v - wp.rint(v)
         y = r * r
-        if k == 0.0:
-            return low(y)
         iz = 1.0 / (TAU * v)
         j0 = TAU * r * _sinc(y) * iz
         if wp.static(edge == 0):
@@ -80,11 +79,10 @@ def band_of(edge: int) -> tuple[Function, Function]:
 
     @wp.func
     def pair(v: float):
-        k = wp.rint(v)
-        r = v - k
+        if wp.abs(v) <= 0.5:
+            return wp.vec2(low(v * v), high(v * v))
+        r = v - wp.rint(v)
         y = r * r
-        if k == 0.0:
-            return wp.vec2(low(y), high(y))
         iz = 1.0 / (TAU * v)
         j0 = TAU * r * _sinc(y) * iz
         j1 = (j0 - cos_turns(y)) * iz

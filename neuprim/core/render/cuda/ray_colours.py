@@ -12,7 +12,7 @@ from neuprim.core.compute.warp import FAST, OPTIONS, wp
 from neuprim.core.render.cpu import layout as W
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.backward_pairs import pixel_of_slot
-from neuprim.core.render.cuda.chord import chord, ray_of, through_chord, xyz
+from neuprim.core.render.cuda.chord import chord, phase, ray_of, through_chord, xyz
 from neuprim.core.render.cuda.chord64 import chord64, through64
 from neuprim.core.render.cuda.forms import Form
 from neuprim.core.render.cuda.functions import TAU, cos_turns, sin_turns
@@ -77,7 +77,7 @@ def net_pairs_kernel(form: Form) -> Any:
                         gq = wp.vec3()
                         for j in range(wp.static(H)):
                             w = units[0, wp.static(each * j)]
-                            u = wp.dot(q, xyz(w)) + w[3]
+                            u = phase(q, w)
                             r = u - wp.rint(u)
                             cosine = cos_turns(r * r)
                             pull = float(0.0)

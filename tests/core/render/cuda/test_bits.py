@@ -12,7 +12,7 @@ from torch import Tensor
 pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
 
 from neuprim.core.compute import warp
-from neuprim.core.render.cuda import backend, binning, forward, frame, net, passes
+from neuprim.core.render.cuda import backend, binning, forward, frame, net, passes, prepare_backward
 from neuprim.core.render.cuda import layout as L
 from tests.core.render.cuda.frames import SCENES, Args, Launch, assert_same_bits, everything, intercept
 
@@ -95,6 +95,24 @@ def test_tiles_may_come_in_any_order(name: str, plain: dict[str, dict[str, Tenso
     intercept(monkeypatch, wrapped)
     assert_same_bits(plain[name], everything(name))
     assert {"forward_kernel", "pairs_kernel"} <= set(met)
+
+
+@pytest.mark.parametrize(("threads", "name"), [(32, "center, depth"), *((96, name) for name in SCENES), (512, "colour networks")])
+def test_blocks_may_be_of_any_size(threads: int, name: str, plain: dict[str, dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a block is a number of threads; it is a tile, or a warp, in kernels that work together, and these have one size."""
+    changed, together = set(), set()
+
+    def through(kernel: Any, dim: Any, inputs: Sequence[Any], device: torch.device, block: int = warp.BLOCK) -> None:
+        called = kernel.key.partition("__")[0]
+        one = isinstance(dim, Sequence) and len(dim) == 2 and dim[1] == block
+        (together if one else changed).add(called)
+        warp.launch(kernel, dim, inputs, device, block if one else threads)
+
+    for module in (binning, frame, net, passes, prepare_backward):
+        monkeypatch.setattr(module, "launch", through)
+    assert_same_bits(plain[name], everything(name))
+    assert {"row_spans", "sum_pairs", "_kernels", "_kernel"} <= changed  # of those made in a function, its name
+    assert {"forward_kernel", "pairs_kernel"} <= together
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -1,4 +1,4 @@
-"""Two things that numba has no word for: an array that is lent, and sixteen floats at once."""
+"""Things that numba has no word for: an array that is lent, and sixteen floats at once."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from numba.core.imputils import impl_ret_borrowed
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
-__all__ = ["copy16", "lent"]
+__all__ = ["copy16", "lent", "returned"]
 
 
 def _lent(context, array):  # type: ignore[no-untyped-def]
     """The same array without its owner: views of it count no references.
 
     Counting is atomic: it costs a pair of a few lanes as much as a vector of arithmetic, and threads that count views of one array wait for
-    each other. Only for arrays that somebody else keeps, such as the arguments of a kernel.
+    each other. Only for arrays that somebody else keeps, such as the arguments of a kernel; a kernel's own are given back by :func:`returned`
+    after the last use of what was lent.
     """
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
@@ -47,5 +48,15 @@ def _copy16(context, target, at, source, first):  # type: ignore[no-untyped-def]
     return types.void(target, types.intp, source, types.intp), code
 
 
+def _returned(context, array):  # type: ignore[no-untyped-def]
+    """Does nothing, after the last use of what an array of the kernel's own lent: numba lets go of it behind the last line that names it."""
+
+    def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return context.get_dummy_value()
+
+    return types.void(array), code
+
+
 lent: Any = intrinsic(_lent)
+returned: Any = intrinsic(_returned)
 copy16: Any = intrinsic(_copy16)

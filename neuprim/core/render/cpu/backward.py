@@ -160,20 +160,23 @@ def backward_tiles(  # type: ignore[no-untyped-def]
         tx, ty = (t % across) * L.TILE, (t // across) * L.TILE
         state[:] = f(0)
         deepest = 0
-        for y in range(L.TILE):
-            for x in range(L.TILE):
-                j, Y, X = y * L.TILE + x, ty + y, tx + x
-                state[j + L.T_] = f(1)
-                if X < width and Y < height:
-                    T = transmittance[Y, X]
-                    state[j + L.T_], state[j + L.NORM] = T, norms[Y, X]
-                    state[j + L.BEHIND] = T * g_transmittance[Y, X]
-                    state[j + L.LAST], state[j + L.ERR] = f(last[Y, X]), error[Y, X]
-                    if with_depth:
-                        state[j + L.GZ] = g_z[Y, X]
-                    for c in range(C):
-                        state[j + L.G_COLOR + c * L.PIXELS] = g_rgb[Y, X, c]
-                    deepest = max(deepest, last[Y, X])
+        down, wide_row = min(L.TILE, height - ty), min(L.TILE, width - tx)
+        for j in range(L.PIXELS):
+            state[index(j + L.T_)] = f(1)
+        for y in range(down):
+            Y, j = index(ty + y), y * L.TILE
+            for x in range(wide_row):
+                X, T = index(tx + x), transmittance[Y, index(tx + x)]
+                state[index(j + x + L.T_)], state[index(j + x + L.NORM)] = T, norms[Y, X]
+                state[index(j + x + L.BEHIND)] = T * g_transmittance[Y, X]
+                state[index(j + x + L.LAST)], state[index(j + x + L.ERR)] = f(last[Y, X]), error[Y, X]
+                deepest = max(deepest, last[Y, X])
+            if with_depth:
+                for x in range(wide_row):
+                    state[index(j + x + L.GZ)] = g_z[Y, index(tx + x)]
+            for c in range(C):
+                for x in range(wide_row):
+                    state[index(j + x + L.G_COLOR + c * L.PIXELS)] = g_rgb[Y, index(tx + x), index(c)]
         first = starts[t]
         for q in range(first + deepest, starts[t + 1]):
             pair_rows[q, :] = f(0)

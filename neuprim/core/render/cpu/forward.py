@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import inline, kernel
-from neuprim.core.compute.views import lent
+from neuprim.core.compute.views import lent, returned
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
-from neuprim.core.render.cpu.kept import alive, grown, room
+from neuprim.core.render.cpu.kept import alive, most_lanes, room
 from neuprim.core.render.cpu.neurons import field_values
 from neuprim.core.render.cpu.ray_colours import add_ray_colours, composite_rgb_ray_colours, ray_colours
 from neuprim.core.render.cpu.tiles import aligned, compact, fetch_ahead, row_spans
@@ -19,7 +19,6 @@ __all__ = ["composite_tiles"]
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
 _STEPS = np.arange(L.TILE).astype(np.float32)
-_LANES_PER_PAIR = 64  # that optical depths are given room for at first
 _LIVE_EVERY = 4  # pairs between two counts of live pixels: a dead row costs a few lanes, a count costs a reduction per row
 
 
@@ -83,30 +82,37 @@ def composite_tiles(  # type: ignore[no-untyped-def]
     starts, ids, colors, live, found = lent(starts), lent(ids), lent(colors), lent(live), lent(found)
     height, width = norms.shape
     keep = live.shape[0] > 0
-    depths = room(_LANES_PER_PAIR * (starts[stop] - starts[start]) if keep else 0)
     across = (width + L.TILE - 1) // L.TILE
+    found_depths = room(most_lanes(start, stop, across, boxes, starts, ids) if keep else 0)
+    depths = lent(found_depths)
     C = colors.shape[1]
     amin, amax, tmin, floor = limits[0], limits[1], limits[2], limits[3]
     scratch = L.FORWARD_SCRATCH
     if net is not None:
         scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
         waves = aligned(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
-    S, D = aligned(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64)
-    state = aligned((4 + C) * L.PIXELS + 2 * L.TILE)
-    w = np.zeros(L.TILE, np.float32)
-    bounds, offset = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32)
-    rows_live = np.zeros(L.TILE, np.float32)
+    lanes, wide_lanes, pixels, weights = (
+        aligned(scratch + 1024),
+        np.zeros(FLOAT64_SCRATCH, np.float64),
+        aligned((4 + C) * L.PIXELS + 2 * L.TILE),
+        aligned(L.TILE),
+    )
+    ends, begins, lives = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32), aligned(L.TILE)
+    S, D, state, w = lent(lanes), lent(wide_lanes), lent(pixels), lent(weights)
+    bounds, offset, rows_live = lent(ends), lent(begins), lent(lives)
     evaluated = 0
     for t in range(start, stop):
         tx, ty = (t % across) * L.TILE, (t // across) * L.TILE
         state[:] = f(0)
+        down, wide_row = min(L.TILE, height - ty), min(L.TILE, width - tx)
         for y in range(L.TILE):
-            rows_live[y] = f(1) if ty + y < height else f(0)
+            rows_live[y] = f(1) if y < down else f(0)
             for x in range(L.TILE):
+                state[index(y * L.TILE + x + L.T_)] = f(-1)  # outside the image: never live
+        for y in range(down):
+            for x in range(wide_row):
                 j = y * L.TILE + x
-                state[j + L.T_] = f(-1)  # outside the image: never live
-                if tx + x < width and ty + y < height:
-                    state[j + L.T_], state[j + L.NORM] = f(1), norms[ty + y, tx + x]
+                state[index(j + L.T_)], state[index(j + L.NORM)] = f(1), norms[index(ty + y), index(tx + x)]
         for q in range(starts[t], starts[t + 1]):
             if q + 1 < starts[t + 1]:
                 fetch_ahead(np.int64(ids[q + 1]), rows, spans, boxes)
@@ -121,8 +127,6 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                 live[q], found[q] = alive(rows_live), evaluated
             if n > 0:
                 n16 = ((n + 15) // 16) * 16
-                if keep and evaluated + n16 > depths.shape[0]:
-                    depths = grown(depths, evaluated + n16)
                 field_values(
                     S, D, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, kinds, neurons, floor, with_depth, False, edge
                 )
@@ -166,13 +170,21 @@ def composite_tiles(  # type: ignore[no-untyped-def]
                         any_live += rows_live[y]
                 if any_live == f(0):
                     break
-        for y in range(min(L.TILE, height - ty)):
-            for x in range(min(L.TILE, width - tx)):
-                j = y * L.TILE + x
-                for c in range(C):
-                    rgb[ty + y, tx + x, c] = state[j + L.COLOR + c * L.PIXELS] + state[j + L.T_] * background[c]
-                transmittance[ty + y, tx + x] = state[j + L.T_]
-                last[ty + y, tx + x] = np.int32(state[j + L.LAST])
-                if with_depth:
-                    zsum[ty + y, tx + x] = state[j + L.ZSUM]
-    return evaluated, depths
+        for y in range(down):
+            Y, j = index(ty + y), y * L.TILE
+            for x in range(wide_row):
+                transmittance[Y, index(tx + x)] = state[index(j + x + L.T_)]
+                last[Y, index(tx + x)] = np.int32(state[index(j + x + L.LAST)])
+            for c in range(C):
+                behind = background[c]
+                for x in range(wide_row):
+                    rgb[Y, index(tx + x), index(c)] = state[index(j + x + L.COLOR + c * L.PIXELS)] + state[index(j + x + L.T_)] * behind
+            if with_depth:
+                for x in range(wide_row):
+                    zsum[Y, index(tx + x)] = state[index(j + x + L.ZSUM)]
+    for mine in (lanes, pixels, weights, lives):
+        returned(mine)
+    returned(wide_lanes)
+    for numbers in (ends, begins):
+        returned(numbers)
+    return evaluated, found_depths

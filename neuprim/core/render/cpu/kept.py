@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from neuprim.core.compute.kernels import inline
 from neuprim.core.render.cpu import layout as L
 
-__all__ = ["Kept", "alive", "grown", "room"]
+__all__ = ["Kept", "alive", "most_lanes", "room"]
 
 
 @dataclass
@@ -55,8 +55,14 @@ def room(floats):  # type: ignore[no-untyped-def]
 
 
 @inline
-def grown(depths, floats):  # type: ignore[no-untyped-def]
-    """The same depths with room for at least so many."""
-    larger = room(max(2 * depths.shape[0], floats))
-    larger[: depths.shape[0]] = depths
-    return larger
+def most_lanes(start, stop, across, boxes, starts, ids):  # type: ignore[no-untyped-def]
+    """Lanes that the pairs of tiles ``start:stop`` have at most: pixels of their boxes, in whole vectors."""
+    lanes = 0
+    for t in range(start, stop):
+        tx, ty = (t % across) * L.TILE, (t // across) * L.TILE
+        for q in range(starts[t], starts[t + 1]):
+            box = boxes[ids[q]]
+            wide = min(box[2] - tx, L.TILE) - max(box[0] - tx, 0)
+            high = min(box[3] - ty, L.TILE) - max(box[1] - ty, 0)
+            lanes += (max(wide, 0) * max(high, 0) + 15) // 16 * 16
+    return lanes

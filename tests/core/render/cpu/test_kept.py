@@ -45,8 +45,8 @@ def kept_of(t: dict[str, torch.Tensor], monkeypatch: pytest.MonkeyPatch) -> tupl
     return found[0], out
 
 
-def test_depths_outgrow_their_first_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Primitives that fill their tiles have 256 lanes a pair: more than the room at first, and no lane is lost."""
+def test_there_is_room_for_the_depths_of_tiles_that_are_filled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Primitives that fill their tiles have 256 lanes a pair, as many as there is room for, and no lane is lost."""
     t = scenes.tensors(16, seed=2)
     t["log_scales"] = 0.9 + 0.3 * t["log_scales"]
     kept, out = kept_of(t, monkeypatch)

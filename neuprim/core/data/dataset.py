@@ -96,6 +96,7 @@ class PointCloud:
         alphas: (N,) opacities 0..1 through their middles.
         deviations: (N, 3) standard deviations along the axes in place of ``axes``, where the points are Gaussians: the density says how large
             an ellipsoid looks like each.
+        steps: condition name -> from one value at which views show the scene from many sides to the next, where that is known: a sequence's frames.
     """
 
     means: Tensor
@@ -105,11 +106,15 @@ class PointCloud:
     quats: Tensor | None = None
     alphas: Tensor | None = None
     deviations: Tensor | None = None
+    steps: Mapping[str, float] = field(default_factory=dict)
 
     def rows(self, index: Tensor) -> PointCloud:
         """The points at ``index``, (M,) int64 or (N,) bool, with all that belongs to them."""
-        ellipsoids = (None if value is None else value[index] for value in (self.axes, self.quats, self.alphas, self.deviations))
-        return PointCloud(self.means[index], self.colors[index], {n: value[index] for n, value in self.conditions.items()}, *ellipsoids)
+        axes, quats, alphas, deviations = (
+            None if value is None else value[index] for value in (self.axes, self.quats, self.alphas, self.deviations)
+        )
+        found = {n: value[index] for n, value in self.conditions.items()}
+        return PointCloud(self.means[index], self.colors[index], found, axes, quats, alphas, deviations, self.steps)
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ class InitContext:
         conditions: name -> (N,) condition at which each starting point was found ("time"), where the data set says so.
         axes: (N, 3) initial semi-axes and quats: (N, 4) wxyz their orientations, where the starting points are ellipsoids.
         alphas: (N,) opacities in 0..1 through their middles, where they have one.
+        steps: condition name -> from one of a sequence's frames to the next, where the data are one.
     """
 
     means: Tensor
@@ -49,6 +50,7 @@ class InitContext:
     axes: Tensor | None = None
     quats: Tensor | None = None
     alphas: Tensor | None = None
+    steps: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def thickness(self) -> Tensor:

@@ -58,7 +58,7 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
         neighbours = min(3, len(cloud.means) - 1)
         distance = torch.from_numpy(cKDTree(cloud.means.numpy()).query(cloud.means.numpy(), k=neighbours + 1)[0][:, 1:])
         scales = distance.square().mean(dim=1).sqrt().clamp_min(1e-6 * dataset.extent).float()
-    context = InitContext(cloud.means.float(), scales, cloud.colors.float(), generator, settings.init, cloud.conditions)
+    context = InitContext(cloud.means.float(), scales, cloud.colors.float(), generator, settings.init, cloud.conditions, steps=cloud.steps)
     factor = context.number("scale", 1.0, 0)
     context.scales, context.quats, context.alphas = scales * factor, cloud.quats, cloud.alphas
     axes = cloud.axes

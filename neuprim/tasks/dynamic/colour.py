@@ -118,9 +118,15 @@ class TimeHarmonics(ColourField):
         return dc, params.get("sh_rest")
 
     def pieces(self) -> tuple[Piece, ...]:
-        """Bands, and terms in time one by one."""
+        """Coefficients of the direction, each of one channel, and terms in time one by one."""
+        return (*sh.coefficients(self.degree, self.channels, "sh_rest"), *self._in_time())
+
+    def earlier_pieces(self) -> tuple[Piece, ...]:
+        return sh.bands(self.degree, "sh_rest")
+
+    def _in_time(self) -> tuple[Piece, ...]:
         terms = zip(_TIME, (self.powers, self.waves, self.waves), strict=True)
-        return (*sh.bands(self.degree, "sh_rest"), *(Piece(f"{name} {i + 1}", {name: (i,)}) for name, count in terms for i in range(count)))
+        return tuple(Piece(f"{name} {i + 1}", {name: (i,)}) for name, count in terms for i in range(count))
 
     def script(self) -> str:
         return script_beside(__package__, "colour.js")

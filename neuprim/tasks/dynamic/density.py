@@ -41,6 +41,7 @@ PARTS = ("phase", "offset", "window", "motion")
 """What may vary in time."""
 
 OFFSET_TERMS = 4
+_MOTION = ("velocity", "acceleration")
 
 
 def time_of(conditions: Conditions) -> Tensor:
@@ -58,13 +59,13 @@ class TimeDensity(DensityField):
     """f(x~, xi) of K cosine neurons whose ``time`` parts vary, see the module; 5K + 1 parameters and those of the parts.
 
     ``init`` of the model settings: as :class:`~neuprim.core.model.densities.cosine.CosineDensity`, and ``window``, the half width tau of a fresh
-    window in units of the sequence, and ``rate``, the bound of U(-rate, rate) that W_t starts from.
+    window in units of the sequence, ``window_frames``, how many frames of a sequence it is at most, and ``rate``, the bound of U(-rate, rate) that W_t starts from.
 
     Args:
         seams: (from, to) of the times over which one chunk of the sequence hands over to the next, ascending; none: the model is of one piece.
     """
 
-    init_settings = (*CosineDensity.init_settings, "window", "rate")
+    init_settings = (*CosineDensity.init_settings, "window", "window_frames", "rate")
 
     def __init__(
         self,
@@ -101,9 +102,9 @@ class TimeDensity(DensityField):
             specs += [ParameterSpec(name, (OFFSET_TERMS,), 3e-3, _zeros(OFFSET_TERMS)) for name in ("offset_cos", "offset_sin")]
         if "window" in self.parts:
             specs.append(ParameterSpec("window_center", (1,), 3e-3, _initial_center))
-            specs.append(ParameterSpec("log_window", (1,), 1e-2, lambda c: torch.full((c.count, 1), math.log(c.number("window", 0.2, 0)))))
+            specs.append(ParameterSpec("log_window", (1,), 1e-2, _initial_log_window))
         if "motion" in self.parts:
-            specs += [ParameterSpec(name, (3,), 1e-2, _zeros(3), lr_unit="extent") for name in ("velocity", "acceleration")]
+            specs += [ParameterSpec(name, (3,), 1e-2, _zeros(3), lr_unit="extent") for name in _MOTION]
         if self.seams:
             specs.append(ParameterSpec("chunk", (1,), 0.0, _zeros(1)))
         return specs
@@ -213,8 +214,11 @@ class TimeDensity(DensityField):
         if "offset" in self.parts:
             found.append(Piece("offset", {"offset_cos": (), "offset_sin": ()}))
         if "motion" in self.parts:
-            found += [Piece(name, {name: ()}) for name in ("velocity", "acceleration")]
+            found += [Piece(f"{name} {'xyz'[k]}", {name: (k,)}, name) for name in _MOTION for k in range(3)]
         return tuple(found)
+
+    def earlier_pieces(self) -> tuple[Piece, ...]:
+        return tuple(Piece(name, {name: ()}) for name in _MOTION) if "motion" in self.parts else ()
 
     def script(self) -> str:
         return script_beside(__package__, "density.js")
@@ -242,3 +246,11 @@ def _initial_center(ctx: InitContext) -> Tensor:
     if "time" in ctx.conditions:
         return ctx.conditions["time"].float().reshape(-1, 1)
     return (ctx.uniform(1) + 1) / 2
+
+
+def _initial_log_window(ctx: InitContext) -> Tensor:
+    """A sequence that is longer shows more events, not longer ones, so that frames say how long a fresh primitive should live."""
+    half = ctx.number("window", 0.2, 0)
+    if ctx.settings.get("window_frames") is not None and "time" in ctx.steps:
+        half = min(half, ctx.number("window_frames", 1.0, 0) * ctx.steps["time"])
+    return torch.full((ctx.count, 1), math.log(half))

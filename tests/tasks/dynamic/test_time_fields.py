@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
 from neuprim.config import compose
+from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
@@ -265,3 +267,25 @@ def test_the_task_rebuilds_its_fields_from_their_settings() -> None:
     for field in (TimeDensity(3, "offset+window"), TimeHarmonics(1, 3, 0.0, 2, 0, "printed")):
         again = TASK.fields[type(field).__name__](**field.settings())  # type: ignore[index]
         assert [(s.name, s.shape) for s in again.parameters()] == [(s.name, s.shape) for s in field.parameters()]
+
+
+@pytest.mark.parametrize(
+    ("settings", "step", "expected"),
+    [
+        ({"window": 0.3, "window_frames": 12}, 0.01, 0.12),
+        ({"window": 0.3, "window_frames": 12}, 0.05, 0.3),  # a short sequence
+        ({"window": 0.3}, 0.01, 0.3),
+        ({"window": 0.3, "window_frames": None}, 0.01, 0.3),
+        ({"window": 0.3, "window_frames": 12}, None, 0.3),  # images with a time each
+    ],
+)
+def test_a_fresh_window_is_so_many_frames_at_most(settings: dict[str, object], step: float | None, expected: float) -> None:
+    spec = next(spec for spec in TimeDensity(0, "window").parameters() if spec.name == "log_window")
+    made = spec.init(replace(_context(7, **settings), steps={} if step is None else {"time": step}))
+    assert made.shape == (7, 1) and torch.allclose(made.exp(), torch.tensor(expected), rtol=1e-5)
+
+
+def test_a_window_of_no_frames_is_refused() -> None:
+    spec = next(spec for spec in TimeDensity(0, "window").parameters() if spec.name == "log_window")
+    with pytest.raises(ConfigError, match=r"model\.init\.window_frames=0"):
+        spec.init(replace(_context(7, window_frames=0), steps={"time": 0.1}))

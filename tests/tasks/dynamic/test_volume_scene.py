@@ -75,6 +75,7 @@ def test_starting_points_lie_where_and_when_there_is_matter(folder: Path, tmp_pa
     cloud = data.initial_points(500, torch.Generator().manual_seed(1))
     again = data.initial_points(500, torch.Generator().manual_seed(1))
     assert torch.equal(cloud.means, again.means) and torch.equal(cloud.conditions["time"], again.conditions["time"])
+    assert cloud.steps == {"time": pytest.approx(1 / 9)} == cloud.rows(torch.arange(3)).steps
     world = recorded(data).capture.normalisation.to_world(cloud.means.numpy())
     for time, center in ((7 / 9, 8.0), (8 / 9, 12.0), (1.0, 16.0)):
         here = (cloud.conditions["time"] - time).abs() < 1e-6

@@ -130,7 +130,9 @@ class Recording:
             means.append(place)
             colors.append(torch.from_numpy(stored["colors"])[rows] / self.exposure)
             times.append(torch.full((wanted,), float(self.test.times[t])))
-        return PointCloud(torch.cat(means), torch.cat(colors), {"time": torch.cat(times)})
+        apart_by = np.diff([float(time) for time in self.test.times][:: self.every])
+        steps = {"time": float(np.median(apart_by))} if len(apart_by) else {}
+        return PointCloud(torch.cat(means), torch.cat(colors), {"time": torch.cat(times)}, steps=steps)
 
     def track(self, index: int) -> Tensor:
         """(H, W) bool, the pixels that show matter in some frame of a test view's camera; kept, as all frames of a camera share it."""

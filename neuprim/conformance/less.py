@@ -54,13 +54,16 @@ def check_pieces(t: Subject) -> None:
         t.require(len(set(names)) == len(names), f"{type(own).__name__}.pieces()", names, "names that are there once")
     pieces = pieces_by_name(model.density, model.colour)
     taken = {name: torch.zeros_like(value, dtype=torch.bool) for name, value in model.params.items()}
+    drawn: set[str] = set()
     for name, piece in pieces.items():
         _place(t, model.params, taken, name, piece)
         gone = torch.arange(model.count) % 2 == 0
         less = Primitives(model.density, model.colour, without({name: (piece, gone)}, model.params))
         t.require(bool((alive(piece, less.params) == ~gone).all()), f"piece {name!r}", "numbers that stay", "zeros where it is gone")
-        for view in t.views()[:2]:
-            t.image(f"image without {name!r}", less, view)
+        if piece.group not in drawn:  # of pieces that are told of together, such as the coefficients of a band, one is drawn
+            for view in t.views()[:2]:
+                t.image(f"image without {name!r}", less, view)
+        drawn |= {piece.group} - {""}
 
 
 def _place(t: Subject, params: Mapping[str, Any], taken: dict[str, Any], name: str, piece: Piece) -> None:

@@ -22,7 +22,7 @@ from neuprim.core.io.files import atomic_path
 from neuprim.core.io.pieces import Kind, write_pieces
 from neuprim.core.model.fields import ColourField, DensityField, pieces_by_name
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.zeros import split_off, whole
+from neuprim.core.model.zeros import of_pieces, split_off, whole
 from neuprim.core.task import TaskSpec
 
 __all__ = [
@@ -146,11 +146,11 @@ def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any
     """Write what rendering needs. ``extra`` (JSON-able) joins the header: background, colour space, data source.
 
     Args:
-        without_zeros: whether pieces that are zero are left out (:mod:`neuprim.core.model.zeros`), as in models that were pruned.
+        without_zeros: whether zeros of the fields are left out (:mod:`neuprim.core.model.zeros`), as in models that were pruned.
     """
-    pieces = pieces_by_name(model.density, model.colour) if without_zeros else {}
-    tensors, apart = split_off(model.params, model.specs, pieces)
-    write(path, "model", tensors, {**model_header(model, task, extra), **({"apart": apart} if apart else {})})
+    specs = (*model.density.parameters(), *model.colour.parameters()) if without_zeros else ()
+    tensors, sparse = split_off(model.params, specs)
+    write(path, "model", tensors, {**model_header(model, task, extra), **({"sparse": sparse} if sparse else {})})
 
 
 def save_compressed(
@@ -221,9 +221,11 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
         raise CheckpointError(
             f"{path}: density and colour fields are {type(density).__name__} and {type(colour).__name__}; expected one of each"
         )
-    if "apart" in header:
-        known = pieces_by_name(density, colour)
-        tensors = whole(tensors, header.pop("apart"), (*density.parameters(), *colour.parameters()), known, str(path))
+    own = (*density.parameters(), *colour.parameters())
+    if "sparse" in header:
+        tensors = whole(tensors, header.pop("sparse"), own, str(path))
+    elif "apart" in header:
+        tensors = of_pieces(tensors, header.pop("apart"), own, pieces_by_name(density, colour, earlier=True), str(path))
     try:
         model = Primitives(density, colour, tensors)
     except (ValueError, KeyError, TypeError, IndexError) as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from neuprim.core.model.fields import pieces_by_name
-from neuprim.core.model.pieces import alive
+from neuprim.core.model.pieces import alive, numbers_of
 from neuprim.core.model.primitives import Primitives
 
 __all__ = ["PRUNED", "kept_pieces", "kept_words"]
@@ -13,11 +13,17 @@ PRUNED = "pruned.json"
 
 
 def kept_pieces(model: Primitives) -> dict[str, float]:
-    """Piece -> share of the primitives that have it."""
-    pieces = pieces_by_name(model.density, model.colour)
-    return {name: float(alive(piece, model.params).float().mean()) if model.count else 0.0 for name, piece in pieces.items()}
+    """Group of pieces -> share of its numbers that are kept, 0 to 1, as ``density.neuron 0`` and ``colour.band 1``."""
+    kept: dict[str, float] = {}
+    sizes: dict[str, int] = {}
+    for name, piece in pieces_by_name(model.density, model.colour).items():
+        group = f"{name.partition('.')[0]}.{piece.group or piece.name}"
+        own = numbers_of(piece, model.params)
+        share = float(alive(piece, model.params).float().mean()) if model.count else 0.0
+        kept[group], sizes[group] = kept.get(group, 0.0) + own * share, sizes.get(group, 0) + own
+    return {group: value / sizes[group] for group, value in kept.items()}
 
 
 def kept_words(kept: dict[str, float]) -> list[str]:
-    """A line for every piece that some primitives do without."""
-    return [f"{name}: kept by {share:.0%} of the primitives" for name, share in kept.items() if share < 1]
+    """A line for every group of pieces that is not whole."""
+    return [f"{name}: {share:.0%} of its numbers are kept" for name, share in kept.items() if share < 1]

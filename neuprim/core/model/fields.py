@@ -134,6 +134,10 @@ class Field(ABC):
         """What single primitives can do without, each a set of numbers that mean nothing once they are zero; no number is in two of them."""
         return ()
 
+    def earlier_pieces(self) -> tuple[Piece, ...]:
+        """Pieces that are none any more, by which files of earlier versions leave numbers out."""
+        return ()
+
     def folded(self, params: Params) -> dict[str, Tensor]:
         """The same field in numbers that lie as close together as they can, for files where each has few bits.
 
@@ -149,9 +153,13 @@ class Field(ABC):
         return None
 
 
-def pieces_by_name(density: DensityField, colour: ColourField) -> dict[str, Piece]:
-    """The pieces of both fields, as ``density.neuron 0`` and ``colour.band 1``."""
-    return {f"{kind}.{piece.name}": piece for kind, own in (("density", density), ("colour", colour)) for piece in own.pieces()}
+def pieces_by_name(density: DensityField, colour: ColourField, earlier: bool = False) -> dict[str, Piece]:
+    """The pieces of both fields, as ``density.neuron 0`` and ``colour.coefficient 1 +0, channel 2``; ``earlier``: with those of earlier files."""
+    found = {}
+    for kind, own in (("density", density), ("colour", colour)):
+        for piece in (*own.pieces(), *(own.earlier_pieces() if earlier else ())):
+            found[f"{kind}.{piece.name}"] = piece
+    return found
 
 
 class DensityField(Field):

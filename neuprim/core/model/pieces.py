@@ -1,7 +1,7 @@
-"""Parts of a primitive's fields that it may do without: a band of its colour, a neuron of its density, a wave in time.
+"""Parts of a primitive's fields that it may do without: a coefficient of its colour, a neuron of its density, a wave in time.
 
-A piece names numbers that mean nothing once they are zero. Pruning decides for every primitive which pieces it keeps; files leave out what is
-zero (:mod:`neuprim.core.model.zeros`), and compressed files have next to nothing to say about it.
+A piece names numbers that mean nothing once they are zero, as few as can go by themselves. Pruning decides for every primitive which pieces it
+keeps; files leave out what is zero (:mod:`neuprim.core.model.zeros`), and compressed files have next to nothing to say about it.
 """
 
 from __future__ import annotations
@@ -26,12 +26,14 @@ class Piece:
     """Numbers of a field that go together.
 
     Attributes:
-        name: unique within the field, e.g. "band 2".
+        name: unique within the field, e.g. "neuron 2".
         places: parameter -> where its numbers are.
+        group: what people are told of it together with others, e.g. "band 2"; empty: its name.
     """
 
     name: str
     places: Mapping[str, Place]
+    group: str = ""
 
     def of(self, params: Params) -> dict[str, Tensor]:
         """Views of the numbers, (N, ...) each."""

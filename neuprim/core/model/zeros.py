@@ -1,11 +1,12 @@
-"""Model files without what is zero: pieces that primitives do without (:mod:`neuprim.core.model.pieces`) are left out row by row.
+"""Model files without what is zero, as pruning leaves it (:mod:`neuprim.core.model.pieces`).
 
-A parameter all of whose numbers belong to pieces is stored as one tensor ``NAME|KIND.PIECE`` per piece, with the rows that have it, if that is
-less. Who has a piece stands in ``rows|KIND.PIECE``, uint8, a bit per primitive, the lowest bit first. Tensors in memory are whole.
+A parameter is stored as two tensors, if that is less: ``NAME|there``, uint8, a bit for each of its numbers, row by row and the lowest bit first,
+and ``NAME|numbers``, float32, those whose bit is set. Tensors in memory are whole. Earlier files name pieces instead, see :func:`of_pieces`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -13,66 +14,76 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import CheckpointError
-from neuprim.core.model.pieces import Piece, alive
+from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import ParameterSpec, Params
 
-__all__ = ["split_off", "whole"]
+__all__ = ["of_pieces", "split_off", "whole"]
 
+_THERE, _NUMBERS = "|there", "|numbers"
 _ROWS = "rows|"
 
 
-def split_off(params: Params, specs: Sequence[ParameterSpec], pieces: Mapping[str, Piece]) -> tuple[dict[str, Tensor], list[str]]:
-    """Tensors as a file holds them, and the names of the pieces that are stored apart.
-
-    Args:
-        pieces: name -> piece, of all fields of the model.
-    """
-    apart = {name: alive(piece, params) for name, piece in pieces.items()}
-    apart = {name: has for name, has in apart.items() if not bool(has.all())}
-    covered = {spec.name for spec in specs if _covered(spec, pieces)}
-    apart = {name: has for name, has in apart.items() if set(pieces[name].places) <= covered}
-    split = {name for piece in apart for name in pieces[piece].places}
-    stored = {name: value for name, value in params.items() if name not in split}
-    used = [name for name, piece in pieces.items() if set(piece.places) & split]
-    for name in used:
-        has = apart.get(name, torch.ones(len(params["means"]), dtype=torch.bool, device=params["means"].device))
-        for parameter, value in pieces[name].of(params).items():
-            if parameter in split:
-                stored[f"{parameter}|{name}"] = value.detach()[has].contiguous()
-        stored[_ROWS + name] = torch.from_numpy(np.packbits(has.cpu().numpy(), bitorder="little"))
-    before, after = (sum(t.numel() * t.element_size() for t in tensors.values()) for tensors in (params, stored))
-    return (stored, used) if after < before else (dict(params), [])
+def split_off(params: Params, specs: Sequence[ParameterSpec]) -> tuple[dict[str, Tensor], list[str]]:
+    """Tensors as a file holds them, and the names of the parameters without their zeros; ``specs`` are those of the fields."""
+    stored, sparse = dict(params), []
+    for name in (spec.name for spec in specs):
+        value = params[name]
+        numbers = value.detach().cpu().contiguous().flatten()
+        there = numbers.view(torch.int32) != 0  # by its bits: a zero below zero is there
+        if 4 * int(there.sum()) + (len(there) + 7) // 8 < 4 * len(there):
+            del stored[name]
+            stored[name + _THERE] = torch.from_numpy(np.packbits(there.numpy(), bitorder="little"))
+            stored[name + _NUMBERS] = numbers[there].contiguous()
+            sparse.append(name)
+    return stored, sparse
 
 
-def _covered(spec: ParameterSpec, pieces: Mapping[str, Piece]) -> bool:
-    """Whether every number of a parameter belongs to a piece."""
-    seen = torch.zeros(spec.shape, dtype=torch.bool)
-    for piece in pieces.values():
-        if spec.name in piece.places:
-            seen[piece.places[spec.name]] = True
-    return bool(seen.all()) and spec.size > 0
-
-
-def whole(stored: Params, names: object, specs: Sequence[ParameterSpec], pieces: Mapping[str, Piece], where: str) -> dict[str, Tensor]:
+def whole(stored: Params, names: object, specs: Sequence[ParameterSpec], where: str) -> dict[str, Tensor]:
     """The tensors of a model from those of its file.
 
     Args:
-        names: of the pieces that are stored apart, as the file's header has them.
+        names: of the parameters without their zeros, as the file's header has them.
+        specs: of the fields' parameters.
         where: the file, for messages.
+
+    Raises:
+        CheckpointError: they do not fit the model's fields or each other.
+    """
+    shapes = {spec.name: spec.shape for spec in specs}
+    if not isinstance(names, list) or not all(isinstance(name, str) and name in shapes for name in names):
+        raise CheckpointError(
+            f"{where}: header field 'sparse' is {names!r}; expected parameters of the model's fields: {', '.join(shapes)}"
+        )
+    count = _count(stored, where)
+    found = {name: value for name, value in stored.items() if not name.endswith((_THERE, _NUMBERS))}
+    for name in names:
+        size = count * math.prod(shapes[name])
+        there = _bits(stored.get(name + _THERE), size, f"{where}: {name + _THERE}")
+        numbers = _expected(stored.get(name + _NUMBERS), (int(there.sum()),), f"{where}: {name + _NUMBERS}")
+        if name in found:
+            raise CheckpointError(f"{where}: {name} is there twice, as {name} and as {name + _NUMBERS}; expected one of them")
+        found[name] = torch.zeros(size).masked_scatter_(there, numbers).reshape(count, *shapes[name])
+    _no_more(stored, {*found, *(name + part for name in names for part in (_THERE, _NUMBERS))}, where, "no parameter")
+    return found
+
+
+def of_pieces(stored: Params, names: object, specs: Sequence[ParameterSpec], pieces: Mapping[str, Piece], where: str) -> dict[str, Tensor]:
+    """The same of a file of earlier, in which a piece was ``NAME|KIND.PIECE`` with the rows that have it, by ``rows|KIND.PIECE``, a bit for each primitive.
+
+    Args:
+        names: of the pieces that are stored apart.
+        pieces: name -> piece, those of earlier included.
 
     Raises:
         CheckpointError: they do not fit the model's fields or each other.
     """
     if not isinstance(names, list) or not all(isinstance(name, str) and name in pieces for name in names):
         raise CheckpointError(f"{where}: header field 'apart' is {names!r}; expected pieces of the model's fields: {', '.join(pieces)}")
-    means = stored.get("means")
-    if means is None or means.dim() != 2:
-        raise CheckpointError(f"{where}: no tensor 'means' (N, 3)")
-    count, shapes = len(means), {spec.name: spec.shape for spec in specs}
+    count, shapes = _count(stored, where), {spec.name: spec.shape for spec in specs}
     found = {name: value for name, value in stored.items() if "|" not in name}
     taken = set(found)
     for name in names:
-        has = _rows(stored.get(_ROWS + name), count, f"{where}: {_ROWS + name}")
+        has = _bits(stored.get(_ROWS + name), count, f"{where}: {_ROWS + name}")
         taken.add(_ROWS + name)
         for parameter, place in pieces[name].places.items():
             key = f"{parameter}|{name}"
@@ -80,19 +91,33 @@ def whole(stored: Params, names: object, specs: Sequence[ParameterSpec], pieces:
                 continue  # some of a piece's parameters may be whole
             target = found.setdefault(parameter, torch.zeros(count, *shapes[parameter]))
             wanted = (int(has.sum()), *target[(slice(None), *place)].shape[1:])
-            part = stored.get(key)
-            if part is None or tuple(part.shape) != wanted or part.dtype != torch.float32:
-                shown = "missing" if part is None else f"{part.dtype} {tuple(part.shape)}"
-                raise CheckpointError(f"{where}: {key} is {shown}; expected torch.float32 {wanted}")
-            target[(has, *place)] = part
+            target[(has, *place)] = _expected(stored.get(key), wanted, f"{where}: {key}")
             taken.add(key)
-    extra = sorted(set(stored) - taken)
-    if extra:
-        raise CheckpointError(f"{where}: tensor {extra[0]!r} belongs to no piece")
+    _no_more(stored, taken, where, "no piece")
     return found
 
 
-def _rows(bits: Tensor | None, count: int, what: str) -> Tensor:
+def _count(stored: Params, where: str) -> int:
+    means = stored.get("means")
+    if means is None or means.dim() != 2:
+        raise CheckpointError(f"{where}: no tensor 'means' (N, 3)")
+    return len(means)
+
+
+def _expected(part: Tensor | None, shape: tuple[int, ...], what: str) -> Tensor:
+    if part is None or tuple(part.shape) != shape or part.dtype != torch.float32:
+        shown = "missing" if part is None else f"{part.dtype} {tuple(part.shape)}"
+        raise CheckpointError(f"{what} is {shown}; expected torch.float32 {shape}")
+    return part
+
+
+def _no_more(stored: Params, taken: set[str], where: str, to: str) -> None:
+    extra = sorted(set(stored) - taken)
+    if extra:
+        raise CheckpointError(f"{where}: tensor {extra[0]!r} belongs to {to}")
+
+
+def _bits(bits: Tensor | None, count: int, what: str) -> Tensor:
     if bits is None or bits.dtype != torch.uint8 or tuple(bits.shape) != ((count + 7) // 8,):
         shown = "missing" if bits is None else f"{bits.dtype} {tuple(bits.shape)}"
         raise CheckpointError(f"{what} is {shown}; expected torch.uint8 ({(count + 7) // 8},)")

@@ -31,7 +31,7 @@ _BITE = 8.0
 """dB that the first cut loses at once, over the tolerance: what training brings back most of."""
 
 _ENOUGH = 0.1
-"""Share of the tolerance below which no further cut is worth its steps."""
+"""Share of the tolerance below which there is nothing to cut for: what is left is trained for a round instead, which wins a little back."""
 
 _FREE = 0.02
 """Share of the tolerance that counts as nothing."""
@@ -78,6 +78,11 @@ class _State:
         return Stage(self.words, self.model.count, numbers(self.model), self.cut, base - self.lost, stays)
 
 
+def _saved(model: Primitives, less: Primitives, size: int) -> float:
+    """Share that is saved: of a file's numbers, or of those that every frame works through, where single ones of them are zero already."""
+    return max(1 - numbers(less) / size, 1 - less.parameters_per_primitive / model.parameters_per_primitive)
+
+
 @dataclass
 class Search:
     """One pruning.
@@ -109,28 +114,37 @@ class Search:
         bite = self.tolerance * (1.0 + (_BITE - 1.0) * min(self.steps / rounds / _LEAST, 1.0))
         for number in range(rounds):
             left = self.tolerance - max(best.lost, 0.0)
-            if left < _ENOUGH * self.tolerance or not best.model.count:
+            if not best.model.count:
                 break
             if tried is None:  # else what the last cut left is trained for longer
                 if apart:  # what failed together with others is tried by itself
                     tried, apart = self._without(best, apart, bite), ()
+                elif left < _ENOUGH * self.tolerance:
+                    tried = replace(best, cut=self.base - best.lost)
                 else:
                     tried = self._cut(best, bite if self.steps else left, number / rounds)
-                if numbers(tried.model) >= numbers(best.model):
-                    break
+                    if numbers(tried.model) >= numbers(best.model):
+                        break
                 bite = tried.bite
+            before, smaller = tried, numbers(tried.model) < numbers(best.model)
             tried = self._trained(tried, number, rounds)
             spent, stays = tried.lost - best.lost, tried.lost <= self.tolerance + 1e-9
             self.stages.append(tried.stage(self.base, stays))
-            if stays:
+            if not smaller:
+                best, tried = min(best, tried, key=lambda state: state.lost), None
+            elif stays:
                 bite *= min(max((left - spent) / max(spent, 0.25 * self.tolerance), 1.0 / _BITE), 2.0)
-                best, tried = tried, None
-            elif tried.rounds > 1 or tried.lost > _PATIENCE * self.tolerance:
+                best, tried = replace(tried, bite=bite), None
+            elif tried.lost > self._hopeless(before, tried):
                 apart = () if tried.alone else tried.words[len(best.words) :]
                 bite *= 1.0 if tried.alone else min(max(0.7 * left / max(spent, 1e-9), 0.2), 0.7)
                 tried = None
         last = {word.partition("=")[0]: word for word in best.words}  # degree 0 after degree 2 is degree 0
         return best.model, tuple(last.values())
+
+    def _hopeless(self, before: _State, now: _State) -> float:
+        """dB from which on what was lost after a round is taken back: more than another round like it would win."""
+        return self.tolerance * _PATIENCE if now.rounds == 1 else self.tolerance + before.lost - now.lost
 
     # ------------------------------------------------------------ one stage
 
@@ -152,7 +166,7 @@ class Search:
             for kind, name, value in steps_down(smaller):
                 less = with_less(smaller, kind, name, value)
                 drop = start - quick(less)
-                if drop <= min(bite, price * (1 - numbers(less) / size)) or drop - lost <= _FREE * self.tolerance:
+                if drop <= min(bite, price * _saved(model, less, size)) or drop - lost <= _FREE * self.tolerance:
                     smaller, lost, again = less, max(drop, lost), True
                     words.append(f"{kind}.{name}={value}")
                     break

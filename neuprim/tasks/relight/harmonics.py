@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
 from neuprim.core.compute import device
-from neuprim.core.model.colours.sh import bands, fewer_bands
+from neuprim.core.model.colours.sh import bands, coefficients, fewer_bands
 from neuprim.core.model.fields import ColourField, Conditions, Constant
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pieces import Piece
@@ -51,7 +51,10 @@ class LightHarmonics(ColourField):
         return LightHarmonics(**{**self.settings(), "degree": value}), fewer_bands(params, "light_sh", value)
 
     def pieces(self) -> tuple[Piece, ...]:
-        """Bands."""
+        """Coefficients, each of one channel."""
+        return coefficients(self.degree, self.channels, "light_sh")
+
+    def earlier_pieces(self) -> tuple[Piece, ...]:
         return bands(self.degree, "light_sh")
 
     def script(self) -> str:

@@ -55,7 +55,10 @@ class SphericalHarmonics(ColourField):
         return params["sh_dc"], params.get("sh_rest")
 
     def pieces(self) -> tuple[Piece, ...]:
-        """Bands."""
+        """Coefficients, each of one channel."""
+        return sh.coefficients(self.degree, self.channels, "sh_rest")
+
+    def earlier_pieces(self) -> tuple[Piece, ...]:
         return sh.bands(self.degree, "sh_rest")
 
     def script(self) -> str:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
+from torch import Tensor
 
 from neuprim.core import checkpoint
 from neuprim.core.errors import CheckpointError
@@ -15,7 +17,7 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import Field, pieces_by_name
 from neuprim.core.model.pieces import alive, numbers_of, without, worth
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.zeros import split_off, whole
+from neuprim.core.model.zeros import of_pieces, split_off, whole
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.registry import load_task
 from neuprim.tasks.dynamic.colour import TimeHarmonics
@@ -82,35 +84,69 @@ def test_a_neuron_that_is_gone_is_a_field_without_it() -> None:
 
 def test_worth_is_the_first_order_of_doing_without() -> None:
     model = made(*PAIRS[0])
-    piece = pieces_by_name(model.density, model.colour)["colour.band 2"]
+    piece = pieces_by_name(model.density, model.colour)["colour.coefficient 2 +0, channel 1"]
     params = {name: value.clone().requires_grad_() for name, value in model.params.items()}
     weights = torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(1))
     colours = 5.0 + sum((params["sh_rest"][:, i] for i in range(15)), torch.zeros(COUNT, 3))  # linear, as harmonics are
     (colours * weights).sum().backward()
     gradients = {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()}
-    expected = (model.params["sh_rest"][:, 3:8].sum(1) * weights).sum(1)
+    expected = model.params["sh_rest"][:, 5, 1] * weights[:, 1]
     assert torch.allclose(worth(piece, params, gradients), expected, atol=1e-5)
 
 
 # ---------------------------------------------------------------- files
 
+BITS = (45 * COUNT + 7) // 8  # bytes of the bits of COUNT primitives' coefficients of degree 3
+
 
 @pytest.mark.parametrize(("density", "colour"), PAIRS, ids=lambda field: type(field).__name__)
 def test_files_leave_zeros_out_and_give_them_back(density: Field, colour: Field) -> None:
     model = pruned(made(density, colour))
-    pieces = pieces_by_name(model.density, model.colour)
-    stored, apart = split_off(model.params, model.specs, pieces)
     own = (*model.density.parameters(), *model.colour.parameters())
-    again = whole(stored, apart, own, pieces, "file")
-    assert apart and again.keys() == model.params.keys()
-    assert all(torch.equal(again[name], value) for name, value in model.params.items())
+    stored, sparse = split_off(model.params, own)
+    again = whole(stored, sparse, own, "file")
+    assert sparse and again.keys() == model.params.keys()
+    assert all(torch.equal(again[name].view(torch.int32), value.view(torch.int32)) for name, value in model.params.items())
     assert sum(t.numel() * t.element_size() for t in stored.values()) < 4 * model.count * model.parameters_per_primitive
 
 
 def test_a_model_without_zeros_is_stored_as_ever() -> None:
     model = made(*PAIRS[0])
-    stored, apart = split_off(model.params, model.specs, pieces_by_name(model.density, model.colour))
-    assert apart == [] and stored == model.params
+    stored, sparse = split_off(model.params, (*model.density.parameters(), *model.colour.parameters()))
+    assert sparse == [] and stored == model.params
+
+
+def test_a_zero_below_zero_keeps_its_sign() -> None:
+    model = pruned(made(*PAIRS[0]))
+    model.params["w2"][:, 0] = -0.0
+    own = (*model.density.parameters(), *model.colour.parameters())
+    again = whole(*split_off(model.params, own), own, "file")
+    assert bool(torch.signbit(again["w2"][:, 0]).all())
+
+
+@pytest.mark.parametrize(("density", "colour"), PAIRS, ids=lambda field: type(field).__name__)
+def test_files_of_pieces_as_they_were_load(density: Field, colour: Field) -> None:
+    """Bands, and velocities as a whole, were pieces; what a primitive had of them followed by its name."""
+    model = made(density, colour)
+    pieces = pieces_by_name(model.density, model.colour, earlier=True)
+    taken: dict[str, Tensor] = {name: torch.zeros_like(value) for name, value in model.params.items()}
+    stored, generator = dict(model.params), torch.Generator().manual_seed(2)
+    names = [name for name, piece in pieces.items() if not piece.group]
+    for name in names:
+        has = torch.rand(model.count, generator=generator) < 0.5
+        stored["rows|" + name] = torch.from_numpy(np.packbits(has.numpy(), bitorder="little"))
+        for parameter, value in pieces[name].of(model.params).items():
+            stored.pop(parameter, None)
+            stored[f"{parameter}|{name}"] = value[has]
+            taken[parameter][(has, *pieces[name].places[parameter])] = value[has]
+    own = (*model.density.parameters(), *model.colour.parameters())
+    again = of_pieces(stored, names, own, pieces, "file")
+    apart = {parameter for name in names for parameter in pieces[name].places}
+    assert apart and again.keys() == model.params.keys()
+    assert all(torch.equal(again[name], taken[name] if name in apart else value) for name, value in model.params.items())
+    stored.pop("rows|" + names[0])
+    with pytest.raises(CheckpointError, match="is missing"):
+        of_pieces(stored, names, own, pieces, "file")
 
 
 @pytest.fixture
@@ -127,7 +163,7 @@ def file(tmp_path: Path, task: TaskSpec) -> Path:
 
 def test_a_pruned_model_loads_as_it_was(file: Path, task: TaskSpec) -> None:
     model, header = checkpoint.load_model(file, task)
-    assert checkpoint.read_header(file, "model")["apart"] and "apart" not in header  # the model in memory is whole
+    assert checkpoint.read_header(file, "model")["sparse"] and "sparse" not in header  # the model in memory is whole
     expected = pruned(made(CosineDensity(2, edge=2, gain=True), SphericalHarmonics(3)))
     assert all(torch.equal(model.params[name], value) for name, value in expected.params.items())
     plain = file.with_name("plain.safetensors")
@@ -136,14 +172,15 @@ def test_a_pruned_model_loads_as_it_was(file: Path, task: TaskSpec) -> None:
 
 
 LIES = {
-    "no mask": (lambda t: t.pop("rows|colour.band 2"), "rows|colour.band 2 is missing"),
-    "a short mask": (lambda t: t.update({"rows|colour.band 2": torch.zeros(1, dtype=torch.uint8)}), "expected torch.uint8 (5,)"),
-    "a mask of floats": (lambda t: t.update({"rows|colour.band 2": torch.zeros(5)}), "expected torch.uint8 (5,)"),
-    "rows too few": (lambda t: t.update({"sh_rest|colour.band 2": t["sh_rest|colour.band 2"][:-1]}), "sh_rest|colour.band 2 is"),
-    "rows too many": (lambda t: t.update({"rows|colour.band 2": torch.zeros(5, dtype=torch.uint8)}), "expected torch.float32 (0, 5, 3)"),
-    "another type": (lambda t: t.update({"sh_rest|colour.band 2": t["sh_rest|colour.band 2"].double()}), "is torch.float64"),
-    "a part missing": (lambda t: t.pop("W1|density.neuron 0"), "W1|density.neuron 0 is missing"),
-    "a part of nothing": (lambda t: t.update({"sh_rest|colour.band 9": torch.zeros(1)}), "belongs to no piece"),
+    "no mask": (lambda t: t.pop("sh_rest|there"), "sh_rest|there is missing"),
+    "a short mask": (lambda t: t.update({"sh_rest|there": torch.zeros(1, dtype=torch.uint8)}), f"expected torch.uint8 ({BITS},)"),
+    "a mask of floats": (lambda t: t.update({"sh_rest|there": torch.zeros(BITS)}), f"expected torch.uint8 ({BITS},)"),
+    "numbers too few": (lambda t: t.update({"sh_rest|numbers": t["sh_rest|numbers"][:-1]}), "sh_rest|numbers is"),
+    "numbers too many": (lambda t: t.update({"sh_rest|there": torch.zeros(BITS, dtype=torch.uint8)}), "expected torch.float32 (0,)"),
+    "another type": (lambda t: t.update({"sh_rest|numbers": t["sh_rest|numbers"].double()}), "is torch.float64"),
+    "a part missing": (lambda t: t.pop("W1|numbers"), "W1|numbers is missing"),
+    "a part of nothing": (lambda t: t.update({"sh_all|numbers": torch.zeros(1)}), "belongs to no parameter"),
+    "there twice": (lambda t: t.update({"w2": torch.zeros(COUNT, 2)}), "w2 is there twice"),
     "no means": (lambda t: t.pop("means"), "means"),
 }
 
@@ -160,9 +197,11 @@ def test_files_that_lie_are_refused(lie: str, file: Path, task: TaskSpec) -> Non
     assert expected in str(caught.value) and str(file) in str(caught.value)
 
 
-@pytest.mark.parametrize("names", ["colour.band 1", ["colour.band 7"], [3], {"colour.band 1": 1}])
-def test_a_header_of_pieces_that_do_not_exist_is_refused(names: object, file: Path, task: TaskSpec) -> None:
+@pytest.mark.parametrize("names", ["sh_rest", ["sh_all"], ["means"], [3], {"sh_rest": 1}])
+@pytest.mark.parametrize("key", ["sparse", "apart"])
+def test_a_header_of_what_does_not_exist_is_refused(key: str, names: object, file: Path, task: TaskSpec) -> None:
     header, tensors = checkpoint.read(file, "model")
-    checkpoint.write(file, "model", tensors, {**{k: v for k, v in header.items() if k not in ("format", "kind")}, "apart": names})
-    with pytest.raises(CheckpointError, match="apart"):
+    header = {k: v for k, v in header.items() if k not in ("format", "kind", "sparse")}
+    checkpoint.write(file, "model", tensors, {**header, key: names})
+    with pytest.raises(CheckpointError, match=f"header field '{key}'"):
         checkpoint.load_model(file, task)

@@ -41,12 +41,13 @@ def test_signs_find_the_mean_squared_change_of_every_piece() -> None:
     whole = images(one, dataset, views)
     trials = [sensitivity(one, dataset, views, SETTINGS, seed) for seed in range(60)]
     pieces = pieces_by_name(one.density, one.colour)
-    found = torch.stack([t.pieces["colour.band 1"] for t in trials]).mean(0)
-    for row in range(one.count):
-        only = torch.arange(one.count) == row
-        less = Primitives(one.density, one.colour, without({"": (pieces["colour.band 1"], only)}, one.params))
-        true = float((images(less, dataset, views) - whole).square().mean())
-        assert abs(float(found[row]) - true) < 0.5 * true + 1e-9
+    for name in ("colour.coefficient 1 -1, channel 0", "colour.coefficient 1 +0, channel 2"):
+        found = torch.stack([t.pieces[name] for t in trials]).mean(0)
+        for row in range(one.count):
+            only = torch.arange(one.count) == row
+            less = Primitives(one.density, one.colour, without({"": (pieces[name], only)}, one.params))
+            true = float((images(less, dataset, views) - whole).square().mean())
+            assert abs(float(found[row]) - true) < 0.5 * true + 1e-9
     assert torch.isfinite(torch.stack([t.pieces["density.neuron 0"] for t in trials])).all()
 
 

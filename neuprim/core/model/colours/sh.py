@@ -110,8 +110,18 @@ _DARKEST = 1e-3
 """Initial colours start at least this far above zero: at zero and below, max(0, .) passes no gradient and black stays black."""
 
 
+def coefficients(degree: int, channels: int, name: str) -> tuple[Piece, ...]:
+    """Every number by itself of coefficients (N, (degree + 1)^2 - 1, C) in the parameter ``name``, told of by bands."""
+    return tuple(
+        Piece(f"coefficient {band} {order - band:+d}, channel {c}", {name: (band * band - 1 + order, c)}, f"band {band}")
+        for band in range(1, degree + 1)
+        for order in range(2 * band + 1)
+        for c in range(channels)
+    )
+
+
 def bands(degree: int, name: str) -> tuple[Piece, ...]:
-    """The bands above the zeroth of coefficients (N, (degree + 1)^2 - 1, C) in the parameter ``name``."""
+    """The bands above the zeroth: pieces, in earlier files."""
     return tuple(Piece(f"band {band}", {name: (slice(band * band - 1, (band + 1) ** 2 - 1),)}) for band in range(1, degree + 1))
 
 

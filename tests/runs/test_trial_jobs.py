@@ -22,8 +22,9 @@ from tests.systems import posix
 def test_the_same_outcomes_as_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("neuprim.runs.launch.share.machine_cores", lambda: 1)
     scene = tiny.write_blender(tmp_path / "two")
-    here = Trial(compose(words(scene, tmp_path / "here", 20)), views=2)
-    there = Trial(compose(words(scene, tmp_path / "there", 20)), views=2)
+    # Folders' names are as long as each other: they are written in the file, whose bytes are compared.
+    here = Trial(compose(words(scene, tmp_path / "in_1", 20)), views=2)
+    there = Trial(compose(words(scene, tmp_path / "in_2", 20)), views=2)
     gone = replace(there, config=compose(words(tmp_path / "nowhere", tmp_path / "gone", 20)))
     assert trial_of(words_of(here)) == here
     told: list[float] = []

@@ -24,6 +24,7 @@ from neuprim.core.render.cpu.forward import composite_tiles
 from neuprim.core.render.cpu.kept import Kept
 from neuprim.core.render.cpu.prepare import NON_FINITE, VISIBLE, prepare, prepare_backward, prepare_wide
 from neuprim.core.render.cpu.profiles import EDGE_TYPES
+from neuprim.core.render.cpu.seen import depth_that_counts
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.settings import RenderSettings
 
@@ -117,7 +118,7 @@ def _prepare(
     names = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
     parallel_for(
         prepare, count, _PRIMITIVES_PER_CHUNK, settings.threads, *(tensors[n] for n in names),
-        R, t, cam, size, settings.near, omega0 / _TURN, edge, rows, spans, kinds, order, boxes, depth, status, in_float64,
+        R, t, cam, size, settings.near, omega0 / _TURN, edge, depth_that_counts(settings.alpha_min), rows, spans, kinds, order, boxes, depth, status, in_float64,
     )  # fmt: skip
     if bool((status == NON_FINITE).any()):
         raise _non_finite(tensors, int(np.flatnonzero(status == NON_FINITE)[0]))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from neuprim.core.compute.kernels import exact_kernel, inline, kernel
-from neuprim.core.compute.views import copy16, lent
+from neuprim.core.compute.views import copy16, keep16, lent, returned
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.gradients import AT_ONCE, chord_gradient, gradients_at_once, lanes_with_slopes, neuron_gradients
@@ -21,7 +21,7 @@ from neuprim.core.render.cpu.ray_colours import (
     uncomposite_rgb_ray_colours,
     weigh_ray_colours,
 )
-from neuprim.core.render.cpu.tiles import aligned, compact, fetch_ahead, lanes_ahead, row_spans
+from neuprim.core.render.cpu.tiles import aligned, chords, compact, fetch_ahead, lanes_ahead, row_spans
 from neuprim.core.render.cpu.trigonometry import one_minus_exp
 
 __all__ = ["backward_tiles", "opacity", "optical_depths", "sum_rows"]
@@ -120,6 +120,26 @@ def _tally(st, w, sums):  # type: ignore[no-untyped-def]
 
 
 @inline
+def _lanes_that_count(S, n, with_depths):  # type: ignore[no-untyped-def]
+    """Move the lanes with a gradient together, and zeros behind them; returns their number. ``with_depths``: DEPTH and NORM_L, too.
+
+    A third of a trained scene's lanes have none: rays below the cut, and those of pixels that are opaque before they get here.
+    """
+    kept = 0
+    for k in range(0, n, L.TILE):
+        if with_depths:
+            keep16(S, L.DEPTH + kept, L.DEPTH + k, L.GRAD + k)
+            keep16(S, L.NORM_L + kept, L.NORM_L + k, L.GRAD + k)
+        keep16(S, L.PIXEL + kept, L.PIXEL + k, L.GRAD + k)
+        kept += keep16(S, L.GRAD + kept, L.GRAD + k, L.GRAD + k)
+    for k in range(L.TILE):
+        S[index(L.PIXEL + kept + k)], S[index(L.GRAD + kept + k)] = f(0), f(0)
+        if with_depths:
+            S[index(L.DEPTH + kept + k)], S[index(L.NORM_L + kept + k)] = f(0), f(0)
+    return kept
+
+
+@inline
 def _total(sums, first):  # type: ignore[no-untyped-def]
     total = f(0)
     for k in range(L.TILE):
@@ -149,12 +169,12 @@ def backward_tiles(  # type: ignore[no-untyped-def]
     if net is not None:
         scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
         waves = aligned(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
-    S, D = aligned(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64)
-    V = aligned(neurons * L.NEURON_SCRATCH).reshape((neurons, L.NEURON_SCRATCH))
-    state = aligned((6 + C) * L.PIXELS + 2 * L.TILE)
-    w, cg, sums = aligned(L.TILE), aligned(L.TILE), aligned((2 + C) * L.TILE)
-    bounds, offset = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32)
-    rows_live = np.zeros(L.TILE, np.float32)
+    lanes, wide_lanes, slopes = aligned(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64), aligned(neurons * L.NEURON_SCRATCH)
+    pixels, weights, rays, totals = aligned((6 + C) * L.PIXELS + 2 * L.TILE), aligned(L.TILE), aligned(L.TILE), aligned((2 + C) * L.TILE)
+    ends, begins, lives = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32), np.zeros(L.TILE, np.float32)
+    S, D, V = lent(lanes), lent(wide_lanes), lent(slopes).reshape((neurons, L.NEURON_SCRATCH))
+    state, w, cg, sums = lent(pixels), lent(weights), lent(rays), lent(totals)
+    bounds, offset, rows_live = lent(ends), lent(begins), lent(lives)
     evaluated = 0
     for t in range(start, stop):
         tx, ty = (t % across) * L.TILE, (t // across) * L.TILE
@@ -200,11 +220,10 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             if n == 0:
                 continue
             n16 = ((n + 15) // 16) * 16
-            evaluated += n16
             for k in range(0, n16, L.TILE):
                 copy16(S, L.DEPTH + k, depths, found[q] + k)
-            at_once = neurons <= AT_ONCE and slots[i] < 0 and net is None and not with_depth
-            if not at_once:
+            later = slots[i] < 0 and net is None and not with_depth  # chords are asked for by nothing but the gradients
+            if not later:
                 lanes_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, neurons, floor, edge)
             opacity(S, n16, amin, amax)
             for k in range(n, n16):
@@ -214,7 +233,7 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                 for c in range(C, 2 * C):
                     for k in range(n, n16):
                         S[L.RAY_COLOUR + c * L.LANES + k] = f(0)
-            if not at_once:
+            if not later:
                 for k in range(n16):
                     S[L.GMID + k] = f(0)
             sums[:] = f(0)
@@ -260,13 +279,26 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             if net is None:
                 for c in range(C):
                     out[color_at + c] = _total(sums, (2 + c) * L.TILE)
-            if at_once:
+            if later:
+                n16 = ((_lanes_that_count(S, n16, neurons > AT_ONCE) + 15) // 16) * 16
+            evaluated += n16
+            if later and neurons <= AT_ONCE:
                 gradients_at_once(S, n16, p, kinds[i], fx0, fy0, floor, neurons, edge, out)
                 continue
+            if later:
+                chords(S, n16, p, fx0, fy0, floor, False, True, edge)
+                for k in range(n16):
+                    S[L.GMID + k] = f(0)
             neuron_gradients(S, V, n16, p, kinds[i], neurons, edge, slots[i] >= 0, out)
             if net is not None:
                 ray_colour_gradient(S, waves, n16, i, net, C, out, color_at)
             chord_gradient(S, n16, p, out, edge, slots[i] >= 0)
+    for mine in (lanes, slopes, pixels, weights, rays, totals):
+        returned(mine)
+    returned(wide_lanes)
+    for numbers in (ends, begins):
+        returned(numbers)
+    returned(lives)
     return evaluated
 
 

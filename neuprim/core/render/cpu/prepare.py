@@ -28,6 +28,7 @@ from neuprim.core.render.cpu.limits import (
     NON_FINITE,
     VISIBLE,
 )
+from neuprim.core.render.cpu.seen import seen_square, too_faint
 
 __all__ = [
     "CULLED",
@@ -126,6 +127,49 @@ def _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turn
     return m, np.isfinite(total), biggest
 
 
+@strict
+def _are_finite(i, means, log_scales, quats, W1, b1):  # type: ignore[no-untyped-def]
+    """Whether a primitive that is not drawn has parameters at all: its geometry's numbers, and a rotation."""
+    total, square = np.float64(0.0), np.float64(0.0)
+    for a in range(3):
+        total += means[i, a] + log_scales[i, a]
+    for a in range(4):
+        square += np.float64(quats[i, a]) * np.float64(quats[i, a])
+    for k in range(W1.shape[1]):
+        total += W1[i, k, 0] + W1[i, k, 1] + W1[i, k, 2] + b1[i, k]
+    return np.isfinite(total + 1.0 / square)
+
+
+@strict
+def _extent(c, m, B, axes, cam, axis, s22, square):  # type: ignore[no-untyped-def]
+    """Where the silhouette of the ellipsoid that is ``square`` ** 0.5 times as large begins and ends along an axis of the screen, in pixels.
+
+    In units of m: tangents (k +- sqrt(D))/(z^2 - S_zz), see projection.screen_boxes; ``s22``: S_zz of the whole ellipsoid.
+    """
+    z, ci, szz = c[2] / m, c[axis] / m, square * s22
+    sii = square * ((B[axis, 0] * axes[0]) ** 2 + (B[axis, 1] * axes[1]) ** 2 + (B[axis, 2] * axes[2]) ** 2)
+    siz = square * (B[axis, 0] * B[2, 0] * axes[0] ** 2 + B[axis, 1] * B[2, 1] * axes[1] ** 2 + B[axis, 2] * B[2, 2] * axes[2] ** 2)
+    D = z * z * sii - 2 * ci * z * siz + ci * ci * szz - (sii * szz - siz * siz)
+    root, mid, den = np.sqrt(max(D, 0.0)), ci * z - siz, z * z - szz
+    return cam[axis] * (mid - root) / den + cam[2 + axis], cam[axis] * (mid + root) / den + cam[2 + axis]
+
+
+@strict
+def _longest(c, m, reach, row, cam, e0, ex, ey):  # type: ignore[no-untyped-def]
+    """A bound of the half chords of all rays that meet the ellipsoid, in units of its longest semi-axis; at most that, 1.
+
+    A ray's direction is e on whitened axes, and m / |e| its half chord through the centre. No point of the ellipsoid is farther than m from the
+    centre, which bounds how far a ray's slopes are from the centre's.
+    """
+    if row[L.TC] == 0.0:  # the anchor is not the centre
+        return 1.0
+    u, v, wide = abs(c[0] / c[2]), abs(c[1] / c[2]), m / (c[2] - reach)
+    du, dv = wide * (1.0 + u), wide * (1.0 + v)
+    least = np.sqrt(_dot(e0, e0)) - cam[0] * du * np.sqrt(_dot(ex, ex)) - cam[1] * dv * np.sqrt(_dot(ey, ey))
+    most = np.sqrt(1.0 + (u + du) ** 2 + (v + dv) ** 2)
+    return most / least if least > most else 1.0
+
+
 @exact_kernel
 def prepare_wide(start, stop, which, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, order, wide):  # type: ignore[no-untyped-def]
     """float64 rows of primitives ``which[start:stop]``, which the pixel stage draws in float64."""
@@ -137,20 +181,29 @@ def prepare_wide(start, stop, which, means, log_scales, quats, W1, b1, w2, b2, R
 
 @exact_kernel
 def prepare(  # type: ignore[no-untyped-def]
-    start, stop, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, size, near, turns, edge,
+    start, stop, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, size, near, turns, edge, least,
     rows, spans, kinds, order, boxes, depth, status, in_float64,
 ):  # fmt: skip
     """Fill kernel rows, silhouette spans, pixel boxes, view depths and status of primitives ``start:stop``.
 
     cam = (fx, fy, cx, cy); size = (width, height); turns = omega0 / 2 pi. Neurons are stored by rising rate: ``order[i, k]`` is the
     model's index of row neuron k, ``kinds[i, m]`` the range of rates (SLOW, MEDIUM, FAST) of row neurons 2m and 2m + 1.
-    ``in_float64[i]`` says that float32 is not enough for the primitive's pixels (see :func:`prepare_wide`).
+    ``in_float64[i]`` says that float32 is not enough for the primitive's pixels (see :func:`prepare_wide`). ``least``: the optical depth below
+    which nothing is drawn; silhouettes are those of the rays that can reach it (:mod:`~neuprim.core.render.cpu.seen`).
     """
     K = W1.shape[1]
     work, waves, rate, row = np.empty((10, 3)), np.empty((K, 4)), np.empty(K), np.zeros(rows.shape[1])
     B, axes, c, e0, ex, ey, xa = work[0:3], work[3], work[4], row[L.E0 : L.EX], row[L.EX : L.EY], row[L.EY : L.XA], row[L.XA : L.XU]
     k0, ka, kb, tmp = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(start, stop):
+        most = np.float64(b2[i])
+        for k in range(K):
+            most += abs(np.float64(w2[i, k]))
+        if too_faint(most, edge, least):  # whatever its place
+            boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
+            in_float64[i], depth[i] = False, 0.0
+            status[i] = CULLED if _are_finite(i, means, log_scales, quats, W1, b1) else NON_FINITE
+            continue
         m, finite, biggest = _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, waves, rate, order, row)
         for n in range(kinds.shape[1]):
             fastest = rate[min(2 * n + 1, K - 1)]
@@ -181,20 +234,14 @@ def prepare(  # type: ignore[no-untyped-def]
         span[L.SKEW], span[L.XC], span[L.YC], span[L.HX], span[L.HY] = 0.0, 0.0, 0.0, L.UNBOUNDED, L.UNBOUNDED
         x0, x1, y0, y1 = 0.0, float(size[0]), 0.0, float(size[1])
         if c[2] - reach > 1e-3 * reach:  # wholly in front of the camera plane: the silhouette is an ellipse
-            # in units of m: tangents (k +- sqrt(D))/(z^2 - S_zz), see projection.screen_boxes
-            z, s22 = c[2] / m, szz / (m * m)
-            for axis in range(2):
-                ci = c[axis] / m
-                sii = (B[axis, 0] * axes[0]) ** 2 + (B[axis, 1] * axes[1]) ** 2 + (B[axis, 2] * axes[2]) ** 2
-                siz = B[axis, 0] * B[2, 0] * axes[0] ** 2 + B[axis, 1] * B[2, 1] * axes[1] ** 2 + B[axis, 2] * B[2, 2] * axes[2] ** 2
-                D = z * z * sii - 2 * ci * z * siz + ci * ci * s22 - (sii * s22 - siz * siz)
-                root, mid, den = np.sqrt(max(D, 0.0)), ci * z - siz, z * z - s22
-                lo, hi = cam[axis] * (mid - root) / den + cam[2 + axis], cam[axis] * (mid + root) / den + cam[2 + axis]
-                if axis == 0:
-                    x0, x1 = max(x0, np.ceil(lo - 0.5)), min(x1, np.floor(hi - 0.5) + 1)
-                else:
-                    y0, y1 = max(y0, np.ceil(lo - 0.5)), min(y1, np.floor(hi - 0.5) + 1)
-            # |e|^2 - |x x e|^2 > 0 is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half width from (HX, HY)
+            s22 = szz / (m * m)
+            square = seen_square(most, _longest(c, m, reach, row, cam, e0, ex, ey), edge, least)
+            if square == 0.0:
+                continue
+            (x0, x1), (y0, y1) = _extent(c, m, B, axes, cam, 0, s22, square), _extent(c, m, B, axes, cam, 1, s22, square)
+            x0, x1 = max(0.0, np.ceil(x0 - 0.5)), min(float(size[0]), np.floor(x1 - 0.5) + 1)
+            y0, y1 = max(0.0, np.ceil(y0 - 0.5)), min(float(size[1]), np.floor(y1 - 0.5) + 1)
+            # |r e|^2 - |x x e|^2 > 0 is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half width from (HX, HY)
             _cross(xa, e0, k0)
             _cross(xa, ex, ka)
             _cross(ex, e0, tmp)
@@ -204,8 +251,8 @@ def prepare(  # type: ignore[no-untyped-def]
             _cross(ey, e0, tmp)
             for j in range(3):
                 kb[j] += tc * tmp[j]
-            q0, q1, q2 = _dot(e0, e0) - _dot(k0, k0), _dot(e0, ex) - _dot(k0, ka), _dot(e0, ey) - _dot(k0, kb)
-            q3, q4, q5 = _dot(ex, ex) - _dot(ka, ka), _dot(ex, ey) - _dot(ka, kb), _dot(ey, ey) - _dot(kb, kb)
+            q0, q1, q2 = square * _dot(e0, e0) - _dot(k0, k0), square * _dot(e0, ex) - _dot(k0, ka), square * _dot(e0, ey) - _dot(k0, kb)
+            q3, q4, q5 = square * _dot(ex, ex) - _dot(ka, ka), square * _dot(ex, ey) - _dot(ka, kb), square * _dot(ey, ey) - _dot(kb, kb)
             d0, d1, d2 = q1 * q1 - q3 * q0, q1 * q4 - q3 * q2, q4 * q4 - q3 * q5
             if q3 < 0.0 and d2 < 0.0:
                 yc = -d1 / d2

@@ -13,6 +13,7 @@ from neuprim.core.cameras import Camera
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.fields import Constant, Cosine, RayNet
 from neuprim.core.model.primitives import Lowered
+from neuprim.core.render.cpu.seen import depth_that_counts
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.forms import Form
 from neuprim.core.render.cuda.frame import NAMES, NotFinite, prepared
@@ -72,6 +73,7 @@ class _Rasterize(torch.autograd.Function):
                 settings.near,
                 omega0 / (2 * math.pi),
                 edge,
+                depth_that_counts(settings.alpha_min),
                 net.fast if net is not None and net.hidden else None,
             )
         except NotFinite as error:
@@ -168,7 +170,9 @@ def render_parts(lowered: Lowered, parts: Tensor, count: int, camera: Camera, se
     own = replace(settings, depth=True)
     try:
         images = (parts.int().contiguous(), count)
-        frame = prepared(tensors, blank, camera, camera.viewmat, own.near, turns, density.edge, None, images)
+        frame = prepared(
+            tensors, blank, camera, camera.viewmat, own.near, turns, density.edge, depth_that_counts(own.alpha_min), None, images
+        )
     except NotFinite as error:
         raise _blame(tensors, error.row) from None
     drawn = forward(frame, form, None, blank.new_zeros(1), own, False, count)

@@ -123,6 +123,7 @@ def prepared(
     near: float,
     turns: float,
     edge: int,
+    least: float,
     forced: Tensor | None = None,
     images: tuple[Tensor, int] | None = None,
 ) -> Frame:
@@ -137,6 +138,7 @@ def prepared(
         near: near plane, in scene units.
         turns: omega0 / 2 pi.
         edge: p of the density's soft edge.
+        least: optical depth below which nothing is drawn, see :mod:`neuprim.core.render.cpu.seen`.
         forced: (N,) bool, primitives to draw in float64 whatever this stage finds.
         images: (N,) int32, which of several images each primitive is drawn in, and how many there are; None for one.
 
@@ -161,7 +163,7 @@ def prepared(
         prepare_kernel(double), N,
         (
             *inputs, array(palette.detach().float().contiguous(), wp.float32), None if forced is None else array(forced.contiguous(), wp.bool),
-            world, projection.intrinsics, camera.width, camera.height, near, turns, edge, K, C,
+            world, projection.intrinsics, camera.width, camera.height, near, turns, edge, least, K, C,
             array(rows, wp.vec4), array(spans.view(N, 2, 4), wp.vec4), array(boxes, wp.vec4i), array(depth, wp.float64),
             array(status, wp.uint8), array(counts, wp.int32), array(bad, wp.int32),
         ), device, PER_BLOCK,

@@ -26,6 +26,7 @@ from neuprim.core.render.cpu.limits import (
 )
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.placement import EXACT, Placed, Ray, View, place, rounded, view_of, whiten
+from neuprim.core.render.cuda.seen import longest, seen_square, too_faint
 from neuprim.core.render.cuda.silhouette import ellipse, tile_range
 
 __all__ = ["prepare_kernel", "wide_kernel"]
@@ -71,12 +72,12 @@ def _spread(p: Placed, i: int, j: int):
 
 
 @wp.func
-def _extent(p: Placed, v: View, axis: int, s22: wp.float64):
-    """Where the silhouette begins and ends on the screen along one axis, in pixels; all of it lies before the camera plane."""
-    z, ci = p.centre[2] / p.m, p.centre[axis] / p.m
-    sii, siz = _spread(p, axis, axis), _spread(p, axis, 2)
-    D = z * z * sii - d(2.0) * ci * z * siz + ci * ci * s22 - (sii * s22 - siz * siz)
-    root, mid, den = wp.sqrt(wp.max(D, d(0.0))), ci * z - siz, z * z - s22
+def _extent(p: Placed, v: View, axis: int, s22: wp.float64, square: wp.float64):
+    """Where the silhouette of the ellipsoid that is ``square`` ** 0.5 times as large begins and ends on the screen along one axis, in pixels."""
+    z, ci, szz = p.centre[2] / p.m, p.centre[axis] / p.m, square * s22
+    sii, siz = square * _spread(p, axis, axis), square * _spread(p, axis, 2)
+    D = z * z * sii - d(2.0) * ci * z * siz + ci * ci * szz - (sii * szz - siz * siz)
+    root, mid, den = wp.sqrt(wp.max(D, d(0.0))), ci * z - siz, z * z - szz
     return wp.vec2d(v.focal[axis] * (mid - root) / den + v.centre[axis], v.focal[axis] * (mid + root) / den + v.centre[axis])
 
 
@@ -93,16 +94,17 @@ class Outline:
 
 
 @wp.func
-def _outline(p: Placed, r: Ray, width: int, height: int):
-    """|e|^2 - |x x e|^2 > 0 is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half width from (HX, HY)."""
+def _outline(p: Placed, r: Ray, width: int, height: int, square: wp.float64):
+    """|r e|^2 - |x x e|^2 > 0, r^2 = ``square``, is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half width from (HX, HY)."""
     o = Outline()
     o.hx = _UNBOUNDED
     o.hy = _UNBOUNDED
     k0 = wp.cross(r.xa, r.e0)
     ka = wp.cross(r.xa, r.ex) + r.tc * wp.cross(r.ex, r.e0)
     kb = wp.cross(r.xa, r.ey) + r.tc * wp.cross(r.ey, r.e0)
-    q0, q1, q2 = wp.dot(r.e0, r.e0) - wp.dot(k0, k0), wp.dot(r.e0, r.ex) - wp.dot(k0, ka), wp.dot(r.e0, r.ey) - wp.dot(k0, kb)
-    q3, q4, q5 = wp.dot(r.ex, r.ex) - wp.dot(ka, ka), wp.dot(r.ex, r.ey) - wp.dot(ka, kb), wp.dot(r.ey, r.ey) - wp.dot(kb, kb)
+    q0, q1 = square * wp.dot(r.e0, r.e0) - wp.dot(k0, k0), square * wp.dot(r.e0, r.ex) - wp.dot(k0, ka)
+    q2, q3 = square * wp.dot(r.e0, r.ey) - wp.dot(k0, kb), square * wp.dot(r.ex, r.ex) - wp.dot(ka, ka)
+    q4, q5 = square * wp.dot(r.ex, r.ey) - wp.dot(ka, kb), square * wp.dot(r.ey, r.ey) - wp.dot(kb, kb)
     d0, d1, d2 = q1 * q1 - q3 * q0, q1 * q4 - q3 * q2, q4 * q4 - q3 * q5
     if q3 < d(0.0) and d2 < d(0.0):
         yc = -d1 / d2
@@ -142,7 +144,7 @@ def prepare_kernel(double: bool) -> Any:
     """Fills rows, spans, boxes, depth, status and counts of every primitive from float32 or float64 parameters; dim (N,).
 
     ``counts`` (2, N): tiles reached, and 1 where float32 is too coarse and something is seen. ``bad`` (1,): the first primitive that is not
-    finite, its colours included; otherwise left as it is.
+    finite, its colours included; otherwise left as it is. ``least``: the optical depth below which nothing is drawn.
     """
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
@@ -152,11 +154,32 @@ def prepare_kernel(double: bool) -> Any:
         W1: wp.array2d(dtype=vec3), b1: wp.array2d(dtype=real), w2: wp.array2d(dtype=real), b2: wp.array(dtype=real),
         palette: wp.array2d(dtype=wp.float32), forced: wp.array(dtype=wp.bool),
         matrix: wp.array(dtype=wp.float64), intrinsics: wp.vec4d, width: int, height: int, near: wp.float64, turns: wp.float64, edge: int,
-        neurons: int, channels: int,
+        least: wp.float64, neurons: int, channels: int,
         rows: wp.array2d(dtype=wp.vec4), spans: wp.array2d(dtype=wp.vec4), boxes: wp.array(dtype=wp.vec4i), depth: wp.array(dtype=wp.float64),
         status: wp.array(dtype=wp.uint8), counts: wp.array2d(dtype=wp.int32), bad: wp.array(dtype=wp.int32),
     ):  # fmt: skip
         i = wp.tid()
+        most = d(b2[i])
+        for k in range(neurons):
+            most += d(wp.abs(w2[i, k]))
+        if too_faint(most, edge, least):  # whatever its place
+            state = int(_CULLED)
+            given, turn = wp.vec3d(means[i]) + wp.vec3d(log_scales[i]), wp.vec4d(quats[i])
+            given_sum = given[0] + given[1] + given[2] + d(1.0) / wp.dot(turn, turn)
+            for k in range(neurons):
+                given_sum += d(W1[i, k][0]) + d(W1[i, k][1]) + d(W1[i, k][2]) + d(b1[i, k])
+            for c in range(channels):
+                given_sum += d(palette[i, c])
+            if not wp.isfinite(given_sum):
+                state = int(_NON_FINITE)
+                wp.atomic_min(bad, 0, i)
+            store(rows, i, _REST, f(0.0), f(0.0), f(0.0), f(0.0))
+            boxes[i] = wp.vec4i()
+            depth[i] = d(0.0)
+            status[i] = wp.uint8(state)
+            counts[0, i] = 0
+            counts[1, i] = 0
+            return
         v = view_of(matrix, intrinsics, near)
         p = place(wp.vec3d(means[i]), wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), v)
         r = whiten(p, v)
@@ -218,13 +241,16 @@ def prepare_kernel(double: bool) -> Any:
                 o.hx = _UNBOUNDED
                 o.hy = _UNBOUNDED
                 if z - reach > d(1e-3) * reach:  # wholly in front of the camera plane: the silhouette is an ellipse
-                    half, one = d(0.5), d(1.0)
-                    across, down = _extent(p, v, 0, s22), _extent(p, v, 1, s22)
-                    x0, x1 = wp.max(x0, wp.ceil(across[0] - half)), wp.min(x1, wp.floor(across[1] - half) + one)
-                    y0, y1 = wp.max(y0, wp.ceil(down[0] - half)), wp.min(y1, wp.floor(down[1] - half) + one)
-                    o = _outline(p, r, width, height)
-                    if o.delicate > 0:
-                        delicate = 1
+                    half, one, square = d(0.5), d(1.0), seen_square(most, longest(p, r, v, reach), edge, least)
+                    if square == d(0.0):
+                        x1 = x0  # nothing can be seen of it
+                    else:
+                        across, down = _extent(p, v, 0, s22, square), _extent(p, v, 1, s22, square)
+                        x0, x1 = wp.max(x0, wp.ceil(across[0] - half)), wp.min(x1, wp.floor(across[1] - half) + one)
+                        y0, y1 = wp.max(y0, wp.ceil(down[0] - half)), wp.min(y1, wp.floor(down[1] - half) + one)
+                        o = _outline(p, r, width, height, square)
+                        if o.delicate > 0:
+                            delicate = 1
                 if x1 > x0 and y1 > y0:
                     box = wp.vec4i(int(x0), int(y0), int(x1), int(y1))
                     state = int(_VISIBLE)

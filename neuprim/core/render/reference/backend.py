@@ -67,14 +67,14 @@ class _Prepared:
         view = camera.viewmat.double()
         self.rotation = view[:3, :3]
         self.origin = -self.rotation.T @ view[:3, 3]
-        log_scales = g.log_scales.double()
+        # one layout: the order of a product's sums, and the last bits of gradients, would follow that of its factors on some processors
+        means, log_scales, quats = (x.double().contiguous() for x in (g.means, g.log_scales, g.quats))
         first = log_scales.detach().argmax(dim=-1, keepdim=True)
         log_m = log_scales.gather(-1, first)
         self.m = log_m.exp()[:, 0]
         self.axes = (log_scales - log_m).exp()  # s/m, never over- or underflows
-        quats = g.quats.double()
         self.local = quaternion_to_matrix(quats)  # ellipsoid axes -> scene
-        self.center = g.means.double() @ self.rotation.T + view[:3, 3]
+        self.center = means @ self.rotation.T + view[:3, 3]
         B = self.rotation @ self.local
         self.whiten = B.transpose(1, 2) / self.axes[:, :, None]  # camera -> whitened, times m
         self.start = -(self.whiten @ (self.center / self.m[:, None])[:, :, None])[..., 0]  # camera centre, whitened

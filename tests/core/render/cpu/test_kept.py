@@ -10,7 +10,8 @@ import pytest
 import torch
 from numba import njit
 
-from neuprim.core.compute.views import copy16, lent
+from neuprim.core.compute import views
+from neuprim.core.compute.views import copy16, keep16, lent
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.cpu import backend, layout
 from neuprim.core.render.cpu.kept import Kept, alive
@@ -54,7 +55,8 @@ def test_there_is_room_for_the_depths_of_tiles_that_are_filled(monkeypatch: pyte
     assert lanes > 100 * out.stats.pairs, "the scene does not fill its tiles"
     assert sum(len(d) for d in kept.depths) >= lanes
     monkeypatch.undo()
-    assert_same_frame(t, scenes.camera(), SETTINGS)
+    # one ray near a hard edge decides the error of a gradient, by D^-1/2: over seeds 2 to 9 it is 2e-5 to 2e-3
+    assert_same_frame(t, scenes.camera(), SETTINGS, grad_bound=3e-3)
 
 
 @pytest.mark.parametrize("neurons", [0, 1, 2, 3, 8])
@@ -113,6 +115,29 @@ def test_sixteen_floats_are_read_before_they_are_written() -> None:
     numbers = np.arange(40, dtype=np.float32)
     copy(numbers, 5, numbers, 3)
     assert numbers.tolist() == [*range(5), *range(3, 19), *range(21, 40)]
+
+
+@pytest.mark.parametrize("compresses", [True, False])
+def test_those_of_sixteen_floats_that_count_are_moved_together(compresses: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the instruction and one by one, in place, and whatever the flags: not numbers count, and zeros of either sign do not."""
+    if compresses and not views._COMPRESSES:
+        pytest.skip("this version of LLVM is not asked for the instruction")
+    monkeypatch.setattr(views, "_COMPRESSES", compresses)
+
+    @njit
+    def keep(array: Any, at: Any, first: Any, flags: Any) -> Any:
+        return keep16(array, at, first, flags)
+
+    g = np.random.default_rng(0)
+    for chance in (0.0, 0.1, 0.5, 0.9, 1.0):
+        for at in (0, 3, 16):
+            array = g.normal(size=64).astype(np.float32)
+            array[32:48] = np.where(g.random(16) < chance, g.choice([1e-40, -2.0, np.nan, np.inf], 16), g.choice([0.0, -0.0], 16))
+            chosen = array[16:32][array[32:48] != 0]
+            expected = array.copy()
+            expected[at : at + 16] = [*chosen, *[0.0] * (16 - len(chosen))]
+            assert keep(array, at, 16, 32) == len(chosen)
+            np.testing.assert_array_equal(array, expected)
 
 
 def test_a_lent_array_is_the_same_array_and_its_owner_keeps_it() -> None:

@@ -15,6 +15,7 @@ from neuprim.core.render.cpu import layout as P
 from neuprim.core.render.cpu.binning import TileLists, bin_primitives
 from neuprim.core.render.cpu.limits import NON_FINITE, VISIBLE
 from neuprim.core.render.cpu.prepare import prepare, prepare_backward, prepare_wide
+from neuprim.core.render.cpu.seen import depth_that_counts
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.frame import NAMES, Frame, prepared
 from tests import scenes
@@ -82,6 +83,9 @@ CASES = {
 }
 
 
+LEAST = depth_that_counts(1 / 255)
+
+
 @dataclass
 class Numba:
     """What the numba backend makes of a frame; neurons by ``order``."""
@@ -139,13 +143,13 @@ def numba_frame(case: Case, t: dict[str, Tensor]) -> Numba:
     count, K = given[3].shape[:2]
     neurons = K + K % 2
     rows, spans = np.empty((count, P.row_width(neurons)), np.float32), np.zeros((count, P.SPAN_WIDTH), np.float32)
-    kinds, order = np.empty((count, neurons // 2), np.uint8), np.empty((count, K), np.uint8)
+    kinds, order = np.empty((count, neurons // 2), np.uint8), np.zeros((count, K), np.uint8)
     boxes, depth, status = np.empty((count, 4), np.int32), np.empty(count), np.empty(count, np.uint8)
     delicate = np.empty(count, np.bool_)
     camera, cam, view = case.camera, _intrinsics(case), case.camera.viewmat.double().numpy()
     R, origin = np.ascontiguousarray(view[:3, :3]), np.ascontiguousarray(view[:3, 3])
     prepare(
-        0, count, *given, R, origin, cam, np.array([camera.width, camera.height]), case.near, case.turns, case.edge,
+        0, count, *given, R, origin, cam, np.array([camera.width, camera.height]), case.near, case.turns, case.edge, LEAST,
         rows, spans, kinds, order, boxes, depth, status, delicate,
     )  # fmt: skip
     which = np.flatnonzero(delicate & (status == VISIBLE))
@@ -166,7 +170,7 @@ def both(name: str, device: str) -> tuple[Numba, Frame]:
 
 def frame_of(case: Case, t: dict[str, Tensor], device: str, forced: Tensor | None = None) -> Frame:
     t = {key: value.to(device) for key, value in t.items()}
-    return prepared(t, t["colors"], case.camera, case.camera.viewmat, case.near, case.turns, case.edge, forced)
+    return prepared(t, t["colors"], case.camera, case.camera.viewmat, case.near, case.turns, case.edge, LEAST, forced)
 
 
 def numpy(tensor: Tensor) -> Array:

@@ -1,0 +1,57 @@
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
+"""How much of an ellipsoid can be seen, on the device: the twin of :mod:`neuprim.core.render.cpu.seen` and of ``_longest`` in ``prepare``."""
+
+from neuprim.core.compute.warp import wp
+from neuprim.core.model.edge import NORMS
+from neuprim.core.render.cpu.seen import POWERS, WORTHS
+from neuprim.core.render.cuda.placement import Placed, Ray, View, rounded
+
+__all__ = ["longest", "seen_square", "too_faint"]
+
+d = wp.float64
+_NORMS, _POWERS, _WORTHS = (tuple(wp.constant(d(number)) for number in numbers) for numbers in (NORMS, POWERS, WORTHS))
+_N0, _N1, _N2 = _NORMS
+_P0, _P1, _P2 = _POWERS
+_W0, _W1, _W2 = _WORTHS
+
+
+@wp.func
+def longest(p: Placed, r: Ray, v: View, reach: wp.float64):
+    """A bound of the half chords of all rays that meet the ellipsoid, in units of its longest semi-axis; ``reach`` of it along the view."""
+    bound, one = d(1.0), d(1.0)
+    if r.tc != d(0.0):
+        z = p.centre[2]
+        slope_x, slope_y, wide = wp.abs(p.centre[0] / z), wp.abs(p.centre[1] / z), p.m / (z - reach)
+        du, dv = wide * (one + slope_x), wide * (one + slope_y)
+        least = wp.sqrt(wp.dot(r.e0, r.e0)) - v.focal[0] * du * wp.sqrt(wp.dot(r.ex, r.ex)) - v.focal[1] * dv * wp.sqrt(wp.dot(r.ey, r.ey))
+        most = wp.sqrt(one + (slope_x + du) * (slope_x + du) + (slope_y + dv) * (slope_y + dv))
+        if least > most:
+            bound = most / least
+    return bound
+
+
+@wp.func
+def too_faint(most: wp.float64, edge: int, least: wp.float64):
+    """Whether no chord can reach the depth ``least``, however long."""
+    norm = _N0
+    if edge == 1:
+        norm = _N1
+    if edge == 2:
+        norm = _N2
+    return most <= d(0.0) or most * norm <= least
+
+
+@wp.func
+def seen_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.float64):
+    """r^2 of the part that can be seen: 1 for all of it, 0 for nothing. ``most``: b2 + sum |w2|, positive; ``bound``: from :func:`longest`."""
+    square, norm, power, worth = d(0.0), _N0, _P0, _W0  # an array would be a stack: its index is not known to the compiler
+    if edge == 1:
+        norm, power, worth = _N1, _P1, _W1
+    if edge == 2:
+        norm, power, worth = _N2, _P2, _W2
+    share = least / (most * norm * bound)
+    if share <= worth:
+        square = d(1.0)
+    elif share < d(1.0):
+        square = rounded(d(1.0) - wp.exp(wp.log(share) * power))
+    return square

@@ -167,7 +167,7 @@ def weight_in(model: Primitives, dataset: Dataset, index: int, settings: Any) ->
     return tally.of_all(model.count)[0]
 
 
-def table(rows: list[dict[str, Any]]) -> str:
+def table(rows: list[dict[str, Any]], cpu: str) -> str:
     made = Table("model", "bytes", "times smaller", "PSNR", "against as trained", "SSIM")
     for scene in SCENES:
         mine = [r for r in rows if r["scene"] == scene]
@@ -190,7 +190,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     said = ", ".join(f"{scene} {count}" for scene, count in seeds.items() if count)
     return (
         f"{made}\n\nSeeds: {said}; mean ± half the spread. Pruned with a tolerance of {TOLERANCE} dB on training views and {PRUNED:,} steps of fine-tuning; "
-        f"{FEW_BITS:,} steps for few bits; {cpu_name()}, one thread."
+        f"{FEW_BITS:,} steps for few bits; {cpu}, one thread."
     )
 
 
@@ -208,7 +208,9 @@ def main() -> None:
     if args.orders is not None:
         orders(args.orders)
         return
-    rows: list[dict[str, Any]] = json.loads(RESULTS.read_text())["rows"] if RESULTS.exists() else []
+    record = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"cpu": "", "rows": []}
+    rows: list[dict[str, Any]] = record["rows"]
+    cpu = record["cpu"]
     data = {"chair": args.chair, "chair_5000": args.chair, "fire": args.fire, "fire_half": args.fire}
     if not args.print:
         context = multiprocessing.get_context("spawn")
@@ -224,9 +226,9 @@ def main() -> None:
             while waiting or not queue.empty():
                 while not queue.empty():
                     rows.append(queue.get())
+                    cpu = cpu if cpu_name() in cpu.split("; ") else "; ".join(filter(None, (cpu, cpu_name())))  # rows may be of several
                     RESULTS.write_text(
-                        json.dumps({"cpu": cpu_name(), "rows": sorted(rows, key=lambda r: (r["scene"], r["seed"], r["what"]))}, indent=1)
-                        + "\n"
+                        json.dumps({"cpu": cpu, "rows": sorted(rows, key=lambda r: (r["scene"], r["seed"], r["what"]))}, indent=1) + "\n"
                     )
                     print({k: v for k, v in rows[-1].items() if k != "kept"}, flush=True)
                 done = {future for future in waiting if future.done()}
@@ -234,7 +236,7 @@ def main() -> None:
                     future.result()
                 waiting -= done
                 time.sleep(1.0)
-    text = table(rows)
+    text = table(rows, cpu)
     if args.docs:
         between_markers(ROOT / "docs" / "tradeoffs.md", "smaller", text)
 

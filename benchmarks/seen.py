@@ -3,8 +3,8 @@
     python benchmarks/seen.py RUN_DIR... [--views 8] [--rounds 7] [--record]
 
 Forward is a training view without gradients, step one with them and its backward pass; the colours' lowering is inside, the optimiser is not. Times are the fastest
-rounds of all views, on one thread. *lanes*: rays against primitives that the forward and the backward pass evaluate, of those that they evaluate with whole
-silhouettes; *pairs* of tiles and primitives. *image*, *gradient*: the largest difference, of a gradient relative to its parameter's largest.
+rounds of all views, on one thread. *pairs* of tiles and primitives and *lanes*, rays against primitives, are shares of those of whole silhouettes; *backward* are the
+lanes that get a gradient, of those drawn. *image*, *gradient*: the largest difference, of a gradient relative to its parameter's largest.
 --record writes benchmarks/results/seen.json and the table in docs/performance.md.
 """
 
@@ -52,11 +52,10 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     rows = [measured(run, args.views, args.rounds) for run in args.runs]
-    table = Table("run", "primitives", "pairs", "lanes forward", "backward", "forward, times", "step, times", "image", "gradient")
+    shares = ("pairs", "lanes", "backward", "forward", "step")
+    table = Table("run", "primitives", "pairs", "lanes", "backward", "time forward", "time of a step", "image", "gradient")
     for r in rows:
-        lanes = [f"{r[f'{way}_lanes']:.2f}" for way in ("forward", "backward")]
-        times = [f"{r[name]:.2f}" for name in ("forward", "step")]
-        table.row(r["run"], f"{r['primitives']:,}", f"{r['pairs']:.2f}", *lanes, *times, f"{r['image']:.0e}", f"{r['gradient']:.0e}")
+        table.row(r["run"], f"{r['primitives']:,}", *(f"{r[name]:.2f}" for name in shares), f"{r['image']:.0e}", f"{r['gradient']:.0e}")
     if args.record:
         RESULTS.write_text(json.dumps({"cpu": cpu_name(), "rows": rows}, indent=1) + "\n")
         between_markers(PERFORMANCE, "seen", f"{table}\n\n{cpu_name()}, one thread.")
@@ -98,7 +97,9 @@ def measured(folder: Path, count: int, rounds: int) -> dict[str, Any]:
     return {
         "run": dataset.name,
         "primitives": model.count,
-        **{name: own[name] / other[name] for name in ("pairs", "forward_lanes", "backward_lanes")},
+        "pairs": own["pairs"] / other["pairs"],
+        "lanes": own["forward_lanes"] / other["forward_lanes"],
+        "backward": own["backward_lanes"] / own["forward_lanes"],
         **{name: mine / theirs for name, (mine, theirs) in times.items()},
         "image": max(float((a - b).abs().max()) for a, b in zip(own["images"], other["images"], strict=True)),
         "gradient": max(gradients),

@@ -123,7 +123,7 @@ def _tally(st, w, sums):  # type: ignore[no-untyped-def]
 def _lanes_that_count(S, n, with_depths):  # type: ignore[no-untyped-def]
     """Move the lanes with a gradient together, and zeros behind them; returns their number. ``with_depths``: DEPTH and NORM_L, too.
 
-    A third of a trained scene's lanes have none: rays below the cut, and those of pixels that are opaque before they get here.
+    Many have none: rays below the cut, and those of pixels that are opaque before they get here.
     """
     kept = 0
     for k in range(0, n, L.TILE):
@@ -222,7 +222,9 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             n16 = ((n + 15) // 16) * 16
             for k in range(0, n16, L.TILE):
                 copy16(S, L.DEPTH + k, depths, found[q] + k)
-            later = slots[i] < 0 and net is None and not with_depth  # chords are asked for by nothing but the gradients
+            later = (
+                slots[i] < 0 and net is None and not with_depth
+            )  # nothing but the gradients asks for chords: those of lanes that have one
             if not later:
                 lanes_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, neurons, floor, edge)
             opacity(S, n16, amin, amax)

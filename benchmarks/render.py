@@ -58,7 +58,7 @@ def _count_hits(E0, EX, EY, XA, tc, anchor, boxes):  # type: ignore[no-untyped-d
 
 
 def true_hits(lowered: Lowered, camera: Camera) -> int:
-    """Rays that really meet a primitive, of all (pixel, primitive) pairs; counted in the frame that a forward pass keeps."""
+    """Rays that really meet a primitive within its silhouette, of all (pixel, primitive) pairs; counted in the frame that a forward pass keeps."""
     node = render_lowered(lowered, camera, RenderSettings(backend="cpu"), torch.zeros(3)).rgb.grad_fn
     while not hasattr(node, "frame"):
         assert node is not None, "the backend keeps its frame in the graph"

@@ -4,7 +4,7 @@
 
 Forward is a training view without gradients, step one with them and its backward pass; the colours' lowering is inside, the optimiser is not. Times are the fastest
 rounds of all views, on one thread. *pairs* of tiles and primitives and *lanes*, rays against primitives, are shares of those of whole silhouettes; *backward* are the
-lanes that get a gradient, of those drawn. *image*, *gradient*: the largest difference, of a gradient relative to its parameter's largest.
+lanes that the backward pass evaluates, of those drawn. *image*, *gradient*: the largest difference, of a gradient relative to its parameter's largest.
 --record writes benchmarks/results/seen.json and the table in docs/performance.md.
 """
 
@@ -34,7 +34,7 @@ RESULTS = Path(__file__).parent / "results" / "seen.json"
 
 @contextmanager
 def whole() -> Iterator[None]:
-    """Silhouettes of all that there is: no depth is too little."""
+    """Silhouettes of all that has a density: no depth is too little."""
     genuine = backend.depth_that_counts
     backend.depth_that_counts = lambda alpha_min: -1.0
     try:

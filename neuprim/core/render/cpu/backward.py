@@ -171,7 +171,7 @@ def backward_tiles(  # type: ignore[no-untyped-def]
         waves = aligned(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
     lanes, wide_lanes, slopes = aligned(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64), aligned(neurons * L.NEURON_SCRATCH)
     pixels, weights, rays, totals = aligned((6 + C) * L.PIXELS + 2 * L.TILE), aligned(L.TILE), aligned(L.TILE), aligned((2 + C) * L.TILE)
-    ends, begins, lives = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32), np.zeros(L.TILE, np.float32)
+    ends, begins, lives = np.zeros(2 * L.TILE, np.int32), np.zeros(L.TILE, np.int32), aligned(L.TILE)
     S, D, V = lent(lanes), lent(wide_lanes), lent(slopes).reshape((neurons, L.NEURON_SCRATCH))
     state, w, cg, sums = lent(pixels), lent(weights), lent(rays), lent(totals)
     bounds, offset, rows_live = lent(ends), lent(begins), lent(lives)
@@ -222,10 +222,10 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             n16 = ((n + 15) // 16) * 16
             for k in range(0, n16, L.TILE):
                 copy16(S, L.DEPTH + k, depths, found[q] + k)
-            later = (
-                slots[i] < 0 and net is None and not with_depth
-            )  # nothing but the gradients asks for chords: those of lanes that have one
+            # where nothing but the gradients asks for chords, they are those of the lanes that have a gradient
+            later = slots[i] < 0 and net is None and not with_depth
             if not later:
+                evaluated += n16
                 lanes_with_slopes(S, D, V, n16, bounds, y0, y1, tx, ty, fx0, fy0, i, rows, wide, slots, neurons, floor, edge)
             opacity(S, n16, amin, amax)
             for k in range(n, n16):
@@ -283,7 +283,7 @@ def backward_tiles(  # type: ignore[no-untyped-def]
                     out[color_at + c] = _total(sums, (2 + c) * L.TILE)
             if later:
                 n16 = ((_lanes_that_count(S, n16, neurons > AT_ONCE) + 15) // 16) * 16
-            evaluated += n16
+                evaluated += n16
             if later and neurons <= AT_ONCE:
                 gradients_at_once(S, n16, p, kinds[i], fx0, fy0, floor, neurons, edge, out)
                 continue
@@ -295,12 +295,11 @@ def backward_tiles(  # type: ignore[no-untyped-def]
             if net is not None:
                 ray_colour_gradient(S, waves, n16, i, net, C, out, color_at)
             chord_gradient(S, n16, p, out, edge, slots[i] >= 0)
-    for mine in (lanes, slopes, pixels, weights, rays, totals):
+    for mine in (lanes, slopes, pixels, weights, rays, totals, lives):
         returned(mine)
     returned(wide_lanes)
     for numbers in (ends, begins):
         returned(numbers)
-    returned(lives)
     return evaluated
 
 

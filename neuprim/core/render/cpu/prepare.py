@@ -128,15 +128,15 @@ def _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turn
 
 
 @strict
-def _are_finite(i, means, log_scales, quats, W1, b1):  # type: ignore[no-untyped-def]
-    """Whether a primitive that is not drawn has parameters at all: its geometry's numbers, and a rotation."""
-    total, square = np.float64(0.0), np.float64(0.0)
+def _are_finite(i, means, log_scales, quats, W1, b1, most):  # type: ignore[no-untyped-def]
+    """Whether the numbers of a primitive that is not drawn are finite, ``most`` for its amplitudes, and its quaternion a rotation."""
+    total, square = most, np.float64(0.0)
     for a in range(3):
-        total += means[i, a] + log_scales[i, a]
+        total += np.float64(means[i, a]) + np.float64(log_scales[i, a])
     for a in range(4):
         square += np.float64(quats[i, a]) * np.float64(quats[i, a])
     for k in range(W1.shape[1]):
-        total += W1[i, k, 0] + W1[i, k, 1] + W1[i, k, 2] + b1[i, k]
+        total += np.float64(W1[i, k, 0]) + np.float64(W1[i, k, 1]) + np.float64(W1[i, k, 2]) + np.float64(b1[i, k])
     return np.isfinite(total + 1.0 / square)
 
 
@@ -189,7 +189,8 @@ def prepare(  # type: ignore[no-untyped-def]
     cam = (fx, fy, cx, cy); size = (width, height); turns = omega0 / 2 pi. Neurons are stored by rising rate: ``order[i, k]`` is the
     model's index of row neuron k, ``kinds[i, m]`` the range of rates (SLOW, MEDIUM, FAST) of row neurons 2m and 2m + 1.
     ``in_float64[i]`` says that float32 is not enough for the primitive's pixels (see :func:`prepare_wide`). ``least``: the optical depth below
-    which nothing is drawn; silhouettes are those of the rays that can reach it (:mod:`~neuprim.core.render.cpu.seen`).
+    which nothing is drawn; silhouettes are those of the rays that can reach it (:mod:`~neuprim.core.render.cpu.seen`), and of a primitive that cannot
+    anywhere nothing is filled but its status, an empty box and a depth of 0.
     """
     K = W1.shape[1]
     work, waves, rate, row = np.empty((10, 3)), np.empty((K, 4)), np.empty(K), np.zeros(rows.shape[1])
@@ -202,7 +203,7 @@ def prepare(  # type: ignore[no-untyped-def]
         if too_faint(most, edge, least):  # whatever its place
             boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
             in_float64[i], depth[i] = False, 0.0
-            status[i] = CULLED if _are_finite(i, means, log_scales, quats, W1, b1) else NON_FINITE
+            status[i] = CULLED if _are_finite(i, means, log_scales, quats, W1, b1, most) else NON_FINITE
             continue
         m, finite, biggest = _wide_row(i, means, log_scales, quats, W1, b1, w2, b2, R, t, cam, near, turns, work, waves, rate, order, row)
         for n in range(kinds.shape[1]):

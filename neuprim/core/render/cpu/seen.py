@@ -3,7 +3,8 @@
 A chord whose point nearest to the centre has |y|^2 = 1 - D crosses (1 - |y|^2)^p with an integral of N_p D^p times half its length, and half
 its length is at most s D^(1/2), with s the longest half chord that a ray of the view has. No cosine exceeds its amplitude, so
 that an optical depth is at most F N_p s D^(p + 1/2), F = b2 + sum |w2|. Rays below the depth of ``alpha_min`` count as empty in every backend;
-they are those that pass outside the same ellipsoid, smaller by r = (1 - D)^(1/2). What is drawn, and every gradient, stays what it is.
+they are those that pass outside the same ellipsoid, smaller by r = (1 - D)^(1/2). What is drawn, and every gradient, stays what it is but for
+rounding.
 
 s and F are of the frame's own numbers, in float64. The bound is met by a ball of constant density, so that the depth asked for is a little less
 than that of ``alpha_min``: what float32 says of a chord is then no question.

@@ -13,7 +13,7 @@ EXACT = {**OPTIONS, "fuse_fp": False}
 """Options of the per-primitive kernels: every product is rounded, so that two kernels that count the same tiles, and the CPU, agree."""
 
 PER_BLOCK = 64
-"""Primitives of a block: float64 takes 160 registers, and a few more small blocks lie on a processor than large ones."""
+"""Primitives of a block: float64 takes 163 registers, and a few more small blocks lie on a processor than large ones."""
 
 d = wp.float64
 _ANCHOR_RADII = wp.constant(d(ANCHOR_RADII))

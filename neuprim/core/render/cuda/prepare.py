@@ -144,7 +144,8 @@ def prepare_kernel(double: bool) -> Any:
     """Fills rows, spans, boxes, depth, status and counts of every primitive from float32 or float64 parameters; dim (N,).
 
     ``counts`` (2, N): tiles reached, and 1 where float32 is too coarse and something is seen. ``bad`` (1,): the first primitive that is not
-    finite, its colours included; otherwise left as it is. ``least``: the optical depth below which nothing is drawn.
+    finite, its colours included; otherwise left as it is. ``least``: the optical depth below which nothing is drawn; of a primitive that reaches
+    it nowhere nothing is filled but its status, counts, an empty box and a depth of 0.
     """
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
@@ -165,7 +166,7 @@ def prepare_kernel(double: bool) -> Any:
         if too_faint(most, edge, least):  # whatever its place
             state = int(_CULLED)
             given, turn = wp.vec3d(means[i]) + wp.vec3d(log_scales[i]), wp.vec4d(quats[i])
-            given_sum = given[0] + given[1] + given[2] + d(1.0) / wp.dot(turn, turn)
+            given_sum = most + given[0] + given[1] + given[2] + d(1.0) / wp.dot(turn, turn)
             for k in range(neurons):
                 given_sum += d(W1[i, k][0]) + d(W1[i, k][1]) + d(W1[i, k][2]) + d(b1[i, k])
             for c in range(channels):
@@ -173,7 +174,6 @@ def prepare_kernel(double: bool) -> Any:
             if not wp.isfinite(given_sum):
                 state = int(_NON_FINITE)
                 wp.atomic_min(bad, 0, i)
-            store(rows, i, _REST, f(0.0), f(0.0), f(0.0), f(0.0))
             boxes[i] = wp.vec4i()
             depth[i] = d(0.0)
             status[i] = wp.uint8(state)

@@ -68,12 +68,12 @@ def test_gradients_where_rows_die_early(neurons: int, monkeypatch: pytest.Monkey
     # behind walls that let a fiftieth through, float32 is a little coarser than elsewhere: as much before depths were kept (4e-5 and 1.2e-3)
     fast, _ = assert_same_frame(t, scenes.camera(), SETTINGS, image_bound=1e-4, grad_bound=2e-3)
     extra = fast.output.stats.extra
-    assert extra["backward_lanes"] <= extra["forward_lanes"]
+    assert extra["backward_lanes"] < 0.9 * extra["forward_lanes"], "lanes of opaque pixels get no gradient"
 
 
 def test_hidden_pairs_are_not_evaluated_again() -> None:
     extra = draw("cpu", wall(), scenes.camera(), SETTINGS).output.stats.extra
-    assert 0 < extra["backward_lanes"] <= extra["forward_lanes"]
+    assert 0 < extra["backward_lanes"] < 0.9 * extra["forward_lanes"]
 
 
 def test_nothing_is_kept_where_no_gradient_can_be_asked(monkeypatch: pytest.MonkeyPatch) -> None:

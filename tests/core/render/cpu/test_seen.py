@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from kornia.geometry.quaternion import Quaternion
 from numba import njit
 from torch import Tensor
 
@@ -96,6 +97,21 @@ def test_what_cannot_be_seen_costs_nothing(edge: int) -> None:
     assert all(not leaf.grad.any() for leaf in leaves.values() if leaf.grad is not None)
 
 
+@pytest.mark.parametrize("edge", [0, 1, 2])
+def test_discs_that_are_thin_along_every_ray_cost_nothing(edge: int) -> None:
+    """Seen from the front their chords are a fiftieth of their radius; from the side the same discs can be seen."""
+    t = scenes.tensors(9, 0)
+    t["means"], t["log_scales"] = 0.3 * t["means"], torch.tensor([-2.0, -2.0, -2.0 - math.log(50.0)]).expand(9, 3).contiguous()
+    t["b2"] = torch.full_like(t["b2"], 10.0 * depth_that_counts(ALPHA_MIN) / NORMS[edge])
+    camera, pairs = scenes.camera(1280, 960), {}
+    axes = camera.viewmat[:3, :3].T  # of the camera, as columns: the disc's are these, or its normal is the first of them
+    for name, order in (("front", [0, 1, 2]), ("side", [1, 2, 0])):
+        t["quats"] = Quaternion.from_matrix(axes[None, :, order]).data.float().expand(9, 4).contiguous()
+        with scenes.soft(edge):
+            pairs[name] = render_lowered(scenes.lowered(t), camera, SETTINGS).stats.pairs
+    assert pairs["front"] == 0 < pairs["side"]
+
+
 def test_no_density_is_nothing_to_see() -> None:
     t = scenes.tensors(30, 2)
     t["b2"] = -1.001 * t["w2"].abs().sum(-1, keepdim=True)
@@ -120,12 +136,14 @@ def test_what_is_too_faint_wherever_it_is(edge: int) -> None:
     assert not faint(math.nan, edge, 0.01) and not faint(math.inf, edge, 0.01)
 
 
-@pytest.mark.parametrize("name", ["means", "log_scales", "quats", "W1", "b1"])
+@pytest.mark.parametrize("name", ["means", "log_scales", "quats", "W1", "b1", "b2"])
 def test_faint_primitives_are_checked_as_others(name: str) -> None:
     t = scenes.tensors(4, 2)
     t["b2"], t["w2"] = torch.zeros_like(t["b2"]), torch.zeros_like(t["w2"])
     assert render_lowered(scenes.lowered(t), scenes.camera(), SETTINGS).stats.pairs == 0
-    t[name][2] = 0.0 if name == "quats" else math.nan
+    t["W1"][1, 0] = 2e38  # three of which float32 cannot add
+    assert render_lowered(scenes.lowered(t), scenes.camera(), SETTINGS).stats.pairs == 0
+    t[name][2] = {"quats": 0.0, "b2": -math.inf}.get(name, math.nan)
     with pytest.raises(NonFiniteError, match=f"{name} of primitive 2"):
         render_lowered(scenes.lowered(t), scenes.camera(), SETTINGS)
 

@@ -21,6 +21,9 @@ ROUNDS = 5
 """Of training, at most, each with its share of the steps, and nearly each after a cut. Every one goes down to the rates of the run's end, so that what is
 judged is as well trained as it was."""
 
+_MORE = 900
+"""Steps of a round where there are so many that :data:`ROUNDS` would be longer: what a scene does not require at all goes a doubled cut at a time."""
+
 _LEAST = 600
 """Steps of a round, at least: few of them leave a model worse than they found it."""
 
@@ -29,6 +32,9 @@ _PATIENCE = 3.0
 
 _BITE = 8.0
 """dB that the first cut loses at once, over the tolerance: what training brings back most of."""
+
+_LARGEST_BITE = 10.0
+"""dB: a bite smaller than this that takes nothing is doubled."""
 
 _ENOUGH = 0.1
 """Share of the tolerance below which there is nothing to cut for: what is left is trained for a round instead, which wins a little back."""
@@ -110,7 +116,7 @@ class Search:
         self.base = self.judge(model)
         best, tried = _State(model), None
         apart: tuple[str, ...] = ()
-        rounds = min(max(self.steps // _LEAST, 1), ROUNDS)
+        rounds = min(max(self.steps // _LEAST, 1), max(ROUNDS, self.steps // _MORE))
         bite = self.tolerance * (1.0 + (_BITE - 1.0) * min(self.steps / rounds / _LEAST, 1.0))
         for number in range(rounds):
             left = self.tolerance - max(best.lost, 0.0)
@@ -123,6 +129,8 @@ class Search:
                     tried = replace(best, cut=self.base - best.lost)
                 else:
                     tried = self._cut(best, bite if self.steps else left, number / rounds)
+                    while numbers(tried.model) >= numbers(best.model) and 0.0 < tried.bite < _LARGEST_BITE and self.steps:
+                        tried = self._cut(best, 2.0 * tried.bite, number / rounds)  # of a few large parts each is worth more than the bite
                     if numbers(tried.model) >= numbers(best.model):
                         break
                 bite = tried.bite

@@ -37,7 +37,7 @@ def test_slots_lead_from_every_primitive_to_its_pairs() -> None:
 def test_many_large_primitives_fill_every_tile() -> None:
     """More pairs in one unit of work than its buffer starts with, on one thread and two."""
     t, camera = scenes.tensors(600, 0, seed=5, radius=9.0), scenes.camera(90, 70)
-    t["log_scales"][:] = 3.0
+    t["log_scales"][:], t["b2"] = 3.0, t["b2"].abs() + 0.01  # all of them can be seen
     for threads in (1, 2):
         lists = frame_of(t, camera, threads).lists
         tiles = -(-90 // TILE) * -(-70 // TILE)

@@ -46,7 +46,7 @@ def test_equal_depths_keep_their_order(device: str) -> None:
 def test_large_primitives_fill_every_tile(device: str) -> None:
     case = Case(0)
     t = case.tensors()
-    t["log_scales"][:] = 3.0
+    t["log_scales"][:], t["b2"] = 3.0, t["b2"].abs() + 0.01  # all of them can be seen
     lists = frame_of(case, t, device).lists
     tiles = -(-150 // L.TILE) * -(-110 // L.TILE)
     assert lists.pairs == case.count * tiles

@@ -18,7 +18,7 @@ from neuprim.runs.prune.judge import judge_of
 __all__ = ["ROUNDS", "Search", "Stage"]
 
 ROUNDS = 5
-"""Of training, at most, each with its share of the steps, and nearly each after a cut. Every one goes down to the rates of the run's end, so that what is
+"""Of training, at most (but see :data:`_MORE`), each with its share of the steps, and nearly each after a cut. Every one goes down to the rates of the run's end, so that what is
 judged is as well trained as it was."""
 
 _MORE = 900

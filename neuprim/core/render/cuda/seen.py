@@ -9,10 +9,7 @@ from neuprim.core.render.cuda.placement import Placed, Ray, View, rounded
 __all__ = ["longest", "seen_square", "too_faint"]
 
 d = wp.float64
-_NORMS, _POWERS, _WORTHS = (tuple(wp.constant(d(number)) for number in numbers) for numbers in (NORMS, POWERS, WORTHS))
-_N0, _N1, _N2 = _NORMS
-_P0, _P1, _P2 = _POWERS
-_W0, _W1, _W2 = _WORTHS
+(_N0, _N1, _N2), (_P0, _P1, _P2), (_W0, _W1, _W2) = ([wp.constant(d(number)) for number in numbers] for numbers in (NORMS, POWERS, WORTHS))
 
 
 @wp.func
@@ -31,27 +28,28 @@ def longest(p: Placed, r: Ray, v: View, reach: wp.float64):
 
 
 @wp.func
+def _of(edge: int, hard: wp.float64, one: wp.float64, two: wp.float64):
+    """An array would be a stack: its index is not known to the compiler."""
+    number = hard
+    if edge == 1:
+        number = one
+    if edge == 2:
+        number = two
+    return number
+
+
+@wp.func
 def too_faint(most: wp.float64, edge: int, least: wp.float64):
     """Whether no chord can reach the depth ``least``, however long."""
-    norm = _N0
-    if edge == 1:
-        norm = _N1
-    if edge == 2:
-        norm = _N2
-    return most <= d(0.0) or most * norm <= least
+    return most <= d(0.0) or most * _of(edge, _N0, _N1, _N2) <= least
 
 
 @wp.func
 def seen_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.float64):
     """r^2 of the part that can be seen: 1 for all of it, 0 for nothing. ``most``: b2 + sum |w2|, positive; ``bound``: from :func:`longest`."""
-    square, norm, power, worth = d(0.0), _N0, _P0, _W0  # an array would be a stack: its index is not known to the compiler
-    if edge == 1:
-        norm, power, worth = _N1, _P1, _W1
-    if edge == 2:
-        norm, power, worth = _N2, _P2, _W2
-    share = least / (most * norm * bound)
-    if share <= worth:
+    square, share = d(0.0), least / (most * _of(edge, _N0, _N1, _N2) * bound)
+    if share <= _of(edge, _W0, _W1, _W2):
         square = d(1.0)
     elif share < d(1.0):
-        square = rounded(d(1.0) - wp.exp(wp.log(share) * power))
+        square = rounded(d(1.0) - wp.exp(wp.log(share) * _of(edge, _P0, _P1, _P2)))
     return square

@@ -111,7 +111,7 @@ def measured(name: str, chair: Path | None, work: Path) -> dict[str, Any]:
                 "test_stored": record.achieved["test"]["psnr"],
                 "bytes_usual": chosen.packed,
                 "bytes": record.achieved["packed_bytes"],
-                "level": record.achieved["level"],
+                "rounding": record.achieved["rounding"],
                 "warning": record.warning,
             }
         )
@@ -169,7 +169,7 @@ def report(name: str, result: Mapping[str, Any]) -> str:
             f"{run['trials']} trials, {run['full_runs']} full",
             f"{value:.2f} ± {doubt:.2f}, had {had:.2f}",
             f"{run['held_out']:.2f}",
-            f"{run['held_out_stored']:.2f}, level {run['level']}",
+            f"{run['held_out_stored']:.2f}",
             f"{run['test_stored']:.2f}",
             f"{run['bytes']:,}",
             f"{run['bytes_usual'] / smallest(result['grid'], run['target']):.2f}",

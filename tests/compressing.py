@@ -52,6 +52,13 @@ FIELDS: dict[str, tuple[str, Callable[[], tuple[DensityField, ColourField]]]] = 
             field("dynamic", "TimeHarmonics", degree=2, powers=2, waves=3),
         ),
     ),
+    "volume": (
+        "dynamic",
+        lambda: (
+            field("dynamic", "TimeDensity", neurons=0, time="window+motion", edge=2, gain=True),
+            field("dynamic", "TimeHarmonics", degree=0),
+        ),
+    ),
     "additive": ("relight", lambda: (CosineDensity(2), field("relight", "LightNetwork", hidden=4))),
     "multiplicative": ("relight", lambda: (CosineDensity(2), field("relight", "LightNetwork", hidden=3, form="multiplicative"))),
     "harmonics": ("relight", lambda: (CosineDensity(2), field("relight", "LightHarmonics", degree=4))),

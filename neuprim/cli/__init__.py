@@ -294,7 +294,9 @@ def _compress(args: argparse.Namespace) -> int:
     from neuprim.runs.compress import compress_run
 
     progress = LineProgress(plain_console(stderr=True))
-    print_compression(compress_run(run_dir, args.level, args.bits, args.out, args.force, progress, args.seconds, args.steps))
+    print_compression(
+        compress_run(run_dir, args.level, args.bits, args.out, args.force, progress, args.seconds, args.steps, args.tolerance)
+    )
     return 0
 
 

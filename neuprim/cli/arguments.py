@@ -77,8 +77,11 @@ def for_inspect(parser: argparse.ArgumentParser) -> None:
 def for_compress(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of ``neuprim compress``."""
     parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
-    parser.add_argument("--level", type=count, default=3, metavar="1-5", help="1 keeps nearly everything, 5 very little (default: 3)")
-    words = "bits of a parameter, or of all others, over the level's: means=16 sh_rest=6,5 others=8"
+    parser.add_argument("--tolerance", type=decibels, metavar="DB", help="how much worse it may get (default: 0.1dB)")
+    parser.add_argument(
+        "--level", type=count, metavar="1-5", help="so many bits instead, whatever that costs: 1 keeps nearly everything, 5 very little"
+    )
+    words = "bits of a parameter, or of all others, over a level's (3 unless given): means=16 sh_rest=6,5 others=8"
     parser.add_argument("--bits", nargs="+", default=[], metavar="NAME=BITS", help=words)
     parser.add_argument("--seconds", type=duration, default=30.0, metavar="S", help="of training for few bits; 0 for none (default: 30)")
     parser.add_argument("--steps", type=whole, metavar="N", help="of training instead, for the same file on every machine")

@@ -57,7 +57,7 @@ def print_record(record: Record, console: Console) -> None:
         line(f"{text}; test views {found['test'][name]:.4g}, {found['test_before_storing'][name]:.4g} before storing")
     whole = Path(found["run_dir"]) / "model.safetensors"
     line(
-        f"{found['primitives']:,} primitives: {found['file']} {found['packed_bytes']:,} bytes (level {found['level']}), {whole.name} {found['model_bytes']:,} bytes"
+        f"{found['primitives']:,} primitives: {found['file']} {found['packed_bytes']:,} bytes, {whole.name} {found['model_bytes']:,} bytes"
     )
     line(f"{found['seconds']:.0f} s of {record.asked['budget']:g} s used; {found['fps']:.1f} frames per second")
     for why in record.why:

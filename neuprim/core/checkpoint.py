@@ -158,23 +158,23 @@ def save_compressed(
     model: Primitives,
     task: str,
     extra: Mapping[str, Any],
-    table: compressed.BitTable,
+    bits: compressed.BitTable | compressed.Schemes,
     config: str | None = None,
-    made: compressed.Schemes | None = None,
 ) -> dict[str, compressed.Stored]:
     """As :func:`save_model`, in few bits; returns what the file has of every parameter.
 
     Args:
-        table: how many.
+        bits: how many, or how the numbers of a model that is folded are coded.
         config: text of the run's ``config.yaml``, so that a run directory can be made of the file.
-        made: of a model that is folded and was trained for them; then the table is not asked.
 
     Raises:
         CheckpointError: numbers that cannot be stored, or the file could not be written; names it and the reason.
     """
-    if made is None:
+    if isinstance(bits, compressed.BitTable):
         model = compressed.folded(model)
-        made = compressed.schemes(model, table)
+        made = compressed.schemes(model, bits)
+    else:
+        made = bits
     sections = compressed.encode(model, made)
     if config is not None:
         sections.insert(0, compressed.Section(compressed.CONFIG, compressed.TEXT, (), planes=(config.encode(),)))

@@ -16,13 +16,16 @@ from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.io.drafts import refuse_taken
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
-from neuprim.runs.few_bits import train_for
+from neuprim.runs.few_bits import Fewer, train_for, train_within
 from neuprim.runs.measure import quality
 from neuprim.runs.open import COMPRESSED, LOGS, load_dataset, load_run
 
-__all__ = ["Compression", "StoredParameter", "compress_run"]
+__all__ = ["TOLERANCE", "Compression", "StoredParameter", "compress_run"]
 
 Progress = Callable[[str, float], None]
+
+TOLERANCE = 0.1
+"""dB that judged training views may lose, unless said otherwise."""
 
 
 @dataclass(frozen=True)
@@ -57,37 +60,47 @@ class Compression:
 
 def compress_run(
     run_dir: Path,
-    level: int = USUAL_LEVEL,
+    level: int | None = None,
     bits: Iterable[str] = (),
     out: Path | None = None,
     overwrite: bool = False,
     progress: Progress = lambda text, fraction: None,
     seconds: float = 0.0,
     steps: int | None = None,
+    tolerance: float | None = None,
 ) -> Compression:
     """Write a run's model as a compressed file, whole or not at all, and measure what that costs where the run's data are there.
 
+    Unless a level or bits are given, training views decide how coarse every number may be: as coarse as ``tolerance`` allows. Where the run's data
+    are not there, it is :data:`~neuprim.core.compressed.USUAL_LEVEL`.
+
     With ``seconds`` or ``steps`` the numbers are trained for the few bits first: every image of a step is drawn of what will be read back, and
-    gradients go to the numbers themselves (straight through). What training views say is better of both, trained or not, is written.
+    gradients go to the numbers themselves (straight through). What training views say is better, trained or not, is written.
 
     Args:
         level: 1 (nearly everything) to 5 (very little), see :data:`neuprim.core.compressed.LEVELS`.
-        bits: words NAME=BITS over the level's own.
+        bits: words NAME=BITS over the level's own, or over those of :data:`~neuprim.core.compressed.USUAL_LEVEL`.
         out: the file; None: ``model.neuprim`` in the run directory.
         overwrite: whether a file that exists may be replaced.
         progress: called with (text, fraction 0..1).
         seconds: of fine-tuning, about; steps: so many instead, which gives the same file again.
+        tolerance: dB that training views may lose, :data:`TOLERANCE` unless given; neither with a level nor with bits.
 
     Raises:
         NeuprimError: no such run, level or parameter, numbers that cannot be stored, or a file in the way.
     """
+    bits = tuple(bits)
+    if tolerance is not None and (level is not None or bits):
+        raise ConfigError(
+            f"--tolerance {tolerance:g}: decides the bits of every number; expected no {'--bits' if bits else '--level'} beside it"
+        )
     final = run_dir / COMPRESSED if out is None else out
     if final.is_dir():
         raise ConfigError(f"--out {final}: is a folder; expected the name of a file")
     refuse_taken(final, overwrite)
     config, task, model, header = load_run(run_dir)
     config = replace(config, output_dir=run_dir)
-    table = bit_table(level, bits, model.specs)
+    table = bit_table(USUAL_LEVEL if level is None else level, bits, model.specs)
     extra = extra_of(header)
     notes = ["its primitives are in another order than the run's"]
     dataset: Dataset | None = None
@@ -99,11 +112,18 @@ def compress_run(
         notes.append(f"what this costs was not measured{training}, as the run's data cannot be read: {error}")
     start = time.perf_counter()
     with suspects_of(config).watch(run_dir / LOGS):
-        whole, made, trained = model, None, 0
-        if dataset is not None and (steps or (steps is None and seconds > 0)):
-            whole, made, trained, said = train_for(config, task, dataset, model, table, seconds, steps, progress)
-            notes += said
-        stored = save_compressed(final, whole, task.name, extra, table, (run_dir / "config.yaml").read_text(encoding="utf-8"), made)
+        fewer: Fewer | None = None
+        if dataset is not None and level is None and not bits:
+            allowed = TOLERANCE if tolerance is None else tolerance
+            fewer = train_within(config, task, dataset, model, allowed, seconds, steps, progress)
+        elif dataset is not None and (steps or (steps is None and seconds > 0)):
+            fewer = train_for(config, task, dataset, model, table, seconds, steps, progress)
+        elif level is None and not bits:
+            notes.append(f"no training views say how coarse its numbers may be; they are of --level {USUAL_LEVEL}")
+        notes += () if fewer is None else fewer.notes
+        text = (run_dir / "config.yaml").read_text(encoding="utf-8")
+        whole, coded = (model, table) if fewer is None else (fewer.model, fewer.made)
+        stored = save_compressed(final, whole, task.name, extra, coded, text)
     taken = time.perf_counter() - start
     parameters = tuple(
         StoredParameter(s.name, stored[s.name].bits, 4 * model.count * s.size, stored[s.name].size) for s in model.specs if s.size
@@ -113,7 +133,7 @@ def compress_run(
     if dataset is not None:
         measured = _costs(run_dir, config, task, dataset, model, again, progress)
     before = sum(p.before for p in parameters)
-    return Compression(final, parameters, before, final.stat().st_size, measured, taken, trained, tuple(notes))
+    return Compression(final, parameters, before, final.stat().st_size, measured, taken, 0 if fewer is None else fewer.steps, tuple(notes))
 
 
 def _dataset(run_dir: Path, config: RunConfig, task: TaskSpec) -> Dataset:

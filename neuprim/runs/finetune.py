@@ -21,9 +21,13 @@ START, COOL = 3.0, 0.02
 """The rates at the first step over those at the end of the run, and those at the last step over these at the first: with next to none at the end, numbers
 settle, which is worth something by itself (row "trained as long" of docs/tradeoffs.md) and decides where numbers are rounded."""
 
-VOXELS_EVERY = 4
+LONG, LEAST_START = 2000, 1.0
+"""Steps from which on rates begin so high; of fewer they begin lower, in proportion, but not below :data:`LEAST_START`. A few hundred steps at high
+rates leave a well trained volume worse than they found it: they unsettle more than there is time to settle."""
+
+VOXELS_EVERY = 8
 """Steps between two looks at voxels, at most, where a run learned from them: in a few hundred steps with looks as rare as in a whole run some frames are
-hardly met, and their extinction drifts for the sake of the images."""
+hardly met, and their extinction drifts for the sake of the images; at every fourth step images are lost for the sake of voxels."""
 
 _WARM, _PACED = 5, 20
 """Steps before the pace is taken, and those that it is taken of."""
@@ -47,7 +51,7 @@ def fine_tuner(
     whole = round(steps / (1 - begin))
     usual = settings_for(config.train, task, copy)
     final = COOL ** (1 / (1 - begin))  # a rate's factor is final ** progress
-    scale = START * usual.final_rate / final**begin
+    scale = max(START * min(steps / LONG, 1.0), LEAST_START) * usual.final_rate / final**begin
     settings = replace(
         usual,
         iterations=whole,

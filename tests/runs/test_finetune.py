@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuprim.core.compressed import bit_table, folded, rounded, schemes
+from neuprim.core.compressed import Schemes, bit_table, folded, rounded, schemes
+from neuprim.core.compressed.columns import Columns
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
-from neuprim.runs.few_bits import train_for
-from neuprim.runs.finetune import COOL, START, fine_tuner, steps_in
+from neuprim.runs.few_bits import Rounding, train_for, train_within
+from neuprim.runs.finetune import COOL, LEAST_START, LONG, START, fine_tuner, steps_in
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.prune.judge import Judge
 from tests.core import tiny
@@ -33,15 +34,18 @@ def dataset(run_dir: Path) -> Dataset:
 
 def test_rates_begin_above_those_of_the_run_s_end_and_fall_to_next_to_nothing(run_dir: Path, dataset: Dataset) -> None:
     config, task, model, _ = load_run(run_dir)
+    assert 40 / LONG * START < LEAST_START
     trainer = fine_tuner(config, task, dataset, model, 40)
     spec = next(s for s in model.specs if s.name == "b2")
     usual = config.train.rates.get("b2", spec.lr) * config.train.final_rate
-    assert trainer.rates()["b2"] == pytest.approx(START * usual, rel=1e-6)
+    assert trainer.rates()["b2"] == pytest.approx(LEAST_START * usual, rel=1e-6)
     means = config.train.rates["means"] * config.train.final_rate * dataset.extent
-    assert trainer.rates()["means"] == pytest.approx(START * means, rel=1e-6)
+    assert trainer.rates()["means"] == pytest.approx(LEAST_START * means, rel=1e-6)
     for _ in range(40):
         trainer.train_step()
-    assert trainer.finished and trainer.rates()["b2"] == pytest.approx(COOL * START * usual, rel=1e-6)
+    assert trainer.finished and trainer.rates()["b2"] == pytest.approx(COOL * LEAST_START * usual, rel=1e-6)
+    for steps, start in ((LONG, START), (3 * LONG, START), (2 * LONG // 3, 2 * START / 3)):  # of many steps they begin higher
+        assert fine_tuner(config, task, dataset, model, steps).rates()["b2"] == pytest.approx(start * usual, rel=1e-3)
 
 
 def test_the_model_itself_stays_as_it_is_and_no_primitive_is_born_or_moved(run_dir: Path, dataset: Dataset) -> None:
@@ -92,11 +96,47 @@ def test_training_for_few_bits_wins_back_what_they_cost(run_dir: Path, dataset: 
 
     plain = folded(model)
     at_once = read_back(plain, schemes(plain, table))
-    trained, made, steps, said = train_for(config, task, dataset, model, table, 0.0, 150, lambda text, fraction: None)
-    assert steps == 150 and said == []
-    assert read_back(trained, made) > at_once + 0.2
-    again, _, _, _ = train_for(config, task, dataset, model, table, 0.0, 150, lambda text, fraction: None)
-    assert all(torch.equal(again.params[name], value) for name, value in trained.params.items())
+    fewer = train_for(config, task, dataset, model, table, 0.0, 150, lambda text, fraction: None)
+    assert fewer.steps == 150 and fewer.notes == ()
+    assert read_back(fewer.model, fewer.made) > at_once + 0.2
+    again = train_for(config, task, dataset, model, table, 0.0, 150, lambda text, fraction: None).model
+    assert all(torch.equal(again.params[name], value) for name, value in fewer.model.params.items())
+
+
+@pytest.mark.parametrize("steps", [0, 200])
+def test_a_tolerance_is_kept(run_dir: Path, dataset: Dataset, steps: int) -> None:
+    config, task, model, _ = load_run(run_dir)
+    judge = Judge(dataset, config.renderer)
+    base = judge(model)
+    for allowed in (0.1, 0.5):
+        fewer = train_within(config, task, dataset, model, allowed, 0.0, steps, lambda text, fraction: None)
+        back = {n: v.detach() for n, v in rounded(fewer.model.params, fewer.made).items()}
+        assert base - judge(Primitives(fewer.model.density, fewer.model.colour, back)) <= allowed + 1e-6
+        assert torch.equal(fewer.model.params["W1"], folded(model).params["W1"]) == (steps == 0)
+
+
+@pytest.mark.parametrize("start", [1e-3, 0.1, 20.0])
+def test_the_coarsest_numbers_that_are_enough_are_found(run_dir: Path, dataset: Dataset, start: float) -> None:
+    config, _, model, _ = load_run(run_dir)
+    rounding = Rounding(model, dataset, Judge(dataset, config.renderer))
+
+    def width(made: Schemes) -> float:
+        scheme = made["sh_dc"]
+        assert isinstance(scheme, Columns)
+        return float((scheme.high - scheme.low).double() @ (1.0 / scheme.last).double())
+
+    wanted = width(rounding.schemes(0.3))
+    made, share = rounding.coarsest(lambda m: width(m) <= wanted, start)
+    assert width(made) <= wanted < width(rounding.schemes(1.1 * share)) and 0.2 < share <= 0.3001
+
+
+def test_a_tolerance_that_not_even_the_finest_numbers_meet_makes_the_finest(run_dir: Path, dataset: Dataset) -> None:
+    config, _, model, _ = load_run(run_dir)
+    rounding = Rounding(model, dataset, Judge(dataset, config.renderer))
+    finest, share = rounding.coarsest(lambda made: False, 0.1)
+    coarsest, most = rounding.coarsest(lambda made: True, 0.1)
+    assert 0 < share < 1e-3 and most >= 30.0
+    assert int(finest["W1"].bits.sum()) > int(coarsest["W1"].bits.sum())  # type: ignore[union-attr]
 
 
 def test_where_training_brings_nothing_the_model_is_stored_as_it_is(
@@ -104,6 +144,6 @@ def test_where_training_brings_nothing_the_model_is_stored_as_it_is(
 ) -> None:
     config, task, model, _ = load_run(run_dir)
     monkeypatch.setattr("neuprim.runs.finetune.START", 3e4)  # rates that spoil everything
-    stored, _, steps, said = train_for(config, task, dataset, model, bit_table(1, [], model.specs), 0.0, 20, lambda text, fraction: None)
-    assert steps == 20 and len(said) == 1 and "brought nothing" in said[0]
-    assert all(torch.equal(stored.params[name], value) for name, value in folded(model).params.items())
+    fewer = train_for(config, task, dataset, model, bit_table(1, [], model.specs), 0.0, 20, lambda text, fraction: None)
+    assert fewer.steps == 20 and len(fewer.notes) == 1 and "brought nothing" in fewer.notes[0]
+    assert all(torch.equal(fewer.model.params[name], value) for name, value in folded(model).params.items())

@@ -5,7 +5,7 @@ bytes, ``file`` how these lie on disk, ``codec`` how a model is taken apart.
 """
 
 from neuprim.core.compressed.bits import LEVELS, USUAL_LEVEL, BitTable, bit_table
-from neuprim.core.compressed.codec import Schemes, Stored, bits_in_words, encode, file_order, folded, rounded, schemes
+from neuprim.core.compressed.codec import Schemes, Stored, bits_in_words, encode, file_order, folded, rounded, schemes, schemes_within
 from neuprim.core.compressed.file import CONFIG, is_compressed, read_compressed, read_head, write_compressed
 from neuprim.core.compressed.sections import TEXT, Section
 
@@ -28,5 +28,6 @@ __all__ = [
     "read_head",
     "rounded",
     "schemes",
+    "schemes_within",
     "write_compressed",
 ]

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compressed.bits import BitTable
-from neuprim.core.compressed.columns import MOST_BITS, Columns, fit_columns, keep_zero, spread_error
+from neuprim.core.compressed.columns import MOST_BITS, Columns, even_columns, fit_columns, keep_zero, spread_error
 from neuprim.core.compressed.order import morton
-from neuprim.core.compressed.rotations import Rotations
+from neuprim.core.compressed.rotations import LEAST_BITS, Rotations
 from neuprim.core.compressed.sections import COLUMNS, POSITIONS, ROTATIONS, Section, pack, pack_rows, pack_sparse
 from neuprim.core.errors import CheckpointError, FormError
 from neuprim.core.model.checks import method
@@ -21,7 +21,7 @@ from neuprim.core.model.fields import pieces_by_name
 from neuprim.core.model.pieces import alive
 from neuprim.core.model.primitives import Primitives
 
-__all__ = ["Schemes", "Stored", "bits_in_words", "encode", "file_order", "folded", "rounded", "schemes"]
+__all__ = ["Schemes", "Stored", "bits_in_words", "encode", "file_order", "folded", "rounded", "schemes", "schemes_within"]
 
 Schemes = dict[str, Columns | Rotations]
 """Parameter -> how its numbers are coded."""
@@ -95,6 +95,45 @@ def schemes(model: Primitives, table: BitTable) -> Schemes:
                     columns = fit_columns(x, [min(2 * b, 16) if more else b for b, more in zip(bits, spiky.tolist(), strict=True)])
             found[spec.name] = keep_zero(columns) if spec.name in sparse else columns
     return found
+
+
+def schemes_within(model: Primitives, effects: Mapping[str, Tensor], error: float) -> Schemes:
+    """How a folded model's numbers are coded so that each of them brings the same error, as little as that is: a step is as long as images allow.
+
+    A number rounded to steps of length s is off by s^2 / 12 in the mean of squares. Of all ways to spend so many bits, those by which the last
+    bit of every number is worth as much are the best (reverse water filling), and codes that no number has take next to no bytes.
+
+    Args:
+        effects: parameter -> (C,) mean squared change of what is looked at, when its numbers change by independent amounts of variance 1
+            (:class:`~neuprim.core.train.sensitivity.Sensitivity`).
+        error: mean squared change that the numbers of one column may bring together.
+    """
+    found: Schemes = {}
+    sparse = _sparse(model)
+    for spec in model.specs:
+        x = model.params[spec.name].reshape(model.count, spec.size)
+        steps = (12.0 * error / effects[spec.name].double()).sqrt()  # infinite where nothing changes
+        if spec.name == "quats":
+            turn = float((12.0 * 3.0 * error / effects[spec.name].double().sum()).sqrt())  # three numbers tell of four
+            found[spec.name] = Rotations(min(max(round(math.log2(2**0.5 / turn + 2)), LEAST_BITS), 16) if turn > 0 else 16)
+        elif spec.fixed:
+            found[spec.name] = fit_columns(x, [_LABEL] * spec.size, clips=(0.0,))
+        elif spec.name == "means":
+            found[spec.name] = _even_positions(x, steps)
+        else:
+            zero = spec.name in sparse
+            columns = even_columns(x, steps, 0.0 if zero else x.double().mean(0))
+            found[spec.name] = keep_zero(columns) if zero else columns
+    return found
+
+
+def _even_positions(x: Tensor, steps: Tensor) -> Columns:
+    """As :func:`even_columns`, with as many bits for each axis."""
+    own = even_columns(x, steps, x.double().mean(0) if len(x) else 0.0)
+    bits = int(own.bits.max())
+    low = own.low.double()
+    step = torch.where(own.high > own.low, (own.high.double() - low) / own.last, 0.0)
+    return Columns(torch.full_like(own.bits, bits), own.low, (low + ((1 << bits) - 1) * step).float())
 
 
 def _sparse(model: Primitives) -> set[str]:

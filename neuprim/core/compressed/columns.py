@@ -17,13 +17,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["CLIPS", "MOST_BITS", "Columns", "fit_columns", "keep_zero", "spread_error"]
+__all__ = ["CLIPS", "MOST_BITS", "Columns", "even_columns", "fit_columns", "keep_zero", "spread_error"]
 
 MOST_BITS = 20
 """Of a column's codes: products of a float32 and a code stay exact in double precision with room to spare."""
 
 _MANTISSA = 24
 """Bits of a float32."""
+
+_LARGEST = float(torch.finfo(torch.float32).max)
 
 CLIPS = (0.0, 1e-4, 1e-3, 1e-2)
 """Shares of a column that may lie beyond either end; the one with the least mean square of errors is taken."""
@@ -83,6 +85,29 @@ def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) 
         least = torch.where(better, error, least)
         best = Columns(wanted, torch.where(better, low, best.low), torch.where(better, high, best.high))
     return best
+
+
+def even_columns(x: Tensor, steps: Tensor, through: Tensor | float) -> Columns:
+    """Columns whose neighbouring values lie ``steps`` (C,) apart, or nearer where they would need more than :data:`MOST_BITS`, and that reach
+    all of x (N, C), finite, on the processor.
+
+    Codes that no number has are as good as free, so a step can be of any length. A column whose numbers all lie within one is a single value.
+
+    Args:
+        through: (C,) or a number, what is one of the values, within the column's numbers.
+    """
+    if not x.numel():
+        return fit_columns(x, [1] * x.shape[1])
+    y = x.detach().double()
+    through = torch.as_tensor(through, dtype=torch.float64).expand(y.shape[1])
+    low, high = torch.minimum(y.amin(0), through), torch.maximum(y.amax(0), through)
+    steps = torch.maximum(steps.double(), (high - low) / (2**MOST_BITS - 3)).clamp(max=2.0 * _LARGEST)
+    wide = torch.where(steps > 0, steps, 1.0)
+    below, above = (((side / wide) - 0.5).ceil().clamp(min=0.0) for side in (through - low, high - through))
+    bits = torch.log2(below + above + 1).ceil().clamp(min=1.0).long()
+    first = through - below * steps
+    last = torch.where(below + above > 0, first + ((1 << bits) - 1) * steps, first)
+    return Columns(bits, first.clamp(min=-_LARGEST).float(), last.clamp(max=_LARGEST).float())
 
 
 def keep_zero(columns: Columns) -> Columns:

@@ -1,4 +1,6 @@
-"""One of the many ways to write a sum of cosines: the one whose numbers lie closest together.
+"""One of the many ways to write a density: the one whose numbers lie closest together.
+
+A strength b exp(g) is the sign of b times another gain, so that one number says what two did. Of a sum of cosines,
 
     sum_k w_k cos(rate (v_k . x + b_k))
 
@@ -15,7 +17,7 @@ from torch import Tensor
 
 from neuprim.core.model.schema import Params
 
-__all__ = ["fold_cosines"]
+__all__ = ["fold_cosines", "fold_gain"]
 
 _SLACK = 1e-6
 """Of a turn: phases that rounding left beside an end stay there, so that folding what is folded changes no bit."""
@@ -41,3 +43,17 @@ def fold_cosines(params: Params, inputs: tuple[str, ...], phase: str, weights: s
         value = params[name].detach()
         found[name] = torch.where(backward.reshape(*backward.shape, *[1] * (value.dim() - 2)), -value, value)
     return found
+
+
+def fold_gain(params: Params, strength: str, log_gain: str, limit: float) -> dict[str, Tensor]:
+    """The same products b exp(g), every b -1, 0 or 1.
+
+    Args:
+        params: name -> (N, ...); those that are not named pass through.
+        strength, log_gain: names of b and g, (N, 1).
+        limit: a g counts as no further from 0; where it would be, and where b is 0, both stay as they are.
+    """
+    b, g = params[strength].detach(), params[log_gain].detach()
+    joined = g.double().clamp(-limit, limit) + b.double().abs().log()
+    fits = (b != 0) & (joined.abs() <= limit)
+    return {**params, strength: torch.where(fits, b.sign(), b), log_gain: torch.where(fits, joined.to(g), g)}

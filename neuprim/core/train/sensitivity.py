@@ -34,11 +34,45 @@ class Sensitivity:
         whole: (N,) of each primitive being gone; in views, for a difference of colour of 1 from what is behind it.
         seen: (N,) in how many of the views, or frames, a primitive was; of those in none nothing is known.
         pieces: name -> (N,) of each primitive's piece being zero.
+        columns: parameter -> (C,) float64, of each of its numbers when those of all primitives change by independent amounts of variance 1; of
+            "quats" by amounts across a quaternion of unit norm.
     """
 
     whole: Tensor
     seen: Tensor
     pieces: dict[str, Tensor]
+    columns: dict[str, Tensor]
+
+    def beside(self, other: Sensitivity, weight: float) -> Sensitivity:
+        """Effects on these views and, ``weight`` times, on what another one looked at."""
+        pieces = {name: value + weight * other.pieces[name] for name, value in self.pieces.items()}
+        columns = {name: value + weight * other.columns[name] for name, value in self.columns.items()}
+        return Sensitivity(self.whole + weight * other.whole, self.seen + other.seen, pieces, columns)
+
+
+class _Sums:
+    """What backward passes of random signs say of a model's numbers, summed."""
+
+    def __init__(self, model: Primitives) -> None:
+        self._model, self._pieces = model, pieces_by_name(model.density, model.colour)
+        self.pieces = {name: torch.zeros(model.count) for name in self._pieces}
+        self.columns = {spec.name: torch.zeros(spec.size, dtype=torch.float64) for spec in model.specs}
+
+    def add(self, params: dict[str, Tensor]) -> None:
+        """One pass: ``params`` with their gradients."""
+        gradients = {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()}
+        for name, piece in self._pieces.items():
+            self.pieces[name] += worth(piece, params, gradients).square().cpu()
+        for name, own in self.columns.items():
+            slopes = gradients[name].reshape(self._model.count, len(own))
+            if name == "quats":  # a change of a quaternion counts as it turns, whatever its norm
+                slopes = slopes * params[name].detach().norm(dim=1, keepdim=True)
+            own += slopes.double().square().sum(0).cpu()
+
+    def over(self, count: float, whole: Tensor, seen: Tensor) -> Sensitivity:
+        """Means."""
+        pieces, columns = ({name: value / count for name, value in sums.items()} for sums in (self.pieces, self.columns))
+        return Sensitivity(whole / count, seen, pieces, columns)
 
 
 def sensitivity(model: Primitives, dataset: Dataset, views: Sequence[int], settings: RenderSettings, seed: int = 0) -> Sensitivity:
@@ -49,9 +83,7 @@ def sensitivity(model: Primitives, dataset: Dataset, views: Sequence[int], setti
         seed: of the random signs.
     """
     generator = torch.Generator().manual_seed(seed)
-    pieces = pieces_by_name(model.density, model.colour)
-    whole, there = torch.zeros(model.count), torch.zeros(model.count, dtype=torch.int64)
-    found = {name: torch.zeros(model.count) for name in pieces}
+    whole, there, sums = torch.zeros(model.count), torch.zeros(model.count, dtype=torch.int64), _Sums(model)
     background, numbers = dataset.background.float(), 0
     for index in views:
         view = dataset.train.view(index)
@@ -61,14 +93,12 @@ def sensitivity(model: Primitives, dataset: Dataset, views: Sequence[int], setti
         signs = (2 * torch.randint(0, 2, output.rgb.shape, generator=generator) - 1).to(output.rgb)
         tally = output.watch(signs[..., 0])
         (output.rgb * signs).sum().backward()
-        gradients = {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()}
+        sums.add(params)
         weight, signed = tally.of_all(model.count)
         there += (weight > 0).cpu()
         whole += signed.cpu().square() * output.rgb.shape[-1]
-        for name, piece in pieces.items():
-            found[name] += worth(piece, params, gradients).square().cpu()
         numbers += output.rgb.numel()
-    return Sensitivity(whole / numbers, there, {name: value / numbers for name, value in found.items()})
+    return sums.over(numbers, whole, there)
 
 
 def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: int = 0, threads: int = 0) -> Sensitivity:
@@ -79,9 +109,7 @@ def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: in
         seed, threads: of the random signs; of the backward pass, 0 for all cores.
     """
     generator = torch.Generator().manual_seed(seed)
-    pieces = pieces_by_name(model.density, model.colour)
-    whole, there = torch.zeros(model.count), torch.zeros(model.count, dtype=torch.int64)
-    found = {name: torch.zeros(model.count) for name in pieces}
+    whole, there, sums = torch.zeros(model.count), torch.zeros(model.count, dtype=torch.int64), _Sums(model)
     for samples in draws:
         params = {name: value.detach().requires_grad_() for name, value in model.params.items()}
         values = values_at(Primitives(model.density, model.colour, params), samples.conditions, samples.points, False, threads)
@@ -92,8 +120,5 @@ def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: in
         rows = torch.arange(model.count) if values.rows is None else values.rows.cpu()
         whole[rows] += shares.error_weight.cpu().square()
         there[rows] += (shares.weight > 0).cpu()
-        gradients = {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()}
-        for name, piece in pieces.items():
-            found[name] += worth(piece, params, gradients).square().cpu()
-    count = max(len(draws), 1)
-    return Sensitivity(whole / count, there, {name: value / count for name, value in found.items()})
+        sums.add(params)
+    return sums.over(max(len(draws), 1), whole, there)

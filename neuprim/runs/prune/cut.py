@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -79,11 +80,8 @@ def priced(model: Primitives, views: Sensitivity, inside: Sensitivity | None, ju
     """Mean squared changes of the views without each primitive and piece, for the differences of colour that there are; what changes inside
     counts as much as it is of the error inside, beside that of the views."""
     whole = views.whole * _contrast(model, views, lambda m: judge.images(m, quick=True))
-    if inside is None:
-        return Sensitivity(whole, views.seen, views.pieces)
-    scale = 10 ** ((judge.inside(model) - judge.images(model)) / 10)  # the mean square of the views over that inside
-    pieces = {name: value + scale * inside.pieces[name] for name, value in views.pieces.items()}
-    return Sensitivity(whole + scale * inside.whole, views.seen + inside.seen, pieces)
+    found = replace(views, whole=whole)
+    return found if inside is None else found.beside(inside, judge.apart(model))
 
 
 _Share = tuple[Tensor, dict[str, Tensor], dict[str, int]]

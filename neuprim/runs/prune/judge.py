@@ -91,6 +91,10 @@ class Judge:
                 found.append(-10 * math.log10(max(error, 1e-20)))
         return float(np.mean(found))
 
+    def apart(self, model: Primitives) -> float:
+        """How many times as large the error of the views is as that inside: what a change inside counts as much as one of images by."""
+        return 10 ** ((self.inside(model) - self.images(model)) / 10)
+
 
 def _frames(points: PointSupervision) -> list[PointSamples]:
     """Points of different frames, as they are drawn, in the order of the frames' names."""

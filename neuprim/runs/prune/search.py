@@ -17,21 +17,24 @@ from neuprim.runs.prune.judge import judge_of
 
 __all__ = ["ROUNDS", "Search", "Stage"]
 
-ROUNDS = 5
+ROUNDS = 3
 """Of training, at most (but see :data:`_MORE`), each with its share of the steps, and nearly each after a cut. Every one goes down to the rates of the run's end, so that what is
 judged is as well trained as it was."""
 
-_MORE = 900
+_MORE = 1300
 """Steps of a round where there are so many that :data:`ROUNDS` would be longer: what a scene does not require at all goes a doubled cut at a time."""
 
 _LEAST = 600
 """Steps of a round, at least: few of them leave a model worse than they found it."""
 
-_PATIENCE = 3.0
+_PATIENCE = 2.0
 """Times the tolerance: what has lost no more after a round is trained for another one before it is taken back."""
 
 _BITE = 8.0
 """dB that the first cut loses at once, over the tolerance: what training brings back most of."""
+
+_LEFT = 0.3
+"""Share of a bite that is still lost after a round of enough steps, but for what the round would have brought without a cut."""
 
 _LARGEST_BITE = 10.0
 """dB: a bite smaller than this that takes nothing is doubled."""
@@ -117,7 +120,9 @@ class Search:
         best, tried = _State(model), None
         apart: tuple[str, ...] = ()
         rounds = min(max(self.steps // _LEAST, 1), max(ROUNDS, self.steps // _MORE))
-        bite = self.tolerance * (1.0 + (_BITE - 1.0) * min(self.steps / rounds / _LEAST, 1.0))
+        enough = min(self.steps / rounds / _LEAST, 1.0)
+        bite = self.tolerance * (1.0 + (_BITE - 1.0) * enough)
+        remains = 1.0 - (1.0 - _LEFT) * enough
         for number in range(rounds):
             left = self.tolerance - max(best.lost, 0.0)
             if not best.model.count:
@@ -141,11 +146,13 @@ class Search:
             if not smaller:
                 best, tried = min(best, tried, key=lambda state: state.lost), None
             elif stays:
-                bite *= min(max((left - spent) / max(spent, 0.25 * self.tolerance), 1.0 / _BITE), 2.0)
+                brought = max(remains * bite - spent, 0.0)  # by training that had no cut to heal; half of it, next time
+                room = self.tolerance - tried.lost
+                bite = min(max((room + 0.5 * brought) / remains, bite / _BITE), max(room / (2 * self.tolerance), 1.0) * bite)
                 best, tried = replace(tried, bite=bite), None
             elif tried.lost > self._hopeless(before, tried):
                 apart = () if tried.alone else tried.words[len(best.words) :]
-                bite *= 1.0 if tried.alone else min(max(0.7 * left / max(spent, 1e-9), 0.2), 0.7)
+                bite *= 1.0 if tried.alone else min(max(0.7 * (self.tolerance - best.lost) / max(spent, 1e-9), 0.2), 0.7)
                 tried = None
         last = {word.partition("=")[0]: word for word in best.words}  # degree 0 after degree 2 is degree 0
         return best.model, tuple(last.values())

@@ -14,16 +14,17 @@ import torch
 from neuprim.config import suspects_of, task_of
 from neuprim.config.target import Target
 from neuprim.core.checkpoint import extra_of, load_model, save_compressed
-from neuprim.core.compressed import LEVELS, bit_table
+from neuprim.core.compressed import Schemes
 from neuprim.core.data.held_out import held_out
 from neuprim.core.io.files import atomic_path, write_text
 from neuprim.core.metrics import psnr, ssim
 from neuprim.core.model.primitives import Primitives
-from neuprim.runs.compress import compress_run
 from neuprim.runs.events import Finishing
+from neuprim.runs.few_bits import Rounding
 from neuprim.runs.finish import finish
-from neuprim.runs.measure import draw
+from neuprim.runs.measure import draw, quality
 from neuprim.runs.open import COMPRESSED, placed, read_metrics
+from neuprim.runs.prune.judge import judge_of
 from neuprim.runs.prune.run import Request, prune_run
 from neuprim.runs.target.judge import ALLOWANCE, ROOM, Judge
 from neuprim.runs.target.prediction import decibels
@@ -35,8 +36,8 @@ from neuprim.runs.truths import masked, truths_of
 
 __all__ = ["STAGES", "Finished", "chosen", "publish"]
 
-_LEVELS = (4, 3, 2, 1)
-"""Of compression, those tried for a target of quality, fewest bits first."""
+_FIRST = 0.05
+"""Share of the squared error that rounding adds where the search for coarse numbers begins."""
 
 _APART = 0.3
 """dB between the test views and the views held out that are worth a line."""
@@ -169,32 +170,34 @@ def _directory(trying: Trying, attempt: Attempt) -> Finished:
 
 
 def quantised(shop: Workshop, before: Finished) -> Finished:
-    """The model in the fewest bits with which it still meets the target; where it does not anyway, those that cost next to nothing. With a limit of
-    bytes alone, in the most bits that it allows."""
-    task = task_of(shop.trying.config)
+    """The model in numbers as coarse as the target lets them be; where it is missed anyway, so coarse that it costs next to nothing. With a limit of
+    bytes alone, as fine as that allows."""
+    trying, target, judge = shop.trying, shop.target, shop.judge
+    task, file = task_of(trying.config), before.run_dir / COMPRESSED
     model, header = load_model(before.run_dir / "model.safetensors", task)
-    draft = before.run_dir / "draft.neuprim"
-    target, judge = shop.target, shop.judge
-    levels = _LEVELS if target.quality or target.megabytes is None else sorted(LEVELS)
+    words = (before.run_dir / "config.yaml").read_text(encoding="utf-8")
     least = min(0.0, judge.margin(before.held)) - (ALLOWANCE if judge.margin(before.held) < 0 else 0.0)
-    picked, held = levels[-1], before.held
-    for level in levels:
-        shop.trying.events(Finishing(f"storing in few bits, level {level}"))
-        words = (before.run_dir / "config.yaml").read_text(encoding="utf-8")
-        save_compressed(draft, model, task.name, extra_of(header), bit_table(level, (), model.specs), words)
-        picked, held = level, shop.measured(load_model(draft, task)[0])
-        if target.quality:
-            enough = judge.margin(held) >= least
-        elif target.megabytes is not None:
-            enough = draft.stat().st_size <= 1e6 * target.megabytes
-        else:
-            enough = before.held["psnr"] - held["psnr"] <= ALLOWANCE
-        if enough:
-            break
-    draft.unlink(missing_ok=True)
-    made = compress_run(before.run_dir, picked, out=before.run_dir / COMPRESSED, overwrite=True)
-    test = {name: pair[1] for name, pair in made.measured.items()} or before.test
-    return replace(before, held=held, packed=made.after, test=test, facts={**before.facts, "level": picked, "file": str(made.file)})
+    trying.events(Finishing("storing in few bits"))
+    views = replace(trying.dataset, train=held_out(trying.dataset, trying.record.hold_out).train)
+    rounding = Rounding(model, views, judge_of(trying.config, views))
+
+    def stored(made: Schemes) -> int:
+        save_compressed(file, rounding.model, task.name, extra_of(header), made, words)
+        return file.stat().st_size
+
+    def enough(made: Schemes) -> bool:
+        held = shop.measured(rounding.read_back(made))
+        return judge.margin(held) >= least if target.quality else before.held["psnr"] - held["psnr"] <= ALLOWANCE
+
+    if target.quality or target.megabytes is None:
+        made, share = rounding.coarsest(enough, _FIRST)
+    else:
+        most = 1e6 * target.megabytes
+        made, share = rounding.finest(lambda tried: stored(tried) <= most, _FIRST)
+    size = stored(made)
+    again = load_model(file, task)[0]
+    test = dict(zip(("psnr", "ssim"), quality(again, task, trying.dataset, trying.config.renderer), strict=True))
+    return replace(before, held=shop.measured(again), packed=size, test=test, facts={**before.facts, "rounding": share, "file": str(file)})
 
 
 def pruned(shop: Workshop, before: Finished) -> Finished:

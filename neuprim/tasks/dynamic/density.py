@@ -167,6 +167,8 @@ class TimeDensity(DensityField):
         return children
 
     def folded(self, params: Params) -> dict[str, Tensor]:
+        if not self.static.neurons and "offset" not in self.parts:
+            return self.static.folded(params)
         return fold_cosines(params, ("W1", "W_t") if "phase" in self.parts else ("W1",), "b1", "w2", self.static.omega0)
 
     def divide(self, params: Params, geometry: Geometry) -> tuple[Tensor, dict[str, Tensor], Geometry] | None:

@@ -13,7 +13,7 @@ import torch
 import neuprim
 import neuprim.core.compressed.codec as codec
 from neuprim.core import checkpoint
-from neuprim.core.compressed import LEVELS, BitTable, bit_table, folded, read_compressed, rounded, schemes
+from neuprim.core.compressed import LEVELS, BitTable, bit_table, folded, read_compressed, rounded, schemes, schemes_within
 from neuprim.core.compressed.columns import Columns
 from neuprim.core.errors import CheckpointError, ConfigError, FormError
 from neuprim.core.model.densities.cosine import CosineDensity
@@ -219,6 +219,67 @@ def test_rounded_tensors_are_what_comes_back_with_their_own_gradients(tmp_path: 
     grads = torch.autograd.grad(total, list(leaves.values()), allow_unused=True)
     for i, (grad, leaf) in enumerate(zip(grads, leaves.values(), strict=True)):
         assert grad is not None and torch.equal(grad, torch.full_like(leaf, i + 1.0))
+
+
+# ---------------------------------------------------------------- as coarse as images allow
+
+
+def effects_of(model: Primitives) -> dict[str, torch.Tensor]:
+    """Some effect of every number, of very different sizes."""
+    generator = torch.Generator().manual_seed(3)
+    return {s.name: 10 ** (2 * torch.rand(s.size, generator=generator, dtype=torch.float64)) * model.count for s in model.specs}
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_every_column_brings_the_error_that_it_may(tmp_path: Path, name: str) -> None:
+    task, model = example(name, 2000)
+    whole, error = folded(model), 1e-4
+    effects = effects_of(whole)
+    made = schemes_within(whole, effects, error)
+    back = rounded(whole.params, made)
+    for spec in whole.specs:
+        if spec.fixed or not spec.size:
+            continue
+        x, y = (values[spec.name].reshape(2000, spec.size).double() for values in (whole.params, back))
+        brought = effects[spec.name] * (x - y).square().mean(0)
+        if spec.name == "quats":  # across, whatever the norm; whole bits are up to 1.4 times too long or too short
+            off = (angles(x, y) / 2).square().mean() * effects["quats"].sum() / 3
+            assert 0.4 * 3 * error < float(off) < 2.2 * 3 * error
+        elif spec.name == "b2" and name == "volume":
+            assert float(brought) < 1e-12  # -1 and 1 are what they are
+        else:
+            varied = effects[spec.name] * x.var(0) > 2 * error  # else a single value says it
+            assert bool((brought < 1.25 * error).all()) and bool((brought > 0.7 * error)[varied].all()), spec.name
+    path = tmp_path / "m"
+    checkpoint.save_compressed(path, whole, task.name, {}, made)
+    again = checkpoint.load_model(path, task)[0]
+    rows = codec.file_order(whole, made)
+    for key in (k for k in back if k != "quats"):
+        assert torch.equal(again.params[key], back[key][rows]), key
+
+
+@pytest.mark.parametrize("name", ["soft", "volume", "additive"])
+def test_more_error_is_fewer_bytes(tmp_path: Path, name: str) -> None:
+    task, model = example(name, 1000)
+    whole = folded(model)
+    sizes = []
+    for error in (1e-7, 1e-5, 1e-3, 1e-1, 1e9):
+        checkpoint.save_compressed(tmp_path / "m", whole, task.name, {}, schemes_within(whole, effects_of(whole), error))
+        sizes.append((tmp_path / "m").stat().st_size)
+        assert checkpoint.load_model(tmp_path / "m", task)[0].count == 1000
+    assert sizes == sorted(sizes, reverse=True) and sizes[-1] < 0.2 * sizes[0]
+
+
+def test_what_changes_nothing_takes_nothing_and_what_is_gone_stays_gone() -> None:
+    model = folded(without_pieces(example("soft", 400)[1]))
+    effects = {name: torch.zeros_like(value) if name == "log_gain" else value for name, value in effects_of(model).items()}
+    back = rounded(model.params, schemes_within(model, effects, 1e-3))
+    assert len(back["log_gain"].unique()) == 1
+    for name in ("sh_rest", "w2"):
+        gone = model.params[name] == 0
+        assert bool(gone.any()) and bool((back[name][gone] == 0).all())
+    none = Primitives(model.density, model.colour, {name: value[:0] for name, value in model.params.items()})
+    assert rounded(none.params, schemes_within(none, effects, 1e-3))["means"].shape == (0, 3)
 
 
 # ---------------------------------------------------------------- what cannot be stored

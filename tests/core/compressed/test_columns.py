@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from neuprim.core.compressed.columns import Columns, fit_columns, keep_zero, spread_error
+from neuprim.core.compressed.columns import MOST_BITS, Columns, even_columns, fit_columns, keep_zero, spread_error
 from neuprim.core.compressed.order import morton, unmorton
 from neuprim.core.compressed.rotations import Rotations
 
@@ -69,6 +69,39 @@ def test_the_clip_with_the_least_squares_is_taken() -> None:
 
     assert float(made.high) < 10 and error(made) < 0.5 * error(whole)
     assert spread_error(x, whole)[0] > spread_error(x, made)[0] > 1.0
+
+
+@given(st.lists(finite, min_size=1, max_size=30), st.floats(1e-30, 1e30), st.floats(0, 1))
+def test_even_steps_reach_every_number_and_pass_through_one_place(values: list[float], step: float, place: float) -> None:
+    x = torch.tensor(values)[:, None]
+    through = (1 - place) * float(x.min()) + place * float(x.max())
+    made = even_columns(x, torch.tensor([step]), through)
+    assert 1 <= int(made.bits) <= MOST_BITS and bool(made.low <= made.high) and bool(torch.isfinite(made.low) & torch.isfinite(made.high))
+    codes = made.codes(x)
+    assert int(codes.max()) <= int(made.last) and int(codes.min()) >= 0
+    size, width = float(x.double().abs().max()), float(x.double().max() - x.double().min())
+    taken = max(step, width / 2 ** (MOST_BITS - 1))  # of what 20 bits cannot say the step is longer
+    off = (made.values(codes).double() - x.double()).abs().max()
+    assert float(off) <= 0.5 * taken * (1 + 1e-3) + 2e-7 * size + 1e-40
+    near = (made.values(made.codes(torch.tensor([[through]], dtype=torch.float64))).double() - through).abs()
+    assert float(near) <= 1e-3 * taken + 3e-7 * size + 1e-40  # ends are float32
+
+
+def test_steps_are_as_long_as_they_were_asked_for() -> None:
+    x = torch.randn(2000, 3, generator=torch.Generator().manual_seed(0))
+    steps = torch.tensor([0.37, 0.011, 1e-3])
+    made = even_columns(x, steps, x.double().mean(0))
+    assert torch.allclose((made.high - made.low).double() / made.last, steps.double(), rtol=1e-5)
+    rms = (made.values(made.codes(x)).double() - x.double()).square().mean(0).sqrt()
+    assert torch.allclose(rms, steps.double() / 12**0.5, rtol=0.03)
+
+
+def test_numbers_within_one_step_are_a_single_value() -> None:
+    x = torch.tensor([[1.0, -3.0], [1.2, -3.0], [0.9, -3.0]])
+    made = even_columns(x, torch.tensor([torch.inf, 5.0]), x.double().mean(0))
+    assert torch.allclose(made.values(made.codes(x)), x.mean(0).expand(3, 2)) and torch.equal(made.low, made.high)
+    assert even_columns(torch.zeros(0, 2), torch.ones(2), 0.0).values(torch.zeros(0, 2, dtype=torch.int64)).shape == (0, 2)
+    assert even_columns(torch.zeros(5, 0), torch.ones(0), 0.0).codes(torch.zeros(5, 0)).shape == (5, 0)
 
 
 def test_columns_of_one_value_and_no_rows() -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neuprim.core.model.fields import Constant
-from neuprim.core.model.folding import fold_cosines
+from neuprim.core.model.folding import fold_cosines, fold_gain
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from tests import scenes
@@ -64,6 +64,27 @@ def test_a_phase_at_the_end_of_half_a_turn_stays() -> None:
     params = {"W": torch.ones(1, 2, 3), "b": end, "w": torch.ones(1, 2)}
     made = fold_cosines(params, ("W",), "b", "w", 30.0)
     assert all(torch.equal(made[key], value) for key, value in params.items())
+
+
+def test_one_number_says_how_strong_a_density_without_neurons_is() -> None:
+    model = example("volume", 300)[1]
+    model.params["b2"][::3] *= -1.0
+    made = folded(model).params
+    assert set(made["b2"].flatten().tolist()) == {-1.0, 1.0} and len(model.params["b2"].unique()) > 200
+    before, after = (p["b2"].double() * p["log_gain"].double().exp() for p in (model.params, made))
+    assert torch.allclose(after, before, rtol=1e-6)
+    for several in ("soft", "dynamic"):  # neurons, or terms in time, have strengths of their own
+        whole = example(several)[1]
+        assert torch.equal(folded(whole).params["log_gain"], whole.params["log_gain"])
+
+
+def test_strengths_that_do_not_fit_into_a_gain_stay() -> None:
+    b = torch.tensor([[0.0], [1e-30], [1e30], [-2.0], [3.0], [torch.nan], [torch.inf]])
+    g = torch.tensor([[1.0], [-19.0], [19.0], [0.0], [25.0], [0.0], [0.0]])  # beyond 20 a gain counts as 20
+    made = fold_gain({"b": b, "g": g}, "b", "g", 20.0)
+    assert made["b"].flatten().tolist()[:5] == [0.0, b[1, 0].item(), b[2, 0].item(), -1.0, 3.0]
+    assert made["g"].flatten().tolist() == [1.0, -19.0, 19.0, pytest.approx(math.log(2.0)), 25.0, 0.0, 0.0]
+    assert torch.isnan(made["b"][5, 0]) and torch.isinf(made["b"][6, 0])
 
 
 def test_fields_without_cosines_stay_as_they_are() -> None:

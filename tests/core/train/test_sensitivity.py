@@ -71,3 +71,37 @@ def test_the_same_seed_finds_the_same() -> None:
     one, dataset = model(), tiny.two_primitives()
     a, b = (sensitivity(one, dataset, [0, 1], SETTINGS, 3) for _ in range(2))
     assert torch.equal(a.whole, b.whole) and all(torch.equal(a.pieces[name], b.pieces[name]) for name in a.pieces)
+
+
+def test_columns_are_the_mean_squared_change_by_independent_amounts() -> None:
+    """Numbers of one parameter move at random by little; quaternions turn by as much whatever their norm."""
+    one, dataset = model(), tiny.two_primitives()
+    one.params["quats"] = one.params["quats"] * torch.linspace(0.2, 5.0, one.count)[:, None]
+    one.params["log_scales"] = one.params["log_scales"] + torch.tensor([0.4, 0.0, -0.4])
+    views = list(range(len(dataset.train)))[:4]
+    whole = images(one, dataset, views)
+    trials = [sensitivity(one, dataset, views, SETTINGS, seed).columns for seed in range(80)]
+    generator = torch.Generator().manual_seed(1)
+    for name, size in (("log_scales", 1e-3), ("sh_dc", 1e-3), ("means", 1e-4), ("quats", 1e-3), ("log_gain", 1e-3)):
+        value = one.params[name]
+        found = float(torch.stack([t[name] for t in trials]).mean(0).sum())
+        changes = []
+        for _ in range(40):
+            amount = size * torch.randn(value.shape, generator=generator)
+            moved = value + amount
+            if name == "quats":
+                unit = value / value.norm(dim=1, keepdim=True)
+                moved = value + (amount - (amount * unit).sum(1, keepdim=True) * unit) * value.norm(dim=1, keepdim=True)
+            changed = Primitives(one.density, one.colour, {**one.params, name: moved})
+            changes.append(float((images(changed, dataset, views) - whole).square().mean()) / size**2)
+        true = sum(changes) / len(changes)
+        assert abs(found - true) < 0.3 * true, name
+
+
+def test_effects_beside_others_are_weighted_sums() -> None:
+    one, dataset = model(), tiny.two_primitives()
+    a, b = (sensitivity(one, dataset, [view], SETTINGS) for view in (0, 1))
+    both = a.beside(b, 3.0)
+    assert torch.allclose(both.whole, a.whole + 3 * b.whole) and torch.equal(both.seen, a.seen + b.seen)
+    assert all(torch.allclose(both.pieces[n], a.pieces[n] + 3 * b.pieces[n]) for n in a.pieces)
+    assert all(torch.allclose(both.columns[n], a.columns[n] + 3 * b.columns[n]) for n in a.columns)

@@ -17,7 +17,7 @@ from neuprim.core.checked import Range
 from neuprim.core.model.densities.fewer import fewer_neurons, smaller_counts
 from neuprim.core.model.edge import EDGES, NORMS, fade
 from neuprim.core.model.fields import Conditions, Cosine, DensityField
-from neuprim.core.model.folding import fold_cosines
+from neuprim.core.model.folding import fold_cosines, fold_gain
 from neuprim.core.model.footprint import gaussian_support
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pieces import Piece
@@ -106,7 +106,8 @@ class CosineDensity(DensityField):
         return split_cosine(params, old, new, self.omega0, self.edge)
 
     def folded(self, params: Params) -> dict[str, Tensor]:
-        return fold_cosines(params, ("W1",), "b1", "w2", self.omega0)
+        found = fold_cosines(params, ("W1",), "b1", "w2", self.omega0)
+        return fold_gain(found, "b2", "log_gain", GAIN_LIMIT) if self.gain and not self.neurons else found
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
         support, depth = gaussian_support(self.edge, alphas)

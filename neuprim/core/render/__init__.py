@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import nullcontext
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.rays import AnyCamera, RayCamera
 from neuprim.core.compute import device
+from neuprim.core.compute.threads import limited
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.primitives import Lowered, Primitives
@@ -64,7 +66,8 @@ def render(
         ConfigError: there is no backend of the name asked for.
     """
     settings = settings or RenderSettings()
-    return render_lowered(model.lower(camera, conditions or {}, settings), camera, settings, background)
+    with limited(settings.threads) if settings.threads else nullcontext():  # fields are lowered by as many threads as pixels
+        return render_lowered(model.lower(camera, conditions or {}, settings), camera, settings, background)
 
 
 def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None) -> RenderOutput:

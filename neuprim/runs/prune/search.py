@@ -30,8 +30,11 @@ _LEAST = 600
 _PATIENCE = 2.0
 """Times the tolerance: what has lost no more after a round is trained for another one before it is taken back."""
 
-_BITE = 8.0
+_BITE = 6.5
 """dB that the first cut loses at once, over the tolerance: what training brings back most of."""
+
+_GROWTH = 1.5
+"""Times the last bite that the next one may be."""
 
 _LEFT = 0.3
 """Share of a bite that is still lost after a round of enough steps, but for what the round would have brought without a cut."""
@@ -148,7 +151,7 @@ class Search:
             elif stays:
                 brought = max(remains * bite - spent, 0.0)  # by training that had no cut to heal; half of it, next time
                 room = self.tolerance - tried.lost
-                bite = min(max((room + 0.5 * brought) / remains, bite / _BITE), max(room / (2 * self.tolerance), 1.0) * bite)
+                bite = min(max((room + 0.5 * brought) / remains, bite / _BITE), _GROWTH * bite)
                 best, tried = replace(tried, bite=bite), None
             elif tried.lost > self._hopeless(before, tried):
                 apart = () if tried.alone else tried.words[len(best.words) :]

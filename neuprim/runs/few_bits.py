@@ -72,25 +72,29 @@ class Rounding:
         """How this model, or what became of it in training, is coded."""
         return schemes_within(self.model if model is None else model, self._effects, share * self._error)
 
-    def coarsest(self, enough: Callable[[Schemes], bool], start: float, model: Primitives | None = None) -> tuple[Schemes, float]:
-        """The coarsest schemes that are ``enough``, and their share of the error; or the finest that there are."""
-        fine, _ = self._between(enough, start, model)
-        return self.schemes(fine, model), fine
+    def coarsest(self, enough: Callable[[Schemes], bool], start: float) -> tuple[Schemes, float]:
+        """The coarsest schemes that are ``enough``, and their share of the error; or the finest that there are.
+
+        Args:
+            start: the share that is tried first.
+        """
+        fine, _ = self._between(enough, start)
+        return self.schemes(fine), fine
 
     def finest(self, enough: Callable[[Schemes], bool], start: float) -> tuple[Schemes, float]:
         """The finest schemes that are ``enough``, and their share of the error; or the coarsest that there are."""
-        _, coarse = self._between(lambda made: not enough(made), start, None)
+        _, coarse = self._between(lambda made: not enough(made), start)
         return self.schemes(coarse), coarse
 
     def read_back(self, made: Schemes) -> Primitives:
         """The model as it would come back."""
         return read_back(self.model, made)
 
-    def _between(self, fine_enough: Callable[[Schemes], bool], start: float, model: Primitives | None) -> tuple[float, float]:
+    def _between(self, fine_enough: Callable[[Schemes], bool], start: float) -> tuple[float, float]:
         """Two shares that lie close together, of which the first is fine enough and the second is not; or both an end of what is tried."""
         fine, coarse, share = 0.0, 0.0, start
         for _ in range(_LOOKS):
-            if fine_enough(self.schemes(share, model)):
+            if fine_enough(self.schemes(share)):
                 fine = share
             else:
                 coarse = share
@@ -168,7 +172,7 @@ def train_within(
             at_once = max(at_once + (_AIM * tolerance - lost) / _SLOPE, 0.25 * at_once)
         if best is None:
             progress("looking for the coarsest numbers", 1.0)
-            made, share = rounding.coarsest(lambda tried: base - judge(read_back(rounding.model, tried)) <= tolerance, _share(tolerance))
+            made, share = rounding.coarsest(lambda tried: base - judge(rounding.read_back(tried)) <= tolerance, _share(tolerance))
             best = rounding.model, made, share
     state, made, share = best
     return Fewer(state, made, steps, (f"rounding may add {share:.1%} to the squared error; every number's last bit is worth as much",))

@@ -126,6 +126,8 @@ def test_the_coarsest_numbers_that_are_enough_are_found(run_dir: Path, dataset: 
         return float((scheme.high - scheme.low).double() @ (1.0 / scheme.last).double())
 
     wanted = width(rounding.schemes(0.3))
+    coarse, above = rounding.finest(lambda m: width(m) > wanted, start)
+    assert width(coarse) > wanted and 0.2999 <= above < 0.4
     made, share = rounding.coarsest(lambda m: width(m) <= wanted, start)
     assert width(made) <= wanted < width(rounding.schemes(1.1 * share)) and 0.2 < share <= 0.3001
 

@@ -112,9 +112,10 @@ def schemes_within(model: Primitives, effects: Mapping[str, Tensor], error: floa
     sparse = _sparse(model)
     for spec in model.specs:
         x = model.params[spec.name].reshape(model.count, spec.size)
-        steps = (12.0 * error / effects[spec.name].double()).sqrt()  # infinite where nothing changes
+        own = effects[spec.name].double().nan_to_num(nan=torch.inf, posinf=torch.inf)  # what cannot be told is stored as finely as can be
+        steps = (12.0 * error / own).sqrt()  # infinite where nothing changes
         if spec.name == "quats":
-            turn = float((12.0 * 3.0 * error / effects[spec.name].double().sum()).sqrt())  # three numbers tell of four
+            turn = float((12.0 * 3.0 * error / own.sum()).sqrt())  # three numbers tell of four
             found[spec.name] = Rotations(min(max(round(math.log2(2**0.5 / turn + 2)), LEAST_BITS), 16) if turn > 0 else 16)
         elif spec.fixed:
             found[spec.name] = fit_columns(x, [_LABEL] * spec.size, clips=(0.0,))

@@ -39,6 +39,9 @@ _GROWTH = 1.5
 _LEFT = 0.3
 """Share of a bite that is still lost after a round of enough steps, but for what the round would have brought without a cut."""
 
+_AGAIN = 0.35
+"""Share of what a round would have brought without a cut that the next one is expected to bring."""
+
 _LARGEST_BITE = 10.0
 """dB: a bite smaller than this that takes nothing is doubled."""
 
@@ -149,19 +152,22 @@ class Search:
             if not smaller:
                 best, tried = min(best, tried, key=lambda state: state.lost), None
             elif stays:
-                brought = max(remains * bite - spent, 0.0)  # by training that had no cut to heal; half of it, next time
+                brought = max(remains * bite - spent, 0.0)
                 room = self.tolerance - tried.lost
-                bite = min(max((room + 0.5 * brought) / remains, bite / _BITE), _GROWTH * bite)
+                bite = min(max((room + _AGAIN * brought) / remains, bite / _BITE), _GROWTH * bite)
                 best, tried = replace(tried, bite=bite), None
-            elif tried.lost > self._hopeless(before, tried):
+            elif tried.lost > self._hopeless(before, tried, best):
                 apart = () if tried.alone else tried.words[len(best.words) :]
                 bite *= 1.0 if tried.alone else min(max(0.7 * (self.tolerance - best.lost) / max(spent, 1e-9), 0.2), 0.7)
                 tried = None
         last = {word.partition("=")[0]: word for word in best.words}  # degree 0 after degree 2 is degree 0
         return best.model, tuple(last.values())
 
-    def _hopeless(self, before: _State, now: _State) -> float:
-        """dB from which on what was lost after a round is taken back: more than another round like it would win."""
+    def _hopeless(self, before: _State, now: _State, best: _State) -> float:
+        """dB from which on what was lost after a round is taken back: more than another round like it would win, or anything where the model
+        before the cut has room left, as a smaller cut of that is sure to save something."""
+        if best.rounds and best.lost < 0:
+            return self.tolerance
         return self.tolerance * _PATIENCE if now.rounds == 1 else self.tolerance + before.lost - now.lost
 
     # ------------------------------------------------------------ one stage

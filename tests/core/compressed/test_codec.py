@@ -278,6 +278,11 @@ def test_what_changes_nothing_takes_nothing_and_what_is_gone_stays_gone() -> Non
     for name in ("sh_rest", "w2"):
         gone = model.params[name] == 0
         assert bool(gone.any()) and bool((back[name][gone] == 0).all())
+    for unknown in (torch.nan, torch.inf):
+        fine = schemes_within(model, {name: torch.full_like(value, unknown) for name, value in effects.items()}, 1e-3)
+        for name, value in rounded(model.params, fine).items():
+            near = angles(value, model.params[name]) if name == "quats" else value - model.params[name]
+            assert float(near.abs().max()) < 1e-3 if name == "quats" else 1e-5, name
     none = Primitives(model.density, model.colour, {name: value[:0] for name, value in model.params.items()})
     assert rounded(none.params, schemes_within(none, effects, 1e-3))["means"].shape == (0, 3)
 

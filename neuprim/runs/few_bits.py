@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -31,7 +32,7 @@ _AHEAD = 2.0
 
 _ROUND, _ROUNDS = 500, 3
 """Steps of a round of training, at least, and rounds, at most: after one it is known how much training brings back. What was trained for some steps
-between numbers is stored in these: finer ones are no better, since only what is read back was trained."""
+between numbers is best stored in these: of a fire finer ones are worse, since only what is read back was trained."""
 
 _SLOPE, _AIM = 0.7, 0.95
 """dB that a trained model loses more, for one more at once; and the share of the tolerance that the next round aims at."""
@@ -68,9 +69,15 @@ class Rounding:
         columns = sum(spec.size for spec in self.model.specs)
         self._effects, self._error = views.columns, 10 ** (-judge.images(self.model) / 10) / max(columns, 1)
 
-    def schemes(self, share: float, model: Primitives | None = None) -> Schemes:
-        """How this model, or what became of it in training, is coded."""
-        return schemes_within(self.model if model is None else model, self._effects, share * self._error)
+    def of(self, trained: Primitives) -> Rounding:
+        """The same of what became of the model in training."""
+        other = copy(self)
+        other.model = trained
+        return other
+
+    def schemes(self, share: float) -> Schemes:
+        """How the model is coded."""
+        return schemes_within(self.model, self._effects, share * self._error)
 
     def coarsest(self, enough: Callable[[Schemes], bool], start: float) -> tuple[Schemes, float]:
         """The coarsest schemes that are ``enough``, and their share of the error; or the finest that there are.
@@ -154,8 +161,8 @@ def train_within(
         judge = judge_of(config, dataset)
         base = judge(model)
         progress("looking for what numbers are worth", 0.0)
-        rounding = Rounding(model, dataset, judge)
-        state, at_once, best = rounding.model, _AHEAD * tolerance, None
+        plain = Rounding(model, dataset, judge)
+        rounding, at_once, best = plain, _AHEAD * tolerance, None
         rounds = min(max(steps // _ROUND, 1), _ROUNDS) if steps else 0
         for number in range(rounds):
 
@@ -163,19 +170,23 @@ def train_within(
                 progress("training for few bits", (before + part) / rounds)
 
             share = _share(at_once)
-            made = rounding.schemes(share, state)
+            made = rounding.schemes(share)
             own = steps * (number + 1) // rounds - steps * number // rounds
-            state = _trained(config, task, dataset, state, made, own, show)
-            lost = base - judge(read_back(state, made))
+            rounding = rounding.of(_trained(config, task, dataset, rounding.model, made, own, show))
+            lost = base - judge(rounding.read_back(made))
             if lost <= tolerance and (best is None or share > best[2]):
-                best = state, made, share
+                best = rounding.model, made, share
             at_once = max(at_once + (_AIM * tolerance - lost) / _SLOPE, 0.25 * at_once)
-        if best is None:
+        if best is None:  # of what was trained between coarser numbers, and of what was not trained, what can be stored more coarsely
             progress("looking for the coarsest numbers", 1.0)
-            made, share = rounding.coarsest(lambda tried: base - judge(rounding.read_back(tried)) <= tolerance, _share(tolerance))
-            best = rounding.model, made, share
-    state, made, share = best
-    return Fewer(state, made, steps, (f"rounding may add {share:.1%} to the squared error; every number's last bit is worth as much",))
+            tried = [plain, rounding] if rounds else [plain]
+
+            def found(one: Rounding) -> tuple[Primitives, Schemes, float]:
+                return one.model, *one.coarsest(lambda made: base - judge(one.read_back(made)) <= tolerance, _share(tolerance))
+
+            best = max(map(found, tried), key=lambda each: each[2])
+    whole, made, share = best
+    return Fewer(whole, made, steps, (f"rounding may add {share:.1%} to the squared error; every number's last bit is worth as much",))
 
 
 def _share(decibels: float) -> float:

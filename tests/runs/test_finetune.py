@@ -115,6 +115,15 @@ def test_a_tolerance_is_kept(run_dir: Path, dataset: Dataset, steps: int) -> Non
         assert torch.equal(fewer.model.params["W1"], folded(model).params["W1"]) == (steps == 0)
 
 
+def test_training_that_spoils_the_model_is_not_stored(run_dir: Path, dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, task, model, _ = load_run(run_dir)
+    plain = train_within(config, task, dataset, model, 0.2, 0.0, 0, lambda text, fraction: None)
+    monkeypatch.setattr("neuprim.runs.finetune.LEAST_START", 300.0)
+    found = train_within(config, task, dataset, model, 0.2, 0.0, 20, lambda text, fraction: None)
+    assert all(torch.equal(found.model.params[name], value) for name, value in plain.model.params.items())
+    assert found.notes == plain.notes and found.steps == 20
+
+
 @pytest.mark.parametrize("start", [1e-3, 0.1, 20.0])
 def test_the_coarsest_numbers_that_are_enough_are_found(run_dir: Path, dataset: Dataset, start: float) -> None:
     config, _, model, _ = load_run(run_dir)

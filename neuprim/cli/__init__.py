@@ -288,16 +288,9 @@ def _export(args: argparse.Namespace) -> int:
 
 def _compress(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
-    from neuprim.cli.compress_report import print_compression
-    from neuprim.cli.console import plain_console
-    from neuprim.cli.progress import LineProgress
-    from neuprim.runs.compress import compress_run
+    from neuprim.cli.compress_report import compress
 
-    progress = LineProgress(plain_console(stderr=True))
-    print_compression(
-        compress_run(run_dir, args.level, args.bits, args.out, args.force, progress, args.seconds, args.steps, args.tolerance)
-    )
-    return 0
+    return compress(args, run_dir)
 
 
 def _prune(args: argparse.Namespace) -> int:

@@ -1,10 +1,24 @@
-"""What ``neuprim compress`` prints when it is done."""
+"""``neuprim compress``, and what it prints when it is done."""
 
 from __future__ import annotations
 
-from neuprim.runs.compress import Compression
+import argparse
+from pathlib import Path
 
-__all__ = ["print_compression"]
+from neuprim.cli.console import plain_console
+from neuprim.cli.progress import LineProgress
+from neuprim.runs.compress import Compression, compress_run
+
+__all__ = ["compress", "print_compression"]
+
+
+def compress(args: argparse.Namespace, run_dir: Path) -> int:
+    """Writes the file and prints what became of the model."""
+    progress = LineProgress(plain_console(stderr=True))
+    print_compression(
+        compress_run(run_dir, args.level, args.bits, args.out, args.force, progress, args.seconds, args.steps, args.tolerance)
+    )
+    return 0
 
 
 def print_compression(made: Compression) -> None:

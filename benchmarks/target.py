@@ -169,7 +169,7 @@ def report(name: str, result: Mapping[str, Any]) -> str:
             f"{run['trials']} trials, {run['full_runs']} full",
             f"{value:.2f} ± {doubt:.2f}, had {had:.2f}",
             f"{run['held_out']:.2f}",
-            f"{run['held_out_stored']:.2f}",
+            f"{run['held_out_stored']:.2f}{', level {}'.format(run['level']) if 'level' in run else ''}",  # of records before numbers were as coarse as views allow
             f"{run['test_stored']:.2f}",
             f"{run['bytes']:,}",
             f"{run['bytes_usual'] / smallest(result['grid'], run['target']):.2f}",

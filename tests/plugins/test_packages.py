@@ -59,7 +59,8 @@ def test_the_example_installs_and_trains(tmp_path: Path) -> None:
     assert b"BellDensity" in header
     assert json.loads((tmp_path / "r" / "metrics.json").read_text())["psnr"] > 5
     assert "psnr" in neuprim_command(["eval", "r"], tmp_path, site)
-    assert re.search(r"log_kappa +7 +160 ", neuprim_command(["compress", "r"], tmp_path, site))
+    assert re.search(r"log_kappa +[0-9]+ +160 ", neuprim_command(["compress", "r", "--steps", "5"], tmp_path, site))
+    assert re.search(r"log_kappa +7 +160 ", neuprim_command(["compress", "r", "--level", "3", "--steps", "5", "--force"], tmp_path, site))
     (tmp_path / "r" / "model.safetensors").unlink()
     assert "psnr" in neuprim_command(["eval", "r"], tmp_path, site)
 

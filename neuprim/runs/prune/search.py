@@ -126,7 +126,7 @@ class Search:
         best, tried = _State(model), None
         apart: tuple[str, ...] = ()
         rounds = min(max(self.steps // _LEAST, 1), max(ROUNDS, self.steps // _MORE))
-        enough = min(self.steps / rounds / _LEAST, 1.0)
+        enough = min(self.steps / rounds / _LEAST, 1.0) ** 2  # what a few steps bring back is next to nothing
         bite = self.tolerance * (1.0 + (_BITE - 1.0) * enough)
         remains = 1.0 - (1.0 - _LEFT) * enough
         for number in range(rounds):

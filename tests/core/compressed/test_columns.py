@@ -82,9 +82,9 @@ def test_even_steps_reach_every_number_and_pass_through_one_place(values: list[f
     size, width = float(x.double().abs().max()), float(x.double().max() - x.double().min())
     taken = max(step, width / 2 ** (MOST_BITS - 1))  # of what 20 bits cannot say the step is longer
     off = (made.values(codes).double() - x.double()).abs().max()
-    assert float(off) <= 0.5 * taken * (1 + 1e-3) + 2e-7 * size + 1e-40
+    assert float(off) <= 0.5 * taken * (1 + 1e-3) + 5e-7 * size + 1e-40
     near = (made.values(made.codes(torch.tensor([[through]], dtype=torch.float64))).double() - through).abs()
-    assert float(near) <= 1e-3 * taken + 3e-7 * size + 1e-40  # ends are float32
+    assert float(near) <= 1e-3 * taken + 5e-7 * size + 1e-40  # ends are float32
 
 
 def test_steps_are_as_long_as_they_were_asked_for() -> None:

@@ -1,16 +1,16 @@
 """Does `neuprim run … target.psnr=DB budget=…` find the smallest model? A grid search of sizes against target runs of the same scene.
 
-    python benchmarks/target.py [--scenes solids chair] [--chair DIR] [--work DIR] [--docs] [--print]
+    python benchmarks/target.py [--scenes solids chair fire lit_solids] [--chair DIR] [--fire DIR] [--seeds 3] [--work DIR] [--grid] [--docs] [--print]
 
-The grid trains every size at full length, with two degrees of spherical harmonics, judged by the training views that a target run holds out. Between
-its points the bytes that a PSNR takes are interpolated (log of bytes over PSNR), so the smallest model is that of a continuous grid. Target runs
-search the same scene for two PSNRs that the grid has. *ratio* is bytes of the full run that a target run chose over those of the grid's smallest, both
-stored at the usual level. *first full run* is what was expected of it, from trials alone, and what it had; *stored* what the model has, in as few bits as still
-meet the target; *bytes* are of that.
+The grid trains every size at full length, as the preset has it and with less of what most of a primitive's numbers hang on, judged by the training views that
+a target run holds out; once, with seed 0. Between its points the bytes that a PSNR takes are interpolated (log of bytes over PSNR), so the smallest model is
+that of a continuous grid. Target runs search the same scene with every seed. *ratio* is bytes of the full run that a target run chose over those of the grid's
+smallest that has the target, both stored at the usual level. *first full run* is what was expected of it, from trials alone, and what it had; *stored* what the
+model has, pruned and in as few bits as still meet the target; *bytes* are of that.
 
-It is a reduced comparison: `solids` at 64 pixels, or the chair at 100, one seed, one thread, some minutes of one core. Trainings are kept in --work, so that a
-benchmark that is cut short goes on. Results go to benchmarks/results/target.json; --docs puts the tables between the markers of docs/tradeoffs.md,
---print runs nothing.
+It is a reduced comparison: half of the presets' views, one thread, some minutes of one core a search. Trainings are kept in --work, so that a
+benchmark that is cut short goes on; --grid trains the grid alone. Results go to benchmarks/results/target.json; --docs puts the tables between the markers
+of docs/tradeoffs.md, --print runs nothing.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from neuprim.core.io.files import write_json
 from neuprim.runs.events import Event, Note
 from neuprim.runs.open import load_dataset
 from neuprim.runs.target import target_run
+from neuprim.runs.target.run import hold_out
 from neuprim.runs.target.trying import VIEWS
 from neuprim.runs.trials import Trial, run_trial
 
@@ -44,60 +45,85 @@ RESULTS = Path(__file__).parent / "results" / "target.json"
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Words of a scene, the sizes of the grid, what target runs ask for and their budget, seconds; ``start`` is the size that they begin with."""
+    """What is searched.
+
+    Attributes:
+        words: of the scene.
+        sizes: of the grid, primitives.
+        less: words that the grid turns, "" for none.
+        targets: PSNRs asked for, dB, and budget: of each search, seconds.
+        start: primitives that a search begins with.
+    """
 
     words: tuple[str, ...]
     sizes: tuple[int, ...]
+    less: tuple[str, ...]
     targets: tuple[float, ...]
     budget: float
     start: int
 
 
+_SOLIDS = ("task=static", "scene=solids", "scene.size=64", "train.iterations=3000")
+_CHAIR = ("task=static", "scene=blender", "train.iterations=2500")
+_FIRE = ("task=dynamic", "scene=vdb", "scene.size=64", "train.iterations=4000")
+_LIT = ("task=relight", "scene=lit_solids", "scene.size=128", "train.iterations=3000")
 SCENES = {
-    "solids": Scene(("scene=solids", "scene.size=64", "train.iterations=3000"), (40, 80, 160, 320), (26.0, 28.0), 90.0, 400),
-    "chair": Scene(("scene=blender", "scene.downsample=2", "train.iterations=3000"), (50, 100, 200, 400), (29.0, 31.0), 150.0, 1000),
+    "solids": Scene(_SOLIDS, (40, 80, 160, 320), ("", "model.sh_degree=1"), (26.0, 28.0), 90.0, 400),
+    "chair": Scene(_CHAIR, (200, 400, 800, 1600), ("", "model.sh_degree=1"), (33.0,), 240.0, 2800),
+    "fire": Scene(_FIRE, (850, 1700, 3400, 6800), ("", "model.density.time=window"), (43.0,), 240.0, 13500),
+    "lit_solids": Scene(_LIT, (330, 660, 1330, 2655), ("", "model.colour.hidden=4"), (28.0,), 300.0, 2655),
 }
-DEGREES = (3, 1)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="*", default=["solids"], choices=list(SCENES))
     parser.add_argument("--chair", type=Path, help="a NeRF-synthetic folder")
+    parser.add_argument("--fire", type=Path, help="a folder of OpenVDB files")
+    parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--work", type=Path, help="where trainings are kept (default: a temporary folder)")
+    parser.add_argument("--grid", action="store_true", help="no target runs")
     parser.add_argument("--docs", action="store_true")
     parser.add_argument("--print", action="store_true", dest="only_print")
     args = parser.parse_args()
-    if "chair" in args.scenes and args.chair is None and not args.only_print:
-        parser.error("--chair: wants the folder of its data; or leave it out of --scenes")
+    data = {"chair": args.chair, "fire": args.fire}
+    for name in args.scenes:
+        if name in data and data[name] is None and not args.only_print:
+            parser.error(f"--{name}: wants the folder of its data; or leave it out of --scenes")
     found: dict[str, Any] = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
     if not args.only_print:
         with tempfile.TemporaryDirectory() as temporary:
             for name in args.scenes:
-                found[name] = measured(name, args.chair, args.work or Path(temporary))
-                write_json(RESULTS, {**found, "cpu": cpu_name()})
+                work = args.work or Path(temporary)
+                where = [] if data.get(name) is None else [f"scene.{'vdb' if name == 'fire' else 'path'}='{data[name].resolve()}'"]
+                grid = gridded(name, where, work)
+                if not args.grid:
+                    found[name] = {**grid, "runs": [r for seed in range(args.seeds) for r in searched(name, where, work, seed)]}
+                    write_json(RESULTS, {**found, "cpu": cpu_name()})
+    if args.grid:
+        return
     texts = [report(name, found[name]) for name in SCENES if name in found]
     if args.docs:
         between_markers(ROOT / "docs" / "tradeoffs.md", "target", "\n\n".join(texts))
 
 
-def words(name: str, chair: Path | None, out: Path) -> list[str]:
-    path = [f"scene.path='{chair}'"] if name == "chair" else []
-    return ["task=static", *SCENES[name].words, *path, "renderer.threads=1", f"output_dir='{out}'"]
+def words(name: str, where: Sequence[str], out: Path) -> list[str]:
+    return [*SCENES[name].words, *where, "renderer.threads=1", "train.eval_every=0", "resume=true", f"output_dir='{out}'"]
 
 
-def measured(name: str, chair: Path | None, work: Path) -> dict[str, Any]:
-    """Target runs, and the grid that is judged by the same views."""
+def searched(name: str, where: Sequence[str], work: Path, seed: int) -> list[dict[str, Any]]:
+    """Target runs of a seed."""
     scene, runs = SCENES[name], []
     for psnr in scene.targets:
-        out = work / f"{name}-{psnr:g}"
-        config = compose([*words(name, chair, out), f"model.primitives={scene.start}", "resume=true"])
+        out = work / f"{name}-{psnr:g}-{seed}"
+        config = compose([*words(name, where, out), f"model.primitives={scene.start}", f"seed={seed}"])
         record = target_run(config, Target(psnr=psnr), scene.budget, tell)
         full = [a for a in record.attempts if a.purpose == "full"]
         chosen = next(a for a in full if a.folder == record.chosen)
         runs.append(
             {
                 "target": psnr,
+                "seed": seed,
                 "budget": scene.budget,
                 "seconds": record.achieved["seconds"],
                 "primitives": chosen.count,
@@ -115,33 +141,37 @@ def measured(name: str, chair: Path | None, work: Path) -> dict[str, Any]:
                 "warning": record.warning,
             }
         )
-        hold_out = record.hold_out
-    grid = []
-    for degree in DEGREES:
+    return runs
+
+
+def gridded(name: str, where: Sequence[str], work: Path) -> dict[str, Any]:
+    """Every size at full length."""
+    scene, grid, dataset = SCENES[name], [], None
+    for less in scene.less:
         for size in scene.sizes:
-            grid.append({"degree": degree, "primitives": size, **point(name, chair, work, degree, size, hold_out)})
-            print(f"{name}: {size} primitives, degree {degree}: {grid[-1]['psnr']:.2f} dB, {grid[-1]['bytes']} bytes", flush=True)
-    return {"words": scene.words, "hold_out": hold_out, "runs": runs, "grid": grid}
-
-
-def point(name: str, chair: Path | None, work: Path, degree: int, size: int, hold_out: int) -> dict[str, Any]:
-    """A size at full length."""
-    out = work / f"{name}-grid-{size}-{degree}"
-    config = compose([*words(name, chair, out), f"model.primitives={size}", f"model.sh_degree={degree}", "resume=true"])
-    task = task_of(config)
-    outcome = run_trial(Trial(config, hold_out, VIEWS), load_dataset(config, task))
-    model, _ = load_model(out / "model.safetensors", task)
-    packed = out / "packed.neuprim"
-    text = (out / "config.yaml").read_text(encoding="utf-8")
-    save_compressed(packed, model, task.name, {}, bit_table(USUAL_LEVEL, (), model.specs), text)
-    return {"psnr": outcome.psnr, "bytes": packed.stat().st_size, "seconds": outcome.seconds}
+            out = work / f"{name}-grid-{size}{'-' if less else ''}{less.rpartition('.')[2]}"
+            config = compose([*words(name, where, out), f"model.primitives={size}", *([less] if less else [])])
+            task = task_of(config)
+            dataset = dataset or load_dataset(config, task)
+            every = hold_out(dataset)
+            outcome = run_trial(Trial(config, every, VIEWS), dataset)
+            model, _ = load_model(out / "model.safetensors", task)
+            packed, text = out / "packed.neuprim", (out / "config.yaml").read_text(encoding="utf-8")
+            save_compressed(packed, model, task.name, {}, bit_table(USUAL_LEVEL, (), model.specs), text)
+            grid.append(
+                {"less": less, "primitives": size, "psnr": outcome.psnr, "bytes": packed.stat().st_size, "seconds": outcome.seconds}
+            )
+            print(
+                f"{name}: {size} primitives {less}: {outcome.psnr:.2f} dB, {grid[-1]['bytes']} bytes, {outcome.seconds:.0f} s", flush=True
+            )
+    return {"words": scene.words, "hold_out": every, "grid": grid}
 
 
 def smallest(grid: Sequence[Mapping[str, Any]], psnr: float) -> float:
     """Bytes of the smallest model of the grid that has a PSNR; NaN where none has."""
     found = []
-    for degree in DEGREES:
-        own = sorted((g for g in grid if g["degree"] == degree), key=lambda g: int(g["primitives"]))
+    for less in {g["less"] for g in grid}:
+        own = sorted((g for g in grid if g["less"] == less), key=lambda g: int(g["primitives"]))
         for a, b in pairwise(own):
             if a["psnr"] <= psnr <= b["psnr"]:
                 share = (psnr - a["psnr"]) / (b["psnr"] - a["psnr"])
@@ -153,23 +183,25 @@ def report(name: str, result: Mapping[str, Any]) -> str:
     """Prints both tables of a scene; returns them."""
     title = f"**{name}** (`{' '.join(result['words'])}`), one of {result['hold_out']} training views held out"
     print(f"\n{title}")
-    sizes = Table("grid", *(f"degree {degree}" for degree in DEGREES))
+    less = list(dict.fromkeys(g["less"] for g in result["grid"]))
+    sizes = Table("grid", *(f"`{word}`" if word else "as the preset has it" for word in less))
     for size in sorted({g["primitives"] for g in result["grid"]}):
-        own = {g["degree"]: g for g in result["grid"] if g["primitives"] == size}
-        sizes.row(f"{size} primitives", *(f"{own[d]['psnr']:.2f} dB, {own[d]['bytes']:,} bytes" for d in DEGREES))
+        own = {g["less"]: g for g in result["grid"] if g["primitives"] == size}
+        sizes.row(f"{size:,} primitives", *(f"{own[w]['psnr']:.2f} dB, {own[w]['bytes']:,} bytes" for w in less))
     print()
-    table = Table("target", "found", "time", "trained", "first full run", "held out", "stored", "test views", "bytes", "ratio")
+    table = Table("target", "seed", "found", "time", "trained", "first full run", "held out", "stored", "test views", "bytes", "ratio")
     for run in result["runs"]:
         (value, doubt), had = run["first"]
         turned = "".join(f", {key.rpartition('.')[2]} {v}" for key, v in run["words"].items())
         table.row(
             f"{run['target']:.1f} dB",
-            f"{run['primitives']} primitives{turned}",
+            run["seed"],
+            f"{run['primitives']:,} primitives{turned}",
             f"{run['seconds']:.0f} of {run['budget']:.0f} s",
             f"{run['trials']} trials, {run['full_runs']} full",
             f"{value:.2f} ± {doubt:.2f}, had {had:.2f}",
             f"{run['held_out']:.2f}",
-            f"{run['held_out_stored']:.2f}{', level {}'.format(run['level']) if 'level' in run else ''}",  # of records before numbers were as coarse as views allow
+            f"{run['held_out_stored']:.2f}",
             f"{run['test_stored']:.2f}",
             f"{run['bytes']:,}",
             f"{run['bytes_usual'] / smallest(result['grid'], run['target']):.2f}",

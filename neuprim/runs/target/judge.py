@@ -95,15 +95,18 @@ class Judge:
 
     def _done(self, *purposes: Purpose) -> list[Attempt]:
         """Trainings that tell something about the settings of now: made with these, or with others that were turned to them since."""
-        now = self.record.words
-        return [a for a in self.record.done(*purposes) if all(key in now and value >= now[key] for key, value in a.words.items())]
+        return [a for a in self.record.done(*purposes) if all(value in self.record.way(key) for key, value in a.words.items())]
 
     def _now(self, name: str, attempt: Attempt) -> float:
         """What a training would have had with the settings of now."""
         return decibels(name, attempt.quality(name)) - sum(turn.loss.get(name, 0.0) for turn in self._turned_since(attempt))
 
     def _turned_since(self, attempt: Attempt) -> list[Turn]:
-        return [turn for turn in self.record.turns if turn.adopted and attempt.words.get(turn.key, turn.before) > turn.after]
+        def own(turn: Turn) -> bool:
+            way = self.record.way(turn.key)
+            return way.index(attempt.words.get(turn.key, way[0])) >= way.index(turn.after)
+
+        return [turn for turn in self.record.turns if turn.adopted and not own(turn)]
 
     def curve(self) -> Curve:
         """Margins over sizes."""

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from neuprim.core.errors import DataError
 from neuprim.core.io.files import read_json, write_json
 
-__all__ = ["FILE", "Attempt", "Purpose", "Record", "Turn", "read_record"]
+__all__ = ["FILE", "Attempt", "Purpose", "Record", "Setting", "Turn", "read_record"]
 
 FILE = "target.json"
 """Of the run's directory."""
@@ -19,6 +19,9 @@ FILE = "target.json"
 FORMAT = 1
 
 Purpose = Literal["pace", "size", "knob", "longer", "full"]
+
+Setting = int | float | str
+"""A value of a setting that a search turns."""
 
 
 @dataclass
@@ -37,7 +40,7 @@ class Attempt:
     """
 
     purpose: Purpose
-    words: dict[str, int]
+    words: dict[str, Setting]
     primitives: int
     steps: int
     max_seconds: float | None = None
@@ -77,8 +80,8 @@ class Turn:
     """
 
     key: str
-    before: int
-    after: int
+    before: Setting
+    after: Setting
     loss: dict[str, float]
     size: float
     adopted: bool
@@ -118,9 +121,14 @@ class Record:
     warning: str | None = None
 
     @property
-    def words(self) -> dict[str, int]:
+    def words(self) -> dict[str, Setting]:
         """The settings that were turned and stay so."""
         return {turn.key: turn.after for turn in self.turns if turn.adopted}
+
+    def way(self, key: str) -> list[Setting]:
+        """The values of a setting from the first to that of now; empty where it was not turned, or never to stay."""
+        own = [turn for turn in self.turns if turn.adopted and turn.key == key]
+        return [own[0].before, *(turn.after for turn in own)] if own else []
 
     def done(self, *purposes: Purpose) -> list[Attempt]:
         """Finished trainings of these purposes, in their order."""

@@ -23,7 +23,7 @@ from neuprim.runs.target.searching import Search
 from neuprim.runs.target.stages import publish
 from neuprim.runs.target.trying import Trying
 
-__all__ = ["target_run"]
+__all__ = ["hold_out", "target_run"]
 
 
 def target_run(
@@ -66,7 +66,7 @@ def target_run(
         dataset = load_dataset(config, task, progress)
         suspects.know(dataset)
         check_dataset(dataset, task.conditions)
-        record.hold_out = _hold_out(dataset)
+        record.hold_out = hold_out(dataset)
         trying = Trying(config, dataset, record, events, clock, launcher)
         trying.begun = begun - record.spent
         try:
@@ -123,7 +123,7 @@ def _kept(config: RunConfig, asked: dict[str, float]) -> Record:
     return before
 
 
-def _hold_out(dataset: Dataset) -> int:
+def hold_out(dataset: Dataset) -> int:
     """Every how many-th training view judges: one of eight, more of few, as the mean of a few views says little."""
     count = len(dataset.train)
     if count < 4:

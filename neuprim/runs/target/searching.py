@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from neuprim.config import RunConfig
+from neuprim.config import RunConfig, task_of
 from neuprim.config.target import Target
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.runs.target.judge import ALLOWANCE, ROOM, Judge
-from neuprim.runs.target.knobs import next_turn, pays
+from neuprim.runs.target.knobs import ladders, next_turn, pays
 from neuprim.runs.target.pace import linear
 from neuprim.runs.target.prediction import decibels
 from neuprim.runs.target.record import Attempt, Record, Turn
@@ -208,8 +208,9 @@ class Search:
         """Other settings that save bytes, each tried once at the size tried that is nearest to the one wanted."""
         if self.record.out_of_reach or not (self.target.quality or self.target.megabytes is not None):
             return  # nothing is gained by saving bytes
+        known = ladders(self.config, task_of(self.config), self.dataset)
         for _ in range(_MOST_TURNS):
-            turn = next_turn(self.config, self.record.turns)
+            turn = next_turn(known, self.record.turns)
             if turn is None:
                 return
             key, before, after = turn

@@ -20,12 +20,13 @@ from neuprim.runs.events import Events, Note, Preparing
 from neuprim.runs.launch.jobs import Job
 from neuprim.runs.launch.share import at_once
 from neuprim.runs.launch.status import ENDED, Status
+from neuprim.runs.target.changed import changed
 from neuprim.runs.target.pace import Stopwatch, linear
 from neuprim.runs.target.record import Attempt, Record
 from neuprim.runs.trial_jobs import TrialFailed, do_trial, launch_jobs, words_of
 from neuprim.runs.trials import Outcome, Trial, run_trial
 
-__all__ = ["FOLDER", "VIEWS", "Trying", "changed", "packed_bytes"]
+__all__ = ["FOLDER", "VIEWS", "Trying", "packed_bytes"]
 
 FOLDER = "target"
 """Of the run's directory, for the trainings of the search."""
@@ -40,28 +41,6 @@ _EVERY = 5
 """Steps between two interventions, at least: fewer tell nothing about who is used."""
 
 _PSNR_MAX = 200.0  # dB; equal images have an infinite one, which JSON does not
-
-
-def changed(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
-    """A configuration with other settings, by dotted names below ``model`` and ``train``, and with its record of what is not a default."""
-    groups: dict[str, dict[str, Any]] = {}
-    different = dict(config.non_default)
-    for key, value in values.items():
-        group, _, name = key.partition(".")
-        groups.setdefault(group, {})[name] = value
-        for own, was, now in _leaves(key, getattr(getattr(config, group), name), value):
-            default = different.pop(own, (was, was))[0]
-            if now != default:
-                different[own] = (default, now)
-    made = {group: replace(getattr(config, group), **settings) for group, settings in groups.items()}
-    return replace(config, **made, non_default=different)
-
-
-def _leaves(key: str, before: Any, after: Any) -> list[tuple[str, Any, Any]]:
-    """(dotted name, value before, value after) of a setting, or of every setting of a group."""
-    if not dataclasses.is_dataclass(before):
-        return [(key, before, after)]
-    return [(f"{key}.{f.name}", getattr(before, f.name), getattr(after, f.name)) for f in dataclasses.fields(before)]
 
 
 @dataclass

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
 
-__all__ = ["core_count", "limited", "machine_cores", "parallel_for", "sharing"]
+__all__ = ["core_count", "limited", "machine_cores", "parallel_for", "sharing", "threads_of"]
 
 _limit: ContextVar[int] = ContextVar("threads", default=0)
 _pools: dict[int, ThreadPoolExecutor] = {}
@@ -55,6 +55,11 @@ def limited(threads: int) -> Iterator[None]:
         _limit.reset(token)
 
 
+def threads_of(threads: int) -> int:
+    """How many :func:`parallel_for` works with, asked for so many."""
+    return threads or _limit.get() or core_count()
+
+
 def _pool(threads: int) -> ThreadPoolExecutor:
     with _lock:
         if threads not in _pools:
@@ -67,7 +72,7 @@ def parallel_for(function: Callable[..., Any], count: int, chunk: int, threads: 
 
     ``threads`` 0 is all cores, or as many as :func:`limited` says.
     """
-    threads = threads or _limit.get() or core_count()
+    threads = threads_of(threads)
     chunks = -(-count // chunk) if count else 0
     if threads == 1 or chunks <= 1:
         return [function(c * chunk, min(count, (c + 1) * chunk), *args) for c in range(chunks)]

@@ -143,4 +143,6 @@ class RenderOutput:
 def mean_depth(weighted: Tensor, alpha: Tensor) -> Tensor:
     """(H, W) sum of w z over sum of w; 0 where nothing is hit. The weights of a ray telescope: their sum is its alpha."""
     hit = alpha > 0
+    if not (torch.is_grad_enabled() and (weighted.requires_grad or alpha.requires_grad)):
+        return (weighted / alpha).masked_fill_(~hit, 0.0)
     return torch.where(hit, weighted / torch.where(hit, alpha, 1.0), 0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.compute.threads import parallel_for
+from neuprim.core.compute.threads import parallel_for, threads_of
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.fields import Constant, Cosine, RayNet
 from neuprim.core.model.primitives import Lowered
@@ -31,6 +31,7 @@ from neuprim.core.settings import RenderSettings
 __all__ = ["render"]
 
 _PRIMITIVES_PER_CHUNK = 512
+_UNITS_PER_THREAD = 8  # units of work among which threads share a frame
 _TURN = 2.0 * np.pi
 _NET = ("Wx", "bias", "Wout", "base")
 Array = np.ndarray[Any, Any]
@@ -60,6 +61,11 @@ class _Prepared:
     limits: Array
     lists: TileLists
     net: Net | None
+    chunk: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Fixes the unit of work for both passes: half a row of tiles, or more where threads are few, as every unit costs a call."""
+        self.chunk = max(2, -(-self.camera.width // L.TILE) // 2, self.tiles // (_UNITS_PER_THREAD * threads_of(self.settings.threads)))
 
     @property
     def intrinsics(self) -> Array:
@@ -69,10 +75,6 @@ class _Prepared:
     @property
     def tiles(self) -> int:
         return -(-self.camera.width // L.TILE) * -(-self.camera.height // L.TILE)
-
-    @property
-    def chunk(self) -> int:
-        return max(2, -(-self.camera.width // L.TILE) // 2)
 
 
 def _array(tensor: Tensor) -> Array:

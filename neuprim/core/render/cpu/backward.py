@@ -177,6 +177,8 @@ def backward_tiles(  # type: ignore[no-untyped-def]
     bounds, offset, rows_live = lent(ends), lent(begins), lent(lives)
     evaluated = 0
     for t in range(start, stop):
+        if starts[t] == starts[t + 1]:
+            continue
         tx, ty = (t % across) * L.TILE, (t // across) * L.TILE
         state[:] = f(0)
         deepest = 0

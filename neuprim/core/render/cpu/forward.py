@@ -66,6 +66,20 @@ def _composite_row(st, lanes, w, a, b, tmin, rank):  # type: ignore[no-untyped-d
         st[k + L.LAST] = rank if alpha > f(0) else st[k + L.LAST]
 
 
+@inline
+def _empty_tile(tx, ty, down, wide_row, background, with_depth, rgb, transmittance, zsum, last):  # type: ignore[no-untyped-def]
+    """A tile that nothing reaches: the background."""
+    for y in range(down):
+        Y = index(ty + y)
+        for x in range(wide_row):
+            X = index(tx + x)
+            transmittance[Y, X], last[Y, X] = f(1), 0
+            for c in range(background.shape[0]):
+                rgb[Y, X, index(c)] = background[c]
+            if with_depth:
+                zsum[Y, X] = f(0)
+
+
 @kernel
 def composite_tiles(  # type: ignore[no-untyped-def]
     start, stop, rows, wide, slots, spans, kinds, boxes, starts, ids, colors, norms, background, limits, with_depth, neurons,
@@ -103,8 +117,11 @@ def composite_tiles(  # type: ignore[no-untyped-def]
     evaluated = 0
     for t in range(start, stop):
         tx, ty = (t % across) * L.TILE, (t // across) * L.TILE
-        state[:] = f(0)
         down, wide_row = min(L.TILE, height - ty), min(L.TILE, width - tx)
+        if starts[t] == starts[t + 1]:
+            _empty_tile(tx, ty, down, wide_row, background, with_depth, rgb, transmittance, zsum, last)
+            continue
+        state[:] = f(0)
         for y in range(L.TILE):
             rows_live[y] = f(1) if y < down else f(0)
             for x in range(L.TILE):

@@ -157,6 +157,12 @@ def _no_warp() -> str | None:
     return None if importlib.util.find_spec("warp") else "Warp is not installed: pip install 'neuprim[cuda]'"
 
 
+def _cpu_parts() -> Callable[..., tuple[Tensor, Tensor]]:
+    from neuprim.core.render.cpu.backend import render_parts
+
+    return render_parts
+
+
 def _cuda_parts() -> Callable[..., tuple[Tensor, Tensor]]:
     from neuprim.core.render.cuda.backend import render_parts
 
@@ -175,7 +181,7 @@ def _reference() -> Draw:
 
 TABLE: tuple[Backend, ...] = (
     Backend("cuda", _cuda, kernels_refuse, _card, _no_warp, checks=True, devices=(hardware.CARD, hardware.PROCESSOR), parts=_cuda_parts),
-    Backend("cpu", _cpu, kernels_refuse, compiles=True, checks=True),
+    Backend("cpu", _cpu, kernels_refuse, compiles=True, checks=True, parts=_cpu_parts),
     Backend(ORACLE, _reference, differentiates_intrinsics=True),
 )
 """Fastest first."""

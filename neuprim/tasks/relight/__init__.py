@@ -48,9 +48,10 @@ def _check(model: Mapping[str, Any]) -> None:
         raise ConfigError(f"model.colour: {error}") from error
 
 
-def _trade(model: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
-    harmonics = model["colour"].get("form") == "harmonics"
-    return {**DENSITY_TRADE, **({"model.colour.degree": (1, 2, 3, 5)} if harmonics else {"model.colour.hidden": (0, 4, 8, 12)})}
+def _trade(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
+    if model["colour"].get("form") == "harmonics":
+        return {**DENSITY_TRADE, "model.colour.degree": (1, 2, 3, 5)}
+    return {**DENSITY_TRADE, "model.colour.hidden": (0, 4, 8, 12), "model.colour.visibility": ("none", "primitive", "pixel")}
 
 
 def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:

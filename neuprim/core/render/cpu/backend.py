@@ -28,7 +28,7 @@ from neuprim.core.render.cpu.seen import depth_that_counts
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.settings import RenderSettings
 
-__all__ = ["render"]
+__all__ = ["render", "render_parts"]
 
 _PRIMITIVES_PER_CHUNK = 512
 _UNITS_PER_THREAD = 8  # units of work among which threads share a frame
@@ -106,7 +106,9 @@ def _prepare(
     background: Array,
     settings: RenderSettings,
     stats: RenderStats,
+    images: tuple[Array, int] | None = None,
 ) -> _Prepared:
+    """``images``: as of :func:`~neuprim.core.render.cpu.binning.bin_primitives`."""
     count, K = tensors["W1"].shape[:2]
     neurons = K + K % 2  # the backward kernel takes neurons in pairs; a padded one has amplitude 0
     rows = np.empty((count, L.row_width(neurons)), np.float32)
@@ -140,7 +142,7 @@ def _prepare(
         hidden = tensors["Wx"].shape[1]
         net = Net(net_narrow, net_rows(which, tensors, True, settings.threads)[0], hidden + hidden % 2)
     stats.extra["float64"] = len(which)
-    lists = bin_primitives(rows, spans, boxes, depth, status, camera.width, camera.height, settings.threads)
+    lists = bin_primitives(rows, spans, boxes, depth, status, camera.width, camera.height, settings.threads, images)
     stats.pairs = lists.pairs
     limits = np.array([settings.alpha_min, settings.alpha_max, settings.transmittance_min, settings.depth_floor], np.float32)
     return _Prepared(
@@ -316,3 +318,28 @@ def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings
     alpha = 1 - T
     depth = mean_depth(zsum, alpha).to(dtype) if settings.depth else None
     return RenderOutput(rgb.to(dtype), alpha.to(dtype), depth, stats)
+
+
+def render_parts(lowered: Lowered, parts: Tensor, count: int, camera: Camera, settings: RenderSettings) -> tuple[Tensor, Tensor]:
+    """Opacity and depth of parts of the primitives, each as if it were alone, prepared as one frame; see :func:`neuprim.core.render.parts.render_parts`."""
+    g, density = lowered.geometry, lowered.density
+    assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"
+    names = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
+    values = (g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1))
+    tensors = _alike({name: _array(value) for name, value in zip(names, values, strict=True)})
+    nothing, view = np.zeros(1, np.float32), camera.viewmat.detach().double().numpy()
+    stats, images = RenderStats("cpu", g.count), (parts.numpy(), count)
+    frame = _prepare(tensors, camera, view, density.omega0, density.edge, nothing, settings, stats, images)
+    shape, palette, kept = (count, camera.height, camera.width), np.zeros((g.count, 1), np.float32), Kept.of(0)
+    T, z = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    rgb, last = np.empty((*shape[1:], 1), np.float32), np.empty(shape[1:], np.int32)  # of no interest
+    for part in range(count):
+        starts = frame.lists.starts[part * frame.tiles : (part + 1) * frame.tiles + 1]
+        parallel_for(
+            composite_tiles, frame.tiles, frame.chunk, settings.threads,
+            frame.rows, frame.wide, frame.slots, frame.spans, frame.kinds, frame.boxes,
+            starts, frame.lists.ids, palette, frame.norms, nothing, frame.limits, True, frame.neurons,
+            rgb, T[part], z[part], last, kept.live, kept.found, None, EDGE_TYPES[frame.edge],
+        )  # fmt: skip
+    alpha = 1 - torch.from_numpy(T)
+    return alpha.to(g.means.dtype), mean_depth(torch.from_numpy(z), alpha).to(g.means.dtype)

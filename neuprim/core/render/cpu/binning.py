@@ -111,15 +111,22 @@ def _scatter(order, first, tiles, starts, ids, slots):  # type: ignore[no-untype
             slots[k] = slot
 
 
-def bin_primitives(rows: Any, spans: Any, boxes: Any, depth: Any, status: Any, width: int, height: int, threads: int) -> TileLists:
-    """Tile lists of one frame; every argument as :func:`~neuprim.core.render.cpu.prepare.prepare` filled it."""
+def bin_primitives(
+    rows: Any, spans: Any, boxes: Any, depth: Any, status: Any, width: int, height: int, threads: int, images: tuple[Any, int] | None = None
+) -> TileLists:
+    """Tile lists of one frame; every argument as :func:`~neuprim.core.render.cpu.prepare.prepare` filled it.
+
+    With ``images``, (N,) numbers and how many there are, each primitive is in one of several images, whose tiles follow each other.
+    """
     count = depth.shape[0]
     across, down = -(-width // L.TILE), -(-height // L.TILE)
     first = np.zeros(count + 1, np.int64)
     parts = parallel_for(_reached, count, 512, threads, rows, spans, boxes, status, across, first)
     np.cumsum(first, out=first)
     tiles = np.concatenate(parts) if parts else np.empty(0, np.int32)
-    starts = np.zeros(across * down + 1, np.int64)
+    starts = np.zeros((1 if images is None else images[1]) * across * down + 1, np.int64)
+    if images is not None:
+        tiles += np.repeat(images[0].astype(np.int32) * np.int32(across * down), np.diff(first))
     ids, slots = np.empty(len(tiles), np.int32), np.empty(len(tiles), np.int32)
     _scatter(depth_order(depth), first, tiles, starts, ids, slots)
     return TileLists(starts, ids, first, slots)

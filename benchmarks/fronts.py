@@ -98,16 +98,16 @@ def measure(name: str, data: Path | None, out: Path) -> dict[str, Any]:
     ]
     return {
         "words": scene.words,
-        "length": whole["facts"]["length"],
+        "length": whole["length"],
         "models": shown,
-        "speed": whole["speed"],
-        "size": whole["size"],
+        "speed": whole["front"]["speed"],
+        "size": whole["front"]["size"],
         "left_out": [one["knob"] + " " + " ".join(one["words"]) for one in whole["left_out"]],
         "cpu": cpu_name(),
     }
 
 
-KEYS = ("name", "primitives", "steps", "bytes", "ratio", "doubt", "ms_per_frame", "ms_per_step")
+KEYS = ("name", "primitives", "steps", "bytes", "time_ratio", "time_ratio_spread", "ms_per_frame", "ms_per_step")
 
 
 def reach(result: Mapping[str, Any], front: str, cost: str) -> float:
@@ -118,7 +118,7 @@ def reach(result: Mapping[str, Any], front: str, cost: str) -> float:
 
 def report(name: str, result: Mapping[str, Any]) -> str:
     """Prints the table of a scene; returns it with what is said about it."""
-    speed, size = reach(result, "speed", "ratio"), reach(result, "size", "bytes")
+    speed, size = reach(result, "speed", "time_ratio"), reach(result, "size", "bytes")
     title = f"**{SCENES[name].title}** (`{' '.join(result['words'])}`): {speed:.1f} times in the time of a frame, {size:.0f} times in bytes. {result['length']}"
     print(f"\n{title}\n")
     table = Table("model", "front of", "PSNR, dB", "SSIM", "time", "ms", "bytes", "steps", "ms/step")
@@ -131,7 +131,7 @@ def report(name: str, result: Mapping[str, Any]) -> str:
             ", ".join(fronts),
             f"{model['psnr']:.2f}",
             f"{model['ssim']:.4f}",
-            f"{model['ratio']:.3f} ± {model['doubt']:.3f}",
+            f"{model['time_ratio']:.3f} ± {model['time_ratio_spread']:.3f}",
             f"{model['ms_per_frame']:.2f}",
             f"{model['bytes']:,}",
             f"{model['steps']:,}",

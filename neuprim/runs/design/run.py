@@ -31,7 +31,7 @@ from neuprim.runs.tradeoff.record import Record, read_record, write_csv
 __all__ = ["TRIALS", "DesignRequest", "design_run"]
 
 _SINGLES, _TIMED, _COMBINED = 0.58, 0.64, 0.88
-"""Parts of the budget that remains after paces are known, by which single knobs are trained and timed, and combinations trained."""
+"""Parts of the budget that remains after paces are known, by which single knobs are trained and timed, and combinations trained, which a single knob has none of."""
 
 
 def design_run(
@@ -71,9 +71,10 @@ def design_run(
         session = Session(request, folder, words, centre, dataset, record, tell, progress, begun, spent, plan)
         record.left_out += [LeftOut(name, (), "nothing but what the centre has") for name, ladder in ladders.items() if not ladder]
         wanted = session.with_paces([Variant(CENTRE), *in_turn(ladders)])
-        session.make_plan(wanted)
-        session.train(wanted, _SINGLES)
-        session.take_times(_TIMED)
+        several = len([ladder for ladder in ladders.values() if ladder]) > 1
+        session.make_plan(wanted, several)
+        session.train(wanted, _SINGLES if several else _COMBINED)
+        session.take_times(_TIMED if several else 1.0)
         session.train(session.combinations(_COMBINED), _COMBINED)
         session.train(wanted, _COMBINED)
         session.take_times(1.0)

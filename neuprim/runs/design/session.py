@@ -39,7 +39,7 @@ _SLOW = 10.0
 """Seconds of compiling that are said."""
 
 _TRAINED, _TOGETHER = 0.5, 0.22
-"""Parts of what remains then for training single knobs, and for training combinations."""
+"""Parts of what remains then for training single knobs, and for training combinations; a knob that is the only one has both."""
 
 _EXACT = 0.08
 """Part of it for the exact images of all models together, of which there are about so many."""
@@ -187,15 +187,19 @@ class Session:
             self.compiling = self._paces.compiling
         return self._paces
 
-    def make_plan(self, wanted: Sequence[Variant]) -> None:
-        """Choose lengths with which all of these fit, unless that was done by an earlier session: then the same models are trained."""
+    def make_plan(self, wanted: Sequence[Variant], combined: bool = True) -> None:
+        """Choose lengths with which all of these fit, unless that was done by an earlier session: then the same models are trained.
+
+        ``combined``: whether combinations will follow.
+        """
         if self.compiling > _SLOW:
             self.tell(f"{self.compiling:.0f} s went into compiling kernels, once per installation; they do not count")
         self._planned_at = self.spent
         if self.plan is None:
             lengths = [variant.length for variant in wanted for _ in range(self.request.seeds)]
             starting = sum(self._known[variant.name].starting for variant in wanted) / len(wanted)
-            self.plan = planned(self.centre, self._all_paces().seconds, _TRAINED * self.remaining * self._workers, lengths, starting)
+            part = _TRAINED if combined else _TRAINED + _TOGETHER
+            self.plan = planned(self.centre, self._all_paces().seconds, part * self.remaining * self._workers, lengths, starting)
             for variant in wanted:
                 self.plan = self.plan.knowing(variant, self._known[variant.name].ratio)
         self.write()

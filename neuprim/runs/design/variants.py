@@ -66,10 +66,10 @@ def merged(words: Sequence[str], over: Sequence[str]) -> list[str]:
 def singles(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]:
     """Knob -> its variants, those next to the centre first; without the centre's own values as far as its settings name them."""
     own = traded(task, build_settings(task, centre.model, centre.options))
+    counts = dict.fromkeys(max(1, round(part * centre.model.primitives)) for part in _PARTS["model.primitives"])
     found: dict[str, list[Variant]] = {
         "model.primitives": [
-            Variant("model.primitives", (word("model.primitives", max(1, round(part * centre.model.primitives))),))
-            for part in _PARTS["model.primitives"]
+            Variant("model.primitives", (word("model.primitives", count),)) for count in counts if count != centre.model.primitives
         ]
     }
     for knob, values in own.items():

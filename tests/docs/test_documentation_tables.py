@@ -97,10 +97,10 @@ def test_a_benchmark_rewrites_its_tables_without_measuring(
             assert (table in written) == ("-baselines" not in table and "-environment" not in table), table[:40]
 
 
-def test_the_readme_is_a_page_with_one_large_picture_and_two_of_curves() -> None:
+def test_the_readme_is_a_page_with_one_large_picture_curves_and_a_front_per_task() -> None:
     assert len(README.read_text(encoding="utf-8").splitlines()) <= 120
     picture, *curves = [target for target in links(README) if target.endswith(".png")]
-    assert curves == ["docs/pictures/budgets.png", "docs/pictures/effort.png"]
+    assert curves == ["docs/pictures/budgets.png", "docs/pictures/fronts.png"]
     with Image.open(ROOT / picture) as image:
         assert image.width >= 3 * 256 and image.height >= 2 * 256
     assert "generated data" in prose(README).lower()
@@ -123,6 +123,25 @@ def test_the_tables_of_web_pages_are_those_of_the_recorded_results(benchmark: Ca
 def test_the_table_of_factors_is_that_of_the_recorded_results(benchmark: Callable[[str], ModuleType]) -> None:
     recorded = json.loads((RESULTS / "factors.json").read_text(encoding="utf-8"))["trials"]
     assert between("docs/tradeoffs.md", "factors") == str(benchmark("factors").table(recorded))
+
+
+def test_the_fronts_are_those_that_were_measured_and_reach_far(benchmark: Callable[[str], ModuleType]) -> None:
+    script, found = benchmark("fronts"), json.loads((RESULTS / "fronts.json").read_text(encoding="utf-8"))
+    assert found.keys() == script.SCENES.keys(), "one of each task"
+    assert between("docs/tradeoffs.md", "fronts") == "\n\n".join(script.report(name, found[name]) for name in script.SCENES)
+    assert all(script.reach(result, "size", "bytes") >= 10 for result in found.values())
+    assert all(script.reach(found[name], "speed", "time_ratio") >= 8 for name in ("chair", "lit_solids")), (
+        "of the fire see docs/tradeoffs.md"
+    )
+
+
+def test_targets_are_met_by_models_that_are_hardly_larger_than_a_grids(benchmark: Callable[[str], ModuleType]) -> None:
+    script, found = benchmark("target"), json.loads((RESULTS / "target.json").read_text(encoding="utf-8"))
+    assert between("docs/tradeoffs.md", "target") == "\n\n".join(script.report(name, found[name]) for name in script.SCENES)
+    for result in found.values():
+        for run in result["runs"]:
+            assert 0 <= run["held_out_stored"] - run["target"] <= 0.3 and run["seconds"] <= run["budget"] and run["warning"] is None
+            assert run["bytes_usual"] <= 1.15 * script.smallest(result["grid"], run["target"])
 
 
 def test_the_levels_of_effort_are_those_that_were_measured(benchmark: Callable[[str], ModuleType]) -> None:

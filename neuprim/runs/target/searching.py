@@ -16,7 +16,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.runs.target.judge import ALLOWANCE, ROOM, Judge
 from neuprim.runs.target.knobs import ladders, next_turn, pays
 from neuprim.runs.target.pace import linear
-from neuprim.runs.target.prediction import decibels
+from neuprim.runs.target.prediction import NOISE, decibels
 from neuprim.runs.target.record import Attempt, Record, Turn
 from neuprim.runs.target.search import Proposal, climb, propose
 from neuprim.runs.target.trying import VIEWS, Trying
@@ -37,8 +37,12 @@ _PACE_STEPS = 24
 
 _MOST_SIZES, _MOST_TURNS, _MOST_FULL = 6, 4, 5
 
-_OVER = 0.3
-"""dB above the target that are close enough."""
+_OVER, _NEAR = 0.3, 1.08
+"""dB above the target that are close enough, if the size is within that of the one that would be closer: where decibels come slowly, a tenth of one is a
+tenth of the bytes."""
+
+_LEAST_SLOPE = 0.8
+"""dB that twice as many primitives gain at least, in full runs of sizes that a target is met with; short trials may show less."""
 
 _BEYOND, _BELOW = 2.0, 3.0
 """How many times more, and fewer, primitives than any training had a full run may have: curves are not known further away."""
@@ -51,6 +55,9 @@ _ENOUGH = 0.75
 
 _STEP = 1.07
 """From the size of a full run that missed to the next, at least."""
+
+_LEAP = 2.0
+"""Times as many primitives as any size tried has: before that is tried, one trial is longer."""
 
 _SLOWER = 1.5
 """How many times slower than measured a full run may become before it is cut short."""
@@ -150,7 +157,9 @@ class Search:
             self.probe(count)
         for _ in range(_MOST_SIZES - len(begun)):
             proposal = self.proposal()
-            if proposal.kind != "try":
+            if self.target.quality and self.far(proposal) and self.look_further():
+                continue
+            if proposal.kind != "try" or self.promising() is not None:
                 break
             if not self.fits(proposal.primitives, 1.5 * self.record.length):
                 self.because("no time for more sizes")
@@ -167,6 +176,31 @@ class Search:
         while self.steps(self.config.model.primitives) >= 1.9 * _SHORTER * self.record.length:
             self.record.length *= 2
         return self.record.length > before
+
+    def far(self, proposal: Proposal) -> bool:
+        """Whether a proposal leaps, or gives up, by what short trials say of long runs: networks of light gain more with every doubling for long."""
+        largest = max(a.count for a in self.record.done("size"))
+        return proposal.kind == "unreachable" or (proposal.kind == "try" and proposal.primitives > _LEAP * largest)
+
+    def look_further(self) -> bool:
+        """Trains the largest size tried for twice as long, once; whether it did."""
+        largest = max(a.primitives for a in self.record.done("size"))
+        steps = 2 * self.record.length
+        if self.record.done("longer") or steps > self.steps(largest) or not self.fits(largest, steps):
+            return False
+        self.told(Attempt("longer", self.record.words, largest, steps))
+        return True
+
+    def promising(self) -> int | None:
+        """Where no size seems to have the target, and before full runs: the least that is as good as any tried, if it may have it by the doubt
+        about it. A full run of it tells more than trials of larger ones."""
+        judge = self.judge
+        if not self.target.quality or self.record.done("full") or not self.record.done("longer"):
+            return None
+        if judge.curve().count_for(ALLOWANCE, 1, self.highest()) is not None:
+            return None
+        best = max(margin for _, margin in judge.tried())
+        return min(n for n, margin in judge.tried() if margin >= best - NOISE) if best + judge.doubt >= ALLOWANCE else None
 
     def proposal(self) -> Proposal:
         judge, highest = self.judge, self.highest()
@@ -185,14 +219,23 @@ class Search:
             proposal = climb(judge.tried(), 1, highest)
             return proposal.primitives if proposal.kind == "take" else highest
         curve, tried, known = judge.curve(), judge.tried(), min(judge.tried())[0]
-        found = curve.count_for(ALLOWANCE, 1, highest)
+        found = self.promising() or curve.count_for(ALLOWANCE, 1, highest)
         top, best = max(tried)[0], max(tried, key=lambda pair: pair[1])[0]
         if found is not None and found <= _BEYOND * top:
-            return self.beside(max(found, min(round(known / _BELOW), highest)))
+            return self.beside(max(found, min(round(known / _BELOW), highest), self.down_to()))
         more = min(highest, round(_BEYOND * top))
         if found is None and (best < top or self.steps(more) < _ENOUGH * self.steps(top)):
             return min(best, highest)  # more primitives would only have fewer steps
         return self.beside(more)
+
+    def down_to(self) -> int:
+        """The size below which another full run need not be, while all of them have more than the target: short trials of sizes far apart are
+        often alike, and full runs are not."""
+        full = [(a.count, self.judge.margin({name: a.quality(name) for name in self.judge.measures})) for a in self.record.done("full")]
+        if not full or min(margin for _, margin in full) < ROOM:
+            return 1
+        count, margin = min(full)
+        return round(count / 2 ** ((margin - ROOM) / _LEAST_SLOPE))
 
     def beside(self, found: int) -> int:
         """``found``, but no nearer to a full run that missed than makes a difference, on the side that it missed on."""
@@ -271,7 +314,7 @@ class Search:
         if not self.target.quality:
             return shortfall(self.target, attempt) is None and self.wanted() <= _MORE * attempt.count
         margin = self.judge.margin({name: attempt.quality(name) for name in self.judge.measures})
-        return ROOM <= margin <= _OVER and shortfall(self.target, attempt) is None
+        return ROOM <= margin <= _OVER and attempt.count <= _NEAR * self.wanted() and shortfall(self.target, attempt) is None
 
     def plan(self) -> Attempt | None:
         """The next full run; None where another would not change anything, or has no time."""

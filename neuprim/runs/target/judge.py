@@ -20,6 +20,9 @@ ALLOWANCE = 0.1
 ROOM = ALLOWANCE / 2
 """dB above the target without which a full run leaves no room for few bits."""
 
+_ALIKE = 0.7
+"""For each doubling of the primitives between two sizes, the share of what one turned out otherwise by that is expected of the other."""
+
 _FULL_FILE = 0.97
 """Of the bytes allowed, those that are planned with."""
 
@@ -73,13 +76,12 @@ class Judge:
         length = self.record.length
         best = {n: told(n, values) for n, values in lengths.items()}
         short = {n: told(n, {s: v for s, v in values.items() if s <= length} or values) for n, values in lengths.items()}
-        moved = [best[n].value - short[n].value for n, values in lengths.items() if min(values) <= length < max(values)]
-        shift, tested = (sum(moved) / len(moved), True) if moved else (0.0, False)
+        moved = {n: best[n].value - short[n].value for n, values in lengths.items() if min(values) <= length < max(values)}
         made = {}
         for n, values in lengths.items():
             longer = max(values) > self.record.length
-            doubt = best[n].doubt if longer or not tested else max(short[n].doubt / 2, min(f.doubt for f in best.values()))
-            made[n] = best[n] if longer else Forecast(short[n].value + shift, doubt)
+            doubt = best[n].doubt if longer or not moved else max(short[n].doubt / 2, min(f.doubt for f in best.values()))
+            made[n] = best[n] if longer else Forecast(short[n].value + _shift(moved, n), doubt)
         curve = Curve.through([(n, f.value) for n, f in made.items()]) if made else None
         misses = [self._now(name, a) - curve.at(a.count) for a in full.values()] if curve is not None else []
         if misses:  # full runs tell what the trials' forecasts are worth
@@ -113,9 +115,18 @@ class Judge:
         return Curve.through(self.tried())
 
     def tried(self) -> list[tuple[int, float]]:
-        """(primitives, margin) of every size; of those between two full runs, one too small and one large enough, these two alone."""
+        """(primitives, margin) of every size; of those between two full runs, one too small and one large enough, these two alone. A size that is
+        only forecast is no worse than a full run of a smaller one, and no better than one of a larger."""
         found = [(n, self._margin(values)) for n, values in self.forecasts().items()]
         full = {a.count for a in self._done("full")}
+        known = [(n, margin) for n, margin in found if n in full]
+
+        def held(n: int, margin: float) -> float:
+            least = max((m for count, m in known if count < n), default=margin)
+            most = min((m for count, m in known if count > n), default=max(margin, least))
+            return margin if n in full else min(max(margin, least), max(most, least))
+
+        found = [(n, held(n, margin)) for n, margin in found]
         low = max((n for n, margin in found if n in full and margin < ALLOWANCE), default=None)
         high = min((n for n, margin in found if n in full and margin >= ALLOWANCE), default=None)
         if low is None or high is None:
@@ -162,6 +173,14 @@ class Judge:
                 size *= turn.size
             found.append((attempt.count, size))
         return found
+
+
+def _shift(moved: Mapping[int, float], primitives: int) -> float:
+    """What longer trials say of a size's forecast, the nearest of them: less of a size far from it, as few primitives are sooner as good as they can be."""
+    if not moved:
+        return 0.0
+    near = min(moved, key=lambda n: abs(math.log2(n / primitives)))
+    return moved[near] * _ALIKE ** abs(math.log2(near / primitives))
 
 
 def _largest(known: Sequence[tuple[int, float]], allowed: float) -> float:

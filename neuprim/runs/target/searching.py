@@ -157,9 +157,11 @@ class Search:
             self.probe(count)
         for _ in range(_MOST_SIZES - len(begun)):
             proposal = self.proposal()
+            if self.promising() is not None:
+                break
             if self.target.quality and self.far(proposal) and self.look_further():
                 continue
-            if proposal.kind != "try" or self.promising() is not None:
+            if proposal.kind != "try":
                 break
             if not self.fits(proposal.primitives, 1.5 * self.record.length):
                 self.because("no time for more sizes")
@@ -195,7 +197,7 @@ class Search:
         """Where no size seems to have the target, and before full runs: the least that is as good as any tried, if it may have it by the doubt
         about it. A full run of it tells more than trials of larger ones."""
         judge = self.judge
-        if not self.target.quality or self.record.done("full") or not self.record.done("longer"):
+        if not self.target.quality or self.record.done("full") or len(judge.tried()) < 2:
             return None
         if judge.curve().count_for(ALLOWANCE, 1, self.highest()) is not None:
             return None

@@ -16,10 +16,11 @@ def test_trials_promise_what_a_full_run_has() -> None:
     assert [(n, round(m, 2)) for n, m in judge(Target(psnr=25), *PAIR).tried()] == [(100, 0.31), (400, 2.31)]
 
 
-def test_a_longer_trial_moves_the_promises_of_the_others() -> None:
+def test_a_longer_trial_moves_the_promises_of_the_others_the_less_the_further_they_are() -> None:
     before, after = judge(Target(psnr=25), *PAIR), judge(Target(psnr=25), *PAIR, attempt(100, 400, 24.2, "longer"))
     assert dict(after.tried())[100] < dict(before.tried())[100]
-    assert dict(after.tried())[400] - dict(before.tried())[400] == pytest.approx(dict(after.tried())[100] - dict(before.tried())[100])
+    moved = {n: dict(after.tried())[n] - dict(before.tried())[n] for n in (100, 400)}
+    assert moved[400] == pytest.approx(0.7**2 * moved[100])
 
 
 def test_a_full_run_is_what_it_is_and_moves_the_others() -> None:

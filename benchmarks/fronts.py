@@ -60,7 +60,7 @@ SCENES = {
         "relight: lit_solids (generated), 128×128",
         ("task=relight", "scene=lit_solids", "scene.size=128", "train.iterations=6000"),
         ("model.primitives", "model.colour.visibility"),
-        "28m",
+        "40m",
     ),
 }
 
@@ -150,6 +150,7 @@ def draw(found: Mapping[str, Any]) -> None:
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     names = [name for name in SCENES if name in found]
     figure, axes = pyplot.subplots(2, len(names), figsize=(4.2 * len(names), 5.6), constrained_layout=True, squeeze=False)
@@ -163,13 +164,16 @@ def draw(found: Mapping[str, Any]) -> None:
             axis.plot([unit * models[i][cost] for i in others], [models[i]["psnr"] for i in others], ".", color="0.65", label="behind it")
             for i in line:
                 axis.annotate(
-                    f"{models[i]['primitives']:,}",
+                    f"{models[i]['primitives']:,}" + (", no shadows" if "visibility=none" in models[i]["name"] else ""),
                     (unit * models[i][cost], models[i]["psnr"]),
                     textcoords="offset points",
                     xytext=(4, -9),
                     fontsize=7,
                 )
             axis.set_xscale("log")
+            axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.xaxis.set_minor_formatter(NullFormatter())
             axis.set_xlabel(label)
             axis.grid(alpha=0.25)
             if others:

@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
-from typing import Any
 
 from neuprim.config import RunConfig
 from neuprim.config.overrides import parse, word
@@ -14,6 +13,7 @@ from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.task import TaskSpec
 from neuprim.core.uses import build_settings
 from neuprim.plugins.trading import traded
+from neuprim.runs.changed import value_of
 
 __all__ = ["CENTRE", "COMBINED", "LENGTH", "Variant", "check_knobs", "in_turn", "merged", "singles"]
 
@@ -73,7 +73,7 @@ def singles(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]:
         ]
     }
     for knob, values in own.items():
-        now = _value(centre, knob)
+        now = None if knob in centre.unused else value_of(centre, knob)
         ladder = [value for value in values if value != now]
         if now in values:
             place = values.index(now)
@@ -94,11 +94,3 @@ def in_turn(ladders: Mapping[str, Sequence[Variant]]) -> Iterator[Variant]:
     """The first of every knob, then the second: so that short budgets turn as many knobs as they can."""
     for rung in zip_longest(*ladders.values()):
         yield from (variant for variant in rung if variant is not None)
-
-
-def _value(config: RunConfig, key: str) -> Any:
-    """A setting of the configuration by its dotted name; None where it is not said."""
-    node: Any = config.to_dict()
-    for part in key.split("."):
-        node = node.get(part) if isinstance(node, Mapping) else None
-    return node

@@ -10,7 +10,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.task import TaskSpec
 from neuprim.core.uses import build_settings
 from neuprim.plugins.trading import traded
-from neuprim.runs.target.changed import changed, value_of
+from neuprim.runs.changed import changed, value_of
 from neuprim.runs.target.record import Setting, Turn
 
 __all__ = ["ladders", "next_turn", "pays"]

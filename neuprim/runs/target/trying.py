@@ -16,11 +16,11 @@ from neuprim.core.compressed import USUAL_LEVEL, bit_table
 from neuprim.core.data import Dataset
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.settings import PopulationSettings
+from neuprim.runs.changed import changed
 from neuprim.runs.events import Events, Note, Preparing
 from neuprim.runs.launch.jobs import Job
 from neuprim.runs.launch.share import at_once
 from neuprim.runs.launch.status import ENDED, Status
-from neuprim.runs.target.changed import changed
 from neuprim.runs.target.pace import Stopwatch, linear
 from neuprim.runs.target.record import Attempt, Record
 from neuprim.runs.trial_jobs import TrialFailed, do_trial, launch_jobs, words_of

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from neuprim.config import compose, task_of
+from neuprim.runs.changed import changed, value_of
 from neuprim.runs.open import load_dataset
-from neuprim.runs.target.changed import changed, value_of
 from neuprim.runs.target.knobs import ladders, next_turn
 from neuprim.runs.target.record import Setting, Turn
 

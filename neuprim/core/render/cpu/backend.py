@@ -33,6 +33,7 @@ __all__ = ["render", "render_parts"]
 _PRIMITIVES_PER_CHUNK = 512
 _UNITS_PER_THREAD = 8  # units of work among which threads share a frame
 _TURN = 2.0 * np.pi
+_NAMES = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
 _NET = ("Wx", "bias", "Wout", "base")
 Array = np.ndarray[Any, Any]
 
@@ -119,9 +120,8 @@ def _prepare(
     R, t = np.ascontiguousarray(view[:3, :3]), np.ascontiguousarray(view[:3, 3])
     cam = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
     size = np.array([camera.width, camera.height], np.int64)
-    names = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
     parallel_for(
-        prepare, count, _PRIMITIVES_PER_CHUNK, settings.threads, *(tensors[n] for n in names),
+        prepare, count, _PRIMITIVES_PER_CHUNK, settings.threads, *(tensors[n] for n in _NAMES),
         R, t, cam, size, settings.near, omega0 / _TURN, edge, depth_that_counts(settings.alpha_min), rows, spans, kinds, order, boxes, depth, status, in_float64,
     )  # fmt: skip
     if bool((status == NON_FINITE).any()):
@@ -134,7 +134,7 @@ def _prepare(
     slots[which] = np.arange(len(which), dtype=np.int32)
     wide = np.empty((len(which), rows.shape[1]))
     parallel_for(
-        prepare_wide, len(which), _PRIMITIVES_PER_CHUNK, settings.threads, which, *(tensors[n] for n in names),
+        prepare_wide, len(which), _PRIMITIVES_PER_CHUNK, settings.threads, which, *(tensors[n] for n in _NAMES),
         R, t, cam, settings.near, omega0 / _TURN, order, wide,
     )  # fmt: skip
     net = None
@@ -194,9 +194,8 @@ class _Rasterize(torch.autograd.Function):
         colors: Tensor, viewmat: Tensor, background: Tensor, camera: Camera, omega0: float, edge: int, settings: RenderSettings, stats: RenderStats,
         differentiable: bool, *net: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-        names = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
         painted = _NET if net else ("colors",)
-        kernels = zip((*names, *painted[:-1]), (means, log_scales, quats, W1, b1, w2, b2, *net), strict=True)
+        kernels = zip((*_NAMES, *painted[:-1]), (means, log_scales, quats, W1, b1, w2, b2, *net), strict=True)
         tensors = _alike({n: _array(v) for n, v in kernels}) | {painted[-1]: _array(colors)}
         _check_colours(tensors, painted)
         frame = _prepare(tensors, camera, viewmat.detach().double().numpy(), omega0, edge, _array(background.float()), settings, stats)
@@ -324,9 +323,8 @@ def render_parts(lowered: Lowered, parts: Tensor, count: int, camera: Camera, se
     """Opacity and depth of parts of the primitives, each as if it were alone, prepared as one frame; see :func:`neuprim.core.render.parts.render_parts`."""
     g, density = lowered.geometry, lowered.density
     assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"
-    names = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
     values = (g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1))
-    tensors = _alike({name: _array(value) for name, value in zip(names, values, strict=True)})
+    tensors = _alike({name: _array(value) for name, value in zip(_NAMES, values, strict=True)})
     nothing, view = np.zeros(1, np.float32), camera.viewmat.detach().double().numpy()
     stats, images = RenderStats("cpu", g.count), (parts.numpy(), count)
     frame = _prepare(tensors, camera, view, density.omega0, density.edge, nothing, settings, stats, images)

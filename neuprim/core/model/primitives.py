@@ -71,8 +71,16 @@ class Lowered:
             check_rows(self.rows, None, "Lowered.rows holds", sizes["N"][0])
         if self.shade is not None and (fault := function_fault(self.shade)) is not None:
             raise FormError(f"{self.owner('colour')}: shade has {fault} or None")
+        self.check_seen(viewmat, background)
+
+    def check_seen(self, viewmat: Any, background: Any) -> None:
+        """What :meth:`Primitives.lower`, which has looked at the rest, has not seen.
+
+        Raises:
+            FormError: as of :meth:`check`.
+        """
         if background is not None:
-            channels = sizes["C"][0]
+            channels = self.colour.channels
             check_shape("background", background, (channels,), f", as {self.source('colour')} has C={channels}")
         if viewmat is not None:
             check_shape("viewmat", viewmat, (4, 4))
@@ -171,7 +179,9 @@ class Primitives:
 
     def __init__(self, density: DensityField, colour: ColourField, params: Mapping[str, Tensor]) -> None:
         self.density, self.colour = density, colour
-        self.specs: tuple[ParameterSpec, ...] = (*GEOMETRY_SPECS, *density.parameters(), *colour.parameters())
+        own, painted = density.parameters(), colour.parameters()
+        self.specs: tuple[ParameterSpec, ...] = (*GEOMETRY_SPECS, *own, *painted)
+        self._names = tuple(s.name for s in own), tuple(s.name for s in painted)
         names = [s.name for s in self.specs]
         if len(set(names)) != len(names) or set(names) != set(params):
             raise ValueError(f"parameters {sorted(params)} do not match the specs {sorted(names)}")
@@ -213,7 +223,11 @@ class Primitives:
 
     def of(self, field: DensityField | ColourField) -> dict[str, Tensor]:
         """The tensors one field owns."""
-        return {s.name: self.params[s.name] for s in field.parameters()}
+        return self._of(field, self.params)
+
+    def _of(self, field: DensityField | ColourField, params: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Of some rows of all tensors, those that one field owns."""
+        return {name: params[name] for name in self._names[field is self.colour]}
 
     def lower(self, camera: AnyCamera, conditions: Conditions, settings: RenderSettings | None = None) -> Lowered:
         """Fold a frame's conditions into closed forms; differentiable. Primitives that are not alive in it are left out.
@@ -229,7 +243,7 @@ class Primitives:
         sizes = check_geometry(geometry, "geometry")
         density = self._lower_density(living, conditions)
         check_density(density, sizes, names[0])  # before the colour looks at it, which may draw it
-        own = {s.name: living.params[s.name] for s in self.colour.parameters()}
+        own = self._of(self.colour, living.params)
         colour = self.colour.lower(own, geometry, camera, conditions)
         check_colour(colour, sizes, names[1])
         check_channels(sizes["C"][0], self.colour)
@@ -266,7 +280,7 @@ class Primitives:
         if dtype is not None:
             params = {name: value.detach().to(dtype) for name, value in params.items()}
             conditions = {name: value.to(dtype) for name, value in conditions.items()}
-        own = {s.name: params[s.name] for s in self.density.parameters()}
+        own = self._of(self.density, params)
         stored = Geometry(params["means"], params["log_scales"], params["quats"])
         moved = self.density.move(own, stored, conditions)
         if moved is not stored:
@@ -288,7 +302,7 @@ class Primitives:
     def forms(self, camera: AnyCamera, conditions: Conditions) -> Lowered:
         """As :meth:`lower`, unchecked and unshaded: what kind of forms the fields lower to."""
         living = self.living(conditions)
-        own = {s.name: living.params[s.name] for s in self.colour.parameters()}
+        own = self._of(self.colour, living.params)
         density = self._lower_density(living, conditions)
         return Lowered(living.geometry, density, self.colour.lower(own, living.geometry, camera, conditions), living.rows)
 

@@ -67,12 +67,19 @@ def render(
     """
     settings = settings or RenderSettings()
     with limited(settings.threads) if settings.threads else nullcontext():  # fields are lowered by as many threads as pixels
-        return render_lowered(model.lower(camera, conditions or {}, settings), camera, settings, background)
+        lowered = model.lower(camera, conditions or {}, settings)
+        lowered.check_seen(camera.viewmat, background)
+        return _drawn(lowered, camera, settings, background)
 
 
 def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None) -> RenderOutput:
     """Draw a model whose conditions are already folded in; refuses what does not fit or is not finite, see :func:`render`."""
     lowered.check(camera.viewmat, background)
+    return _drawn(lowered, camera, settings, background)
+
+
+def _drawn(lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None) -> RenderOutput:
+    """Of what is checked."""
     backend = choose(lowered, settings, camera)
     if not backend.checks:
         refuse_non_finite(lowered)

@@ -111,10 +111,11 @@ class TimeHarmonics(ColourField):
         return dict(zip(_TIME, (powers, waves.cos(), waves.sin()), strict=True))
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:
-        dc = params["sh_dc"]
-        for name, basis in self._terms(time_of(conditions)).items():
-            if name in params:
-                dc = dc + (params[name] * device.beside(basis, dc)[:, None]).sum(1)
+        dc, xi = params["sh_dc"], time_of(conditions)
+        if self.powers or self.waves:
+            for name, basis in self._terms(xi).items():
+                if name in params:
+                    dc = dc + (params[name] * device.beside(basis, dc)[:, None]).sum(1)
         return dc, params.get("sh_rest")
 
     def pieces(self) -> tuple[Piece, ...]:

@@ -112,14 +112,17 @@ class TimeDensity(DensityField):
     # ------------------------------------------------------------ one frame
 
     def alive(self, params: Params, conditions: Conditions) -> Tensor | None:
-        xi, lives = time_of(conditions), None
+        if "window" not in self.parts and not self.seams:
+            return None
+        xi, rows = time_of(conditions), None
         if "window" in self.parts:
-            center, tau = params["window_center"].detach()[:, 0].double(), params["log_window"].detach()[:, 0].double().exp()
-            lives = (xi - center).abs() < tau
+            from neuprim.tasks.dynamic.frame_cpu import in_their_windows  # numba, loaded when first needed
+
+            rows = in_their_windows(params["window_center"], params["log_window"], xi)
         if self.seams:
-            own = shares(params["chunk"], self.seams, xi)[:, 0] > 0
-            lives = own if lives is None else lives & own
-        return None if lives is None else lives.nonzero()[:, 0]
+            counts = shares(params["chunk"], self.seams, xi)[:, 0] > 0
+            rows = counts.nonzero()[:, 0] if rows is None else rows[counts[rows]]
+        return rows
 
     def move(self, params: Params, geometry: Geometry, conditions: Conditions) -> Geometry:
         if "motion" not in self.parts:

@@ -10,12 +10,34 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.compute.operation import applied
 from neuprim.core.model.densities.gain_cpu import scale_backward
 from neuprim.core.model.edge import fade
 
-__all__ = ["WINDOW_EDGE", "fused_move", "fused_window"]
+__all__ = ["WINDOW_EDGE", "fused_move", "fused_window", "in_their_windows"]
 
 WINDOW_EDGE = 2  # the exponent of the window in time, which is to a life what an edge is to a support
+
+
+@exact_kernel
+def _in_their_windows(center, log_window, xi, rows):  # type: ignore[no-untyped-def]
+    """How many there are; ``rows`` begins with them."""
+    found = 0
+    for n in range(center.shape[0]):
+        if abs(xi - np.float64(center[n, 0])) < np.exp(np.float64(log_window[n, 0])):
+            rows[found] = n
+            found += 1
+    return found
+
+
+def in_their_windows(center: Tensor, log_window: Tensor, xi: Tensor) -> Tensor:
+    """Ascending int64 rows of ``center`` and ``log_window`` (N, 1) with abs(xi - center) < exp(log_window), in float64; no gradient."""
+    center, log_window = center.detach(), log_window.detach()
+    if not device.fused(center, log_window):
+        return ((xi - center[:, 0].double()).abs() < log_window[:, 0].double().exp()).nonzero()[:, 0]
+    rows = np.empty(len(center), np.int64)
+    found = _in_their_windows(center.contiguous().numpy(), log_window.contiguous().numpy(), float(xi), rows)
+    return torch.from_numpy(rows[:found])
 
 
 class _Window(torch.autograd.Function):
@@ -45,7 +67,7 @@ def fused_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi:
     if not device.fused(w2, b2, center, log_window):
         weight = fade(((xi.to(b2.dtype) - center) / log_window.exp()).square(), WINDOW_EDGE)
         return w2 * weight, b2 * weight
-    result: tuple[Tensor, Tensor] = _Window.apply(w2, b2, center, log_window, xi)
+    result: tuple[Tensor, Tensor] = applied(_Window, w2, b2, center, log_window, xi)
     return result
 
 
@@ -84,5 +106,5 @@ def fused_move(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Te
     if not device.fused(means, velocity, acceleration, center):
         since = xi.to(velocity.dtype) - center
         return means + (velocity + acceleration * since) * since
-    moved: Tensor = _Move.apply(means, velocity, acceleration, center, xi)
+    moved: Tensor = applied(_Move, means, velocity, acceleration, center, xi)
     return moved

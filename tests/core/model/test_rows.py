@@ -61,3 +61,17 @@ def test_two_frames_of_one_model_add_up() -> None:
     for rows in ([0, 1], [1, 7]):
         take_rows(mine, torch.tensor(rows))["b2"].sum().backward()
     assert mine["b2"].grad is not None and mine["b2"].grad[:, 0].tolist() == [1, 2, 0, 0, 0, 0, 0, 1, 0]
+
+
+@pytest.mark.parametrize("count", [3, 5000])
+def test_without_a_gradient_few_and_many_rows(count: int) -> None:
+    g = torch.Generator().manual_seed(3)
+    mine = {
+        "means": torch.randn(6000, 3, generator=g),
+        "nothing": torch.zeros(6000, 0, 3),
+        "b2": torch.randn(6000, generator=g).requires_grad_(),
+    }
+    rows = torch.randperm(6000, generator=g)[:count].sort().values
+    with torch.no_grad():
+        taken = take_rows(mine, rows)
+    assert all(torch.equal(taken[n], x[rows]) and not taken[n].requires_grad for n, x in mine.items())

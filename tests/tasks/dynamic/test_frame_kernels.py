@@ -11,7 +11,7 @@ from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext
 from neuprim.tasks.dynamic.density import TimeDensity
-from neuprim.tasks.dynamic.frame_cpu import fused_move, fused_window
+from neuprim.tasks.dynamic.frame_cpu import fused_move, fused_window, in_their_windows
 
 pytestmark = pytest.mark.usefixtures("either_way")
 
@@ -88,6 +88,34 @@ def test_motion_forward_and_backward(dtype: torch.dtype, tolerance: float, xi: f
     found, wanted = fused_move(*mine, time), moved(*exact, time)
     assert torch.equal(found, moved(*mine, time))
     compare([found], [wanted], mine, exact, tolerance)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rows_in_their_windows(dtype: torch.dtype) -> None:
+    center, log_window = draw(9, dtype, 1, 1)
+    center[:6, 0] = torch.tensor([0.25, 0.25, torch.nan, torch.inf, -torch.inf, 0.25], dtype=dtype)
+    log_window[:6, 0] = torch.tensor([-torch.inf, torch.inf, 0.0, 1.0, torch.inf, torch.nan], dtype=dtype)
+    wide = torch.stack([center, log_window], 1)[:, :, 0]  # strides do not matter
+    for xi in (0.25, 0.0, 1.0, -3.0):
+        time = torch.tensor(xi, dtype=torch.float64)
+        wanted = [n for n in range(40) if abs(xi - float(center[n])) < float(log_window[n].double().exp())]
+        for given in ((center, log_window), (wide[:, :1], wide[:, 1:])):
+            rows = in_their_windows(*given, time)
+            assert rows.dtype == torch.int64 and rows.tolist() == wanted
+    assert in_their_windows(center[:2], log_window[:2], torch.tensor(0.25)).tolist() == [1]
+    assert in_their_windows(center[:0], log_window[:0], torch.tensor(0.25)).tolist() == []
+
+
+def test_without_a_gradient_the_same_numbers() -> None:
+    xi = torch.tensor(0.37, dtype=torch.float64)
+    for operation, widths in ((fused_window, (2, 1, 1, 1)), (fused_move, (3, 3, 3, 1))):
+        plain = draw(4, torch.float32, *widths)
+        asked = operation(*[x.clone().requires_grad_() for x in plain], xi)  # type: ignore[operator]
+        with torch.no_grad():
+            silent = operation(*[x.clone().requires_grad_() for x in plain], xi)  # type: ignore[operator]
+        for found in (silent, operation(*plain, xi)):  # type: ignore[operator]
+            for a, b in zip(found, asked, strict=True):
+                assert torch.equal(a, b) and not a.requires_grad and b.requires_grad
 
 
 @pytest.mark.parametrize("parts", ["window", "motion", "window+motion", "phase+offset+window+motion"])

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.compute.operation import applied
 
 __all__ = ["fused_gain", "scale_backward"]
 
@@ -48,5 +49,5 @@ def fused_gain(w2: Tensor, b2: Tensor, log_gain: Tensor, limit: float) -> tuple[
     if not device.fused(w2, b2, log_gain):
         gain = log_gain.clamp(-limit, limit).exp()
         return w2 * gain, b2 * gain
-    result: tuple[Tensor, Tensor] = _Gain.apply(w2, b2, log_gain, limit)
+    result: tuple[Tensor, Tensor] = applied(_Gain, w2, b2, log_gain, limit)
     return result

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.compute.operation import applied
 from neuprim.core.compute.threads import parallel_for, threads_of
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.fields import Constant, Cosine, RayNet
@@ -32,6 +33,7 @@ __all__ = ["render", "render_parts"]
 
 _PRIMITIVES_PER_CHUNK = 512
 _UNITS_PER_THREAD = 8  # units of work among which threads share a frame
+_TILES_ALONE = 64  # tiles that a thread which shares with no other does at once, at least
 _TURN = 2.0 * np.pi
 _NAMES = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
 _NET = ("Wx", "bias", "Wout", "base")
@@ -66,7 +68,9 @@ class _Prepared:
 
     def __post_init__(self) -> None:
         """Fixes the unit of work for both passes: half a row of tiles, or more where threads are few, as every unit costs a call."""
-        self.chunk = max(2, -(-self.camera.width // L.TILE) // 2, self.tiles // (_UNITS_PER_THREAD * threads_of(self.settings.threads)))
+        threads = threads_of(self.settings.threads)
+        least = 2 if threads > 1 else _TILES_ALONE
+        self.chunk = max(least, -(-self.camera.width // L.TILE) // 2, self.tiles // (_UNITS_PER_THREAD * threads))
 
     @property
     def intrinsics(self) -> Array:
@@ -312,7 +316,7 @@ def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings
         g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1), palette, camera.viewmat, background,
     )  # fmt: skip
     differentiable = torch.is_grad_enabled() and any(x.requires_grad for x in (*tensors, *net))
-    rgb, T, zsum = _Rasterize.apply(*tensors, camera, density.omega0, density.edge, settings, stats, differentiable, *net)
+    rgb, T, zsum = applied(_Rasterize, *tensors, camera, density.omega0, density.edge, settings, stats, differentiable, *net)
     dtype = g.means.dtype
     alpha = 1 - T
     depth = mean_depth(zsum, alpha).to(dtype) if settings.depth else None

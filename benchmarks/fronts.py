@@ -44,16 +44,16 @@ class Scene:
 SCENES = {
     "chair": Scene(
         "static: NeRF-synthetic chair, 200×200",
-        ("task=static", "scene=blender", "model.primitives=5600", "train.iterations=8000"),
+        ("task=static", "scene=blender", "model.primitives=5600", "train.iterations=16000"),
         ("model.primitives",),
-        "27m",
+        "55m",
         "scene.path",
     ),
     "fire": Scene(
         "dynamic: EmberGen fire, 64×64",
-        ("task=dynamic", "scene=vdb", "scene.size=64", "train.iterations=16000"),
+        ("task=dynamic", "scene=vdb", "scene.size=64", "train.iterations=44000"),
         ("model.primitives",),
-        "26m",
+        "110m",
         "scene.vdb",
     ),
     "lit_solids": Scene(
@@ -176,6 +176,7 @@ def draw(found: Mapping[str, Any]) -> None:
             axis.xaxis.set_minor_formatter(NullFormatter())
             axis.set_xlabel(label)
             axis.grid(alpha=0.25)
+            axis.margins(x=0.13, y=0.1)  # room for the labels
             if others:
                 axis.legend(fontsize=7, loc="lower right")
         axes[0, column].set_title(SCENES[name].title, fontsize=9)

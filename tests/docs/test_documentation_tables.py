@@ -131,8 +131,7 @@ def test_the_fronts_are_those_that_were_measured_and_reach_far(benchmark: Callab
     assert found.keys() == script.SCENES.keys(), "one of each task"
     assert between("docs/tradeoffs.md", "fronts") == "\n\n".join(script.report(name, found[name]) for name in script.SCENES)
     assert all(script.reach(result, "size", "bytes") >= 10 for result in found.values())
-    spans = {name: script.reach(result, "speed", "time_ratio") for name, result in found.items()}
-    assert spans["lit_solids"] >= 8 and spans["chair"] >= 6 and spans["fire"] >= 2, "the larger models of longer trainings make them longer"
+    assert all(script.reach(result, "speed", "time_ratio") >= 8 for result in found.values())
 
 
 def test_targets_are_met_by_models_that_are_hardly_larger_than_a_grids(benchmark: Callable[[str], ModuleType]) -> None:

@@ -23,7 +23,7 @@ CENTRE, COMBINED = "centre", "combined"
 LENGTH = "train.iterations"
 """The knob whose values are shares of the full length."""
 
-_PARTS = {"model.primitives": (0.5, 2.0, 0.25, 4.0, 1 / 8, 1 / 16, 1 / 32), LENGTH: (0.5, 0.25)}
+_PARTS = {"model.primitives": (0.5, 2.0, 0.25, 4.0, 1 / 8, 1 / 16, 1 / 32, 1 / 64), LENGTH: (0.5, 0.25)}
 """Knobs of every task, as multiples of the centre's."""
 
 _NAME = 80

@@ -26,7 +26,7 @@ def turned(ladder: list[Variant]) -> list[str]:
 def test_the_static_task_has_its_knobs_next_to_the_centre_first() -> None:
     found = offered("task=static", "scene=solids")
     assert list(found) == ["model.primitives", "model.neurons", "model.density.edge", "model.sh_degree", LENGTH]
-    assert turned(found["model.primitives"]) == [f"model.primitives={count}" for count in (1400, 5600, 700, 11200, 350, 175, 88)]
+    assert turned(found["model.primitives"]) == [f"model.primitives={count}" for count in (1400, 5600, 700, 11200, 350, 175, 88, 44)]
     few = offered("task=static", "scene=solids", "model.primitives=4")["model.primitives"]
     assert turned(few) == [f"model.primitives={count}" for count in (2, 8, 1, 16)], "each once"
     assert turned(found["model.neurons"]) == ["model.neurons=0", "model.neurons=4", "model.neurons=8"], "the preset has two"

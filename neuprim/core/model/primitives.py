@@ -69,8 +69,6 @@ class Lowered:
         check_colour(self.colour, sizes, colour)
         if self.rows is not None:
             check_rows(self.rows, None, "Lowered.rows holds", sizes["N"][0])
-        if self.shade is not None and (fault := function_fault(self.shade)) is not None:
-            raise FormError(f"{self.owner('colour')}: shade has {fault} or None")
         self.check_seen(viewmat, background)
 
     def check_seen(self, viewmat: Any, background: Any) -> None:
@@ -79,6 +77,8 @@ class Lowered:
         Raises:
             FormError: as of :meth:`check`.
         """
+        if self.shade is not None and (fault := function_fault(self.shade)) is not None:
+            raise FormError(f"{self.owner('colour')}: shade has {fault} or None")
         if background is not None:
             channels = self.colour.channels
             check_shape("background", background, (channels,), f", as {self.source('colour')} has C={channels}")

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
-from neuprim.core.compute.operation import applied
+from neuprim.core.compute.operation import applied, asked
 from neuprim.core.compute.threads import parallel_for
 
 __all__ = ["take_rows"]
@@ -28,8 +28,7 @@ def take_rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
 
     Nothing is checked: the kernels would read and write beyond the ends.
     """
-    alone = not (torch.is_grad_enabled() and any(value.requires_grad for value in tensors.values()))
-    if (alone and len(rows) < _FEW) or not device.fused(rows, *tensors.values()):
+    if not device.fused(rows, *tensors.values()) or (len(rows) < _FEW and not asked(*tensors.values())):
         return {name: value.index_select(0, rows) for name, value in tensors.items()}
     return dict(zip(tensors, applied(_Rows, rows, *tensors.values()), strict=True))
 

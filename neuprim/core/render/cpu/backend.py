@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.compute.operation import applied
+from neuprim.core.compute.operation import applied, asked
 from neuprim.core.compute.threads import parallel_for, threads_of
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.fields import Constant, Cosine, RayNet
@@ -315,8 +315,7 @@ def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings
     tensors = (
         g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1), palette, camera.viewmat, background,
     )  # fmt: skip
-    differentiable = torch.is_grad_enabled() and any(x.requires_grad for x in (*tensors, *net))
-    rgb, T, zsum = applied(_Rasterize, *tensors, camera, density.omega0, density.edge, settings, stats, differentiable, *net)
+    rgb, T, zsum = applied(_Rasterize, *tensors, camera, density.omega0, density.edge, settings, stats, asked(*tensors, *net), *net)
     dtype = g.means.dtype
     alpha = 1 - T
     depth = mean_depth(zsum, alpha).to(dtype) if settings.depth else None

@@ -259,6 +259,7 @@ def _render(args: argparse.Namespace) -> int:
             tell=progress.note,
             progress=progress.show,
             words=args.words,
+            space=args.space,
             **{name: value for name, value in (("layers", args.layers), ("datatype", args.datatype)) if value is not None},
         )
     for path in paths:

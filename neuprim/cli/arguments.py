@@ -42,6 +42,8 @@ def for_render(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
     cameras = "which cameras; a file is JSON (frames, or a path of nerfstudio's viewer), USD (FILE#/PRIM) or a COLMAP model's folder"
     parser.add_argument("--camera", required=True, metavar="orbit|test|FILE", help=cameras)
+    space = "coordinates of a file's cameras, of lights, and in .exr files: those of the run's data (default), or of the model (volumes: its unit box)"
+    parser.add_argument("--space", choices=("world", "scene"), default="world", help=space)
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the data set's)")
     parser.add_argument("--format", choices=("png", "exr", "npy", "webp", "gif", "mp4"), help="default: png, or webp for an animation")
     layers = "of an .exr: beauty, alpha, depth, density, and what the run's task adds (an unknown name lists them); default: all"
@@ -65,7 +67,7 @@ def for_inspect(parser: argparse.ArgumentParser) -> None:
         "--box",
         type=numbers,
         metavar="X,Y,Z,X,Y,Z",
-        help="two corners, scene units, as --box=-1,-1,-1,1,1,1 (default: around all matter)",
+        help="two corners, in the coordinates of the run's data, as --box=-1,-1,-1,1,1,1 (default: around all matter)",
     )
     parser.add_argument("--level", type=numbers, default=[], metavar="S,...", help="extinctions of isosurfaces, 1/scene unit")
     parser.add_argument("--up", choices=("x", "y", "z"), help="the upward axis (default: the scene's, or z)")

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from torch import Tensor
 
+from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels, stored_channels
 from neuprim.core.checked import Option, Range, converted
 from neuprim.core.conditions import export_frames
@@ -48,6 +49,15 @@ class TrainedModel:
     settings: RenderSettings
     dataset: Callable[[], Dataset]
     volume: Callable[[], VolumeSource | None] = lambda: None
+
+    @property
+    def world(self) -> World:
+        """How its scene lies in the world of the user's files, in whose coordinates everything is exported.
+
+        Raises:
+            DataError: the header says something else.
+        """
+        return World.of(self.header, str(self.directory))
 
     @property
     def channels(self) -> Channels:

@@ -49,7 +49,7 @@ COMMON: tuple[LayerSpec, ...] = (
     LayerSpec("alpha", "accumulated opacity, 0 to 1", lambda frame: frame.drawn.alpha, ("A",)),
     LayerSpec(
         "depth",
-        "distance from the camera's plane (camera z), scene units: the mean over the chord middles of what the pixel shows, weighted by its "
+        "distance from the camera's plane (camera z), in the units of the data's files: the mean over the chord middles of what the pixel shows, weighted by its "
         "part in the pixel; 0 where alpha is 0",
         lambda frame: frame.drawn.depth,
         ("Z",),

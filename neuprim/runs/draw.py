@@ -9,8 +9,9 @@ from typing import Any
 
 import torch
 
-from neuprim.config import RunConfig, suspects_of
+from neuprim.config import RunConfig, suspects_of, task_of
 from neuprim.core.cameras.file import CameraViews, read_camera_file
+from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels, stored_channels
 from neuprim.core.conditions import flag, in_step, read_conditions
 from neuprim.core.data import View
@@ -21,6 +22,7 @@ from neuprim.core.io.files import write_npy
 from neuprim.core.io.film import write_film
 from neuprim.core.io.records import Record
 from neuprim.core.model.fields import Conditions
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import facts_of, orbit_of
 from neuprim.runs.layers import Layers
@@ -29,6 +31,9 @@ from neuprim.runs.open import LOGS, load_dataset, load_run, placed
 from neuprim.runs.operating import read_point
 
 __all__ = ["FORMATS", "SETS", "render_run", "with_conditions"]
+
+SPACES = WORLD, SCENE = ("world", "scene")
+"""Whose coordinates a file of cameras has, after ``--space``."""
 
 SETS = ("orbit", "test")
 """Cameras of the run's own."""
@@ -56,6 +61,7 @@ def render_run(
     words: Sequence[str] = (),
     layers: str | None = None,
     datatype: str | None = None,
+    space: str = WORLD,
 ) -> list[Path]:
     """Draw a run's model: ``camera`` is "orbit", "test" or a file of cameras (see :mod:`neuprim.core.cameras.file`).
 
@@ -70,13 +76,17 @@ def render_run(
         progress: called with (text, fraction 0..1) while images are drawn.
         words: of an operating point (:mod:`neuprim.runs.operating`), over how the run draws.
         layers: of an OpenEXR file, names separated by commas (:mod:`neuprim.core.layers`); None for all but a layer per light.
+        space: "world": a file's cameras, lights, and what is written of cameras and depths are in the coordinates of the data's files; "scene":
+            in those of the model, for volumes their unit box.
         datatype: of light and alpha in an OpenEXR file, "half" or "float" (16 or 32 bits, the default).
 
     Raises:
-        DataError, ConfigError, CheckpointError: bad cameras, conditions, or run directory.
+        DataError, ConfigError, CheckpointError: bad cameras, conditions, or run directory; no image shows anything of the model.
         BackendUnavailable: a format whose package is missing.
     """
     config, task, model, header = load_run(run_dir)
+    world = World.of(header, str(run_dir)) if space == WORLD else World()
+    task = task if space == WORLD else task_of(config, run_dir / "config.yaml")
     point = read_point(words, config.renderer, model)
     suspects = suspects_of(config)
     watch = suspects.watch(run_dir / LOGS)
@@ -97,6 +107,7 @@ def render_run(
         for note in file.notes:
             tell(f"{camera}: {note}")
         views, fps = _views_of(file, task, conditions), fps or file.fps
+        views = [replace(v, camera=world.scene_camera(v.camera)) for v in views]
     else:
         dataset = load_dataset(config, task, run_dir=run_dir)
         suspects.know(dataset)
@@ -114,7 +125,7 @@ def render_run(
     for flag_given, value in (("--layers", layers), ("--datatype", datatype)):
         if value is not None and format != "exr":
             raise ConfigError(f"{flag_given} {value}: of OpenEXR files; expected --format exr, found {format}")
-    layered = Layers(run_dir, task, channels, point, background, layers, datatype == "half", lights) if format == "exr" else None
+    layered = Layers(run_dir, task, channels, point, background, layers, datatype == "half", lights, world) if format == "exr" else None
     if channels.partial and format not in _RAW:
         tell(f"shown: {channels.shown}; --format exr and npy hold all channels")
 
@@ -126,11 +137,13 @@ def render_run(
             f"--out {out}: {len(views)} views do not fit one .{format} file; give a folder, or --format webp for an animation"
         )
     done = 0
+    full = [False] * len(views)
 
     each = max(len(lights), 1)
 
-    def drawn() -> None:
+    def drawn(alpha: torch.Tensor) -> None:
         nonlocal done
+        full[done // each] |= bool((alpha > 0).any())
         done += 1
         progress(f"view {done // each + (done % each > 0)} of {len(views)}", done / (each * len(views)))
 
@@ -138,14 +151,29 @@ def render_run(
         with watch:
             if lights:
                 return point.enlarged(draw_sum(model, point.seen(view), lights, point.settings, background, drawn), view.camera)
-            result = point.draw(model, view, background)
-        drawn()
-        return result
+            return point.draw(model, view, background, drawn)
+
+    def refuse_empty() -> None:
+        """Rule: an image that shows nothing of the model is told, and a shot of such images is an error."""
+        empty = [view for view, some in zip(views, full, strict=True) if not some]
+        if not empty:
+            return
+        where = _apart(model, empty[0], world)
+        if len(empty) < len(views):
+            tell(f"warning: {len(empty)} of {len(views)} images are empty, first {empty[0].name}: {where}")
+            return
+        hint = (
+            ""
+            if camera in SETS or space == SCENE
+            else "; a file's cameras are in the units of the run's data, or of the model with --space scene"
+        )
+        raise DataError(f"--camera {camera}: all {len(views)} images are empty: {where}{hint}")
 
     if animate:
         target = out if single and out is not None else folder.with_suffix(f".{format}")
         target.parent.mkdir(parents=True, exist_ok=True)
         stack = [channels.display(image(v)) for v in views]
+        refuse_empty()
         write_film(target, stack, fps or min(30.0, max(len(views) / 4.0, 5.0)))
         return [target]
     paths = []
@@ -158,7 +186,30 @@ def render_run(
             with watch:
                 layered.write(path, model, v, drawn)
         paths.append(path)
+    try:
+        refuse_empty()
+    except DataError:
+        for path in paths:
+            path.unlink()
+        raise
     return paths
+
+
+def _apart(model: Primitives, view: View, world: World) -> str:
+    """Where the model is and where a camera looks that does not see it, in words."""
+    with torch.no_grad():
+        geometry, _ = model.lower_density(view.conditions)
+    if not geometry.count:
+        return "no primitive is there under these conditions"
+    means, reach = geometry.means.double().cpu(), geometry.scales.double().cpu().amax(1, keepdim=True)
+    low, high = world.world_box(torch.stack([(means - reach).min(0).values, (means + reach).max(0).values]).numpy())
+    seen = world.world_camera(view.camera)
+    at, towards = seen.position.tolist(), seen.viewmat[2, :3].tolist()
+    return f"the model is within {_point(low)} to {_point(high)}, and {view.name} at {_point(at)} looks towards {_point(towards)}"
+
+
+def _point(numbers: Sequence[float]) -> str:
+    return "(" + ", ".join(f"{x:.7g}" for x in numbers) + ")"
 
 
 def _write(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fps: float | None) -> None:

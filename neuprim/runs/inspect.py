@@ -53,7 +53,7 @@ class Request:
         show: names of inspectors.
         conditions: name -> text, as ``{"time": "0:1"}``.
         grid: points along the longest side of the box.
-        box: (2, 3) scene units; None: around the truth, or around what the model absorbs.
+        box: (2, 3) in the coordinates of the run's data; None: around the truth, or around what the model absorbs.
         against: an OpenVDB file or folder, or "scene".
         up: "x", "y" or "z"; None: the scene's setting, or z.
         overwrite: whether files that exist may be replaced.
@@ -105,7 +105,7 @@ def inspect_run(request: Request, events: Events = silent) -> list[Path]:
         write_page(request.out, film, inspectors)
         return [request.out]
     if kind == ".vdb":
-        return _each(request, film, lambda path, frame: write_volume(path, frame))
+        return _each(request, film, lambda path, frame: write_volume(path, frame, film.world))
     window = Window(panels_of(inspectors, request.against is not None), film.up, bool(kind), request.size)
     try:
         if not kind:
@@ -170,7 +170,7 @@ class _Film:
 
     def __init__(self, request: Request, events: Events) -> None:
         run = open_run(request.run_dir)
-        self.model, self.device = run.model, computing_device(run.settings)
+        self.model, self.device, self.world = run.model, computing_device(run.settings), run.world
         self.truth: DensityTruth | None = None
         self.channels, self.needed = run.channels, tuple(c.name for c in run.task.conditions)
         self.up = request.up or str(run.scene.get("up", "z"))
@@ -179,20 +179,21 @@ class _Film:
         wanted = condition_frames(run.task.conditions, request.conditions, lambda text: events(Note(text)))
         pairs: list[tuple[Conditions, int]] = [(conditions, -1) for conditions in wanted]
         if request.against is not None:
-            self.truth, words = open_truth(request.against, run.volume)
+            self.truth, words = open_truth(request.against, run.volume, run.world)
             events(Note(words))
             pairs = pair(wanted, self.truth, bool(request.conditions))
         self.pairs = pairs
         for path in [] if request.out is None else _paths(request.out, len(pairs)):
             refuse_taken(path, request.overwrite)
-        box = request.box if request.box is not None else self._box()
+        box = self.world.scene_box(request.box) if request.box is not None else self._box()
         if request.grid**3 > POINTS_LIMIT:
             raise ConfigError(f"--grid {request.grid}: expected at most {round(POINTS_LIMIT ** (1 / 3))}")
         self.matrix, self.shape = lattice(box, request.grid)
         self.numbers = [self._compare(i, events) for i in range(len(self))]
         self.top, self.gain, self.focus = self._scale(box)
-        low, high = ([round(x, 4) for x in corner] for corner in np.asarray(box).tolist())
-        on = f"{' x '.join(map(str, self.shape))} points from {low} to {high} scene units"
+        low, high = ([round(x, 4) for x in corner] for corner in self.world.world_box(np.asarray(box)).tolist())
+        units = "scene units" if self.world.identity else "in the coordinates of the run's data"
+        on = f"{' x '.join(map(str, self.shape))} points from {low} to {high} {units}"
         events(Note(f"extinction of {self.model.count} primitives on {on}, in 1/scene unit, each primitive clamped at 0 from below"))
         if (request.run_dir / PRUNED).exists():
             for line in kept_words(kept_pieces(self.model)):

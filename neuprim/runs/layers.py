@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras.attributes import exr_attributes
+from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError
@@ -59,6 +60,7 @@ class Layers:
         half: 16-bit floats for light and alpha.
         background: (C,) in the model's colour space. Beauty lies over it where alpha is not among the layers.
         lights: conditions of frames that add up, of light from all around; empty: the view's own light.
+        world: in whose coordinates and units the file has cameras, positions and depths.
     """
 
     run_dir: Path
@@ -69,6 +71,7 @@ class Layers:
     names: str | None = None
     half: bool = False
     lights: Sequence[Conditions] = ()
+    world: World = field(default_factory=World)
 
     def __post_init__(self) -> None:
         if self.apart and len(self.lights) > _MOST_LIGHTS:
@@ -103,8 +106,8 @@ class Layers:
                 )
         return tuple(spec for spec in found if not spec.light or spec.name == "beauty")
 
-    def write(self, path: Path, model: Primitives, view: View, drawn: Callable[[], None] = lambda: None) -> None:
-        """Draw and write one view; ``drawn`` is called after each of its lights.
+    def write(self, path: Path, model: Primitives, view: View, drawn: Callable[[Tensor], None] = lambda alpha: None) -> None:
+        """Draw and write one view; ``drawn`` is called after each of its lights, with the image's alpha.
 
         Raises:
             ConfigError: a layer was asked for by name that the model does not have.
@@ -128,7 +131,7 @@ class Layers:
                     found[spec.name] = image if not i else found[spec.name] + image
             if self.apart:
                 found[f"light_{i:03d}"] = frame.drawn.rgb.cpu()
-            drawn()
+            drawn(frame.drawn.alpha)
         alpha = frame.drawn.alpha.cpu()
         planes, summaries = self._planes(found, present, alpha, view)
         write_layers(path, planes, {**self._attributes(view), **summaries})
@@ -153,7 +156,7 @@ class Layers:
             image = image.float()
             if name == "depth":  # as the mean that it is: nothing of the 0 beside a silhouette
                 weighted = self.point.enlarged(image * alpha[..., None], view.camera)
-                image = mean_depth(weighted, whole)
+                image = mean_depth(weighted, whole) / self.world.scale
             else:
                 image = self.point.enlarged(image, view.camera)
             if name == "beauty":
@@ -177,7 +180,7 @@ class Layers:
         """What the file says about itself: camera, conditions, where it comes from and what its numbers are."""
         linear = self.channels.color_space == "linear"
         found = {
-            **exr_attributes(view.camera, self.point.settings.near),
+            **exr_attributes(self.world.world_camera(view.camera), self.point.settings.near / self.world.scale),
             "software": f"neuprim {__version__}",
             "neuprim:run": self.run_dir.resolve().name,
             "neuprim:task": self.task.name,
@@ -188,13 +191,19 @@ class Layers:
         if self.channels.plain:
             found["chromaticities"] = _REC709
         replaced = {name for light in self.lights for name in light}
-        for name, value in view.conditions.items():
+        for name, value in self._given(view.conditions):
             if name not in replaced:
                 found[f"neuprim:condition:{name}"] = _attribute(value)
         for i, light in enumerate(self.lights if self.apart else ()):
-            for name, value in light.items():
+            for name, value in self._given(light):
                 found[f"neuprim:light_{i:03d}:{name}"] = _attribute(value)
         return found
+
+    def _given(self, conditions: Conditions) -> Iterator[tuple[str, Tensor]]:
+        """Conditions as users write them."""
+        specs = {spec.name: spec for spec in self.task.conditions}
+        for name, value in conditions.items():
+            yield name, specs[name].given(value, self.world) if name in specs else value
 
 
 def _attribute(value: Tensor) -> Any:
@@ -202,4 +211,4 @@ def _attribute(value: Tensor) -> Any:
     numbers = value.detach().cpu().double().flatten().tolist()
     if len(numbers) == 1:
         return float(numbers[0])
-    return np.array(numbers, np.float32) if len(numbers) in (2, 3) else numbers
+    return np.array(numbers, np.float64 if value.dtype == torch.float64 else np.float32) if len(numbers) in (2, 3) else numbers

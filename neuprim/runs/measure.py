@@ -73,7 +73,7 @@ def draw_sum(
     lights: Sequence[Conditions],
     settings: RenderSettings,
     background: Tensor,
-    drawn: Callable[[], None] = lambda: None,
+    drawn: Callable[[Tensor], None] = lambda alpha: None,
 ) -> Tensor:
     """(H, W, C) sum of one view's images under conditions that change light alone, over the background once; as :func:`draw`.
 
@@ -81,14 +81,14 @@ def draw_sum(
 
     Args:
         lights: one or more; each replaces the view's conditions of the same names.
-        drawn: called after every image.
+        drawn: called after every image, with its alpha.
     """
     total, alpha = torch.zeros(()), torch.zeros(())
     for light in lights:
         with torch.no_grad():
             frame = render(model, view.camera, {**view.conditions, **light}, settings)
         total, alpha = total + frame.rgb.double(), frame.alpha
-        drawn()
+        drawn(alpha)
     return (total + (1.0 - alpha.double())[..., None] * background.double().to(alpha.device)).to(frame.rgb).cpu()
 
 

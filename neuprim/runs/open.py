@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config import RunConfig, scene_of, suspects_of, task_of
+from neuprim.core.cameras.world import World
 from neuprim.core.checkpoint import load_model
 from neuprim.core.data import Dataset, View
 from neuprim.core.errors import DataError
@@ -69,7 +70,7 @@ def load_dataset(
 
 
 def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Primitives, dict[str, Any]]:
-    """Configuration, task, model and model header of a run directory.
+    """Configuration, task, model and model header of a run directory; the task reads positions in the world of the run's files.
 
     Warns where another version of neuprim or of the task's package made the run.
 
@@ -85,6 +86,8 @@ def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Pr
     if config.made_by is not None:
         warn_of_neuprim(config.made_by, place)
     model, header = load_model(model_file(run_dir), task)
+    world = World.of(header, str(model_file(run_dir)))
+    task = replace(task, conditions=tuple(spec.within(world) for spec in task.conditions))
     return replace(config, renderer=at_hand(config.renderer)), task, model, header
 
 

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
@@ -91,12 +91,17 @@ class OperatingPoint:
         size = (camera.height, camera.width)
         return interpolate(image.permute(2, 0, 1)[None], size, mode="bilinear", align_corners=False)[0].permute(1, 2, 0).contiguous()
 
-    def draw(self, model: Primitives, view: View, background: Tensor) -> Tensor:
-        """(H, W, C) image of a view of an :meth:`applied` model, without gradients; on the processor."""
+    def draw(self, model: Primitives, view: View, background: Tensor, drawn: Callable[[Tensor], None] = lambda alpha: None) -> Tensor:
+        """(H, W, C) image of a view of an :meth:`applied` model, without gradients; on the processor.
+
+        Args:
+            drawn: called with the image's alpha.
+        """
         small = self.seen(view)
         with torch.no_grad():
-            drawn = render(model, small.camera, small.conditions, self.settings, background).rgb.cpu()
-        return self.enlarged(drawn, view.camera)
+            frame = render(model, small.camera, small.conditions, self.settings, background)
+        drawn(frame.alpha)
+        return self.enlarged(frame.rgb.cpu(), view.camera)
 
 
 def read_point(words: Sequence[str], usual: RenderSettings, model: Primitives) -> OperatingPoint:

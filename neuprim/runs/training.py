@@ -9,8 +9,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import torch
+
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint
+from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset
 from neuprim.core.errors import CheckpointError, RankError
 from neuprim.core.io.files import write_text
@@ -118,6 +121,12 @@ def _resume(fitted: Fitted, events: Events) -> None:
     if header.get("task") != config.task:
         raise CheckpointError(f"{saved}: written for task {header.get('task')!r}; this run's task is {config.task!r}")
     check_resumed(header.get("made_by"), config.made_by, saved)
+    was, now = World.of(header, str(saved)), fitted.dataset.world
+    if ("world" in header or fitted.dataset.placement is None) and not torch.equal(was.scene_from_world, now.scene_from_world):
+        origins = [w.world_points(torch.zeros(3, dtype=torch.float64)).tolist() for w in (was, now)]
+        raise CheckpointError(
+            f"{saved}: the scene's origin is {origins[0]} of the data's files, and now {origins[1]}; expected the same data"
+        )
     fitted.trainer.load_state(tensors, header, str(saved))
     events(Note(f"resumed at step {fitted.trainer.step}"))
 
@@ -186,7 +195,9 @@ def save(fitted: Fitted) -> None:
     trainer, config, dataset = fitted.trainer, fitted.config, fitted.dataset
     tensors, header = trainer.state()
     made_by = {} if config.made_by is None else {"made_by": config.made_by.to_dict()}
-    header = {"task": config.task, **made_by, **header}
+    world = dataset.world.to_json() if dataset.placement is None else {**dataset.placement.to_json(), **dataset.world.to_json()}
+    place = {} if dataset.world.identity and dataset.placement is None else {"world": world}
+    header = {"task": config.task, **made_by, **place, **header}
     files = [config.output_dir / f"{name}.safetensors" for name in ("checkpoint", "model")]
     if not trainer.ranks.parts:
         checkpoint.write(files[0], "checkpoint", tensors, header)
@@ -197,9 +208,8 @@ def save(fitted: Fitted) -> None:
         "data_source": dataset.data_source,
         "data": facts_of(fitted.task, dataset),
         **fitted.training,
+        **place,
     }
-    if dataset.placement is not None:
-        extra["world"] = dataset.placement.to_json()
     if not trainer.ranks.parts:
         checkpoint.save_model(files[1], trainer.model, config.task, extra, without_zeros=bool(trainer.zeros))
         return

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, orbit
+from neuprim.core.cameras.world import World
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.edge import EDGES
 from neuprim.core.model.fields import ConditionSpec, Field
@@ -92,6 +93,7 @@ def web_page(
     conditions: Sequence[Condition] = (),
     views: Sequence[PageView] = (),
     still: str = "",
+    world: World | None = None,
 ) -> WebPage:
     """A page of a model.
 
@@ -103,6 +105,7 @@ def web_page(
         linear: whether colours are linear light, and need the sRGB curve to be seen.
         views: the page begins with the first one.
         still: address of a picture to show where the page cannot draw.
+        world: the coordinates of the user's files, which the page says; all its numbers are the model's own.
 
     Raises:
         ConfigError: a field without a script for browsers, or no such level.
@@ -130,6 +133,7 @@ def web_page(
         "conditions": [_condition(one, views) for one in conditions],
         "views": [_view(view) for view in views],
         "still": bool(still),
+        **({} if world is None or world.identity else {"world": world.to_json()}),
         "home": camera_numbers(views[0].camera if views else _home(middle, radius, up)),
     }
     assets = resources.files(__package__).joinpath("assets")

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
@@ -67,6 +68,7 @@ def scene_page(
     task: str,
     data_source: str,
     level: int = 1,
+    world: World | None = None,
 ) -> WebPage:
     """See :func:`~neuprim.webpage.page.web_page`.
 
@@ -97,6 +99,7 @@ def scene_page(
         conditions=[Condition(spec, start[spec.name]) for spec in specs],
         views=views,
         still=still,
+        world=world,
     )
 
 

@@ -17,7 +17,8 @@ __all__ = ["exr_attributes"]
 
 def exr_attributes(camera: Camera, near: float) -> dict[str, Any]:
     """Attribute name -> value: ``worldToCamera``, ``worldToNDC``, ``screenWindowCenter`` and ``screenWindowWidth`` as the standard has them, and
-    in plain numbers ``neuprim:focalLength`` and ``neuprim:principalPoint`` (x, y, pixels), ``neuprim:near`` (camera z, scene units).
+    in float64, for cameras far from the origin, ``neuprim:worldToCamera``, and
+    in plain numbers ``neuprim:focalLength`` and ``neuprim:principalPoint`` (x, y, pixels), ``neuprim:near`` (camera z, units of the camera's position).
     """
     view = camera.viewmat.detach().double().cpu().numpy()
     up = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -32,6 +33,7 @@ def exr_attributes(camera: Camera, near: float) -> dict[str, Any]:
     )
     return {
         "worldToCamera": np.ascontiguousarray((up @ view).T, dtype=np.float32),
+        "neuprim:worldToCamera": np.ascontiguousarray((up @ view).T),
         "worldToNDC": np.ascontiguousarray((project @ view).T, dtype=np.float32),
         "screenWindowCenter": np.array([(width / 2 - camera.cx) / camera.fx, (camera.cy - height / 2) / camera.fy], np.float32),
         "screenWindowWidth": width / camera.fx,

@@ -60,7 +60,7 @@ def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = 
     wanted = size or _resolution(stage, path)
     records = list(stage.objects("frames"))
     cameras = [_camera(Record(r.values, where if len(records) == 1 else f"{where}, frame {i}"), wanted) for i, r in enumerate(records)]
-    note = f"{stage.text('up')} is up and a unit is {stage.number('meters', 'metres per unit', 0.0):g} m in this file; taken as the scene's own axes and units"
+    note = f"{stage.text('up')} is up and a unit is {stage.number('meters', 'metres per unit', 0.0):g} m in this file; taken as the axes and units of the run's data"
     fps = stage.number("fps", "time codes per second above 0", 0.0) if len(cameras) > 1 else None
     if fps is not None and not RATES[0] <= fps <= RATES[1]:  # some tools count in ticks
         note, fps = f"{note}; timeCodesPerSecond {fps:g} is no rate of a film, --fps says another", None

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.rays import AnyCamera, RayCamera
+from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, PointSamples, PointSupervision, View, ViewSet
 from neuprim.core.errors import DataError
 from neuprim.core.model.fields import ConditionSpec
@@ -167,6 +168,9 @@ def _members(dataset: Dataset) -> None:
         raise DatasetFault(f"{who}: points is {_described(dataset.points)}; expected a neuprim.core.data.PointSupervision, or None")
     if not isinstance(dataset.exposure, (int, float)) or not 0 < dataset.exposure < float("inf"):
         raise DatasetFault(f"{who}: exposure is {dataset.exposure!r}; expected a positive number")
+    if not isinstance(dataset.world, World):
+        raise DatasetFault(f"{who}: world is {_described(dataset.world)}; expected a {World.__module__}.World")
+    dataset.world.validate(f"{who}: world")
     if not isinstance(dataset.placement, Placement | None):
         raise DatasetFault(f"{who}: placement is {_described(dataset.placement)}; expected a {Placement.__module__}.Placement, or None")
 

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset, PointCloud, StartingPoints, camera_extent
 from neuprim.core.data.context import SceneContext
 from neuprim.core.data.focus import focus_point
 from neuprim.core.data.initial import initial_points
+from neuprim.core.data.place import world_around
 from neuprim.core.data.settings import FolderSettings
 from neuprim.core.data.views import ImageFrame, ImageViews
 from neuprim.core.errors import ConfigError, DataError
 
-__all__ = ["IMAGE_SUFFIXES", "every_nth", "find_image", "missing_files", "posed_images", "unique_names"]
+__all__ = ["IMAGE_SUFFIXES", "every_nth", "find_image", "in_scene", "missing_files", "posed_images", "unique_names"]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG", ".EXR")
 _LISTED = 10
@@ -81,6 +84,7 @@ def posed_images(
     to_linear: bool = False,
     exposure: float | Callable[[ImageViews], float] = 1.0,
     extra: object = None,
+    places: Sequence[str] = (),
 ) -> Dataset:
     """The data set of two splits, whose view sets are :class:`~neuprim.core.data.views.ImageViews`.
 
@@ -88,13 +92,14 @@ def posed_images(
         where: file or folder that errors name.
         settings: the common settings.
         up: (3,) upward direction; None takes the mean of the cameras' own.
-        points: starting points that the format brings, if any.
+        points: starting points that the format brings, if any, in the coordinates of the file, float64.
         prefix: reduction already in the files, e.g. "images_4".
         start: another rule for starting points; None takes ``points``, else the visual hull of the alpha masks, else a box in
             front of the cameras, which suits scenes at rest (:func:`neuprim.core.data.initial.initial_points`).
         to_linear: turn sRGB files into linear light.
         exposure: what linear values are divided by, or how that number follows from the training views.
         extra: see :class:`~neuprim.core.data.dataset.Dataset`.
+        places: conditions that are positions, in the coordinates of the file, float64.
 
     Raises:
         DataError: an empty split, an image without alpha beside one with, sRGB beside linear files, or damaged images.
@@ -118,6 +123,9 @@ def posed_images(
     if background == "random" and not alpha:
         raise ConfigError(f"scene.background is 'random', but the images in {where} have no alpha; expected auto, white or black")
     factor = settings.downsample
+    world = world_around([f.camera for f in both])
+    train, test = ([in_scene(f, world, places) for f in frames] for frames in (train, test))
+    points = None if points is None else points.within(world)
     views = [ImageViews(frames, factor, to_linear=to_linear) for frames in (train, test)]
     if settings.preload:
         for split, images in zip(("training", "test"), views, strict=True):
@@ -139,8 +147,15 @@ def posed_images(
         up=_mean_up([f.camera for f in train]) if up is None else up,
         center=focus_point(cameras).float(),
         exposure=divisor,
+        world=world,
         extra=extra,
     )
+
+
+def in_scene(frame: ImageFrame, world: World, places: Sequence[str]) -> ImageFrame:
+    """The frame with its camera and its conditions ``places`` in the scene's coordinates, subtracted in float64."""
+    moved = {name: world.scene_points(frame.conditions[name]).float() for name in places}
+    return replace(frame, camera=world.scene_camera(frame.camera), conditions={**frame.conditions, **moved})
 
 
 def _reduction(frames: Sequence[ImageFrame], reduced: Camera, factor: int) -> str:

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, final
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, orbit
+from neuprim.core.cameras.world import World
 from neuprim.core.compute import device as hardware
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Conditions
@@ -88,7 +90,7 @@ class PointCloud:
     """Points where matter probably is.
 
     Attributes:
-        means: (N, 3) scene units.
+        means: (N, 3) scene units; of a file that was just read, float64 world units (:meth:`within`).
         colors: (N, C) in the data set's colour space.
         conditions: condition name -> (N,) the value under which matter was found at each point, e.g. "time" -> times 0..1;
             empty for scenes without conditions.
@@ -115,6 +117,16 @@ class PointCloud:
         )
         found = {n: value[index] for n, value in self.conditions.items()}
         return PointCloud(self.means[index], self.colors[index], found, axes, quats, alphas, deviations, self.steps)
+
+    def within(self, world: World) -> PointCloud:
+        """The points of a file, in the scene's coordinates as float32; subtracted in float64, so ``means`` should be of a file in doubles."""
+        means = world.scene_points(self.means).float()
+        axes, deviations = (x if x is None or world.scale == 1.0 else x * world.scale for x in (self.axes, self.deviations))
+        quats = self.quats
+        if quats is not None and world.rotation is not None:
+            turned = Rotation.from_matrix(world.rotation.numpy()) * Rotation.from_quat(quats[:, [1, 2, 3, 0]].double().numpy())
+            quats = torch.from_numpy(turned.as_quat()[:, [3, 0, 1, 2]]).float()
+        return replace(self, means=means, axes=axes, deviations=deviations, quats=quats)
 
 
 @dataclass(frozen=True)
@@ -156,7 +168,8 @@ class Dataset:
         center: (3,) what the cameras look at, for orbits; the origin unless said.
         bounds: (2, 3) lower and upper corner of a box around everything, scene units; None if the data do not say.
         exposure: what the linear values of the files were divided by.
-        placement: how scene units follow from the world of the voxel files that the scene was made from; None without such files.
+        world: how all these coordinates follow from those of the user's files; the same unless said.
+        placement: which voxel files the scene was made from, in the same world; None without such files.
         points: points at which extinction and source radiance are known, for ``train.supervision=voxels`` and ``both``; None where they
             are not.
         extra: what else the scene's own task likes to know, of the class that this task names, e.g. what pixels show or what the images
@@ -178,6 +191,7 @@ class Dataset:
     center: Tensor = field(default_factory=lambda: torch.zeros(3))
     bounds: Tensor | None = None
     exposure: float = 1.0
+    world: World = field(default_factory=World)
     placement: Placement | None = None
     points: PointSupervision | None = None
     extra: object = None

@@ -18,10 +18,12 @@ __all__ = ["read_points"]
 
 _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _LARGEST = 1e6
+_FARTHEST = 1e12
+"""From the origin of the file's coordinates: the Earth's radius in millimetres is less."""
 
 
 def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
-    """The vertices of a PLY file as starting points, in the file's own coordinates.
+    """The vertices of a PLY file as starting points, in the file's own coordinates, float64.
 
     Properties ``x y z`` are required. Colours come from ``f_dc_0..2`` or from ``red green blue`` (bytes, or floats 0..1), both taken for
     sRGB; points without are mid-grey. ``scale_0..2`` (logarithms of standard deviations) with ``rot_0..3`` (wxyz) make Gaussians of them,
@@ -34,7 +36,7 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
         DataError: a damaged file, one without points, or values that are not finite or out of all proportion.
     """
     found = read_ply(path)
-    means = _numbers(found, ("x", "y", "z"), path)
+    means = _means(found, path)
     if means is None:
         raise DataError(f"{path}: no properties x, y, z; expected points")
     if not len(means):
@@ -68,6 +70,18 @@ def _colors(found: PlyVertices, path: Path) -> Tensor:
             kind = found.rows.dtype[names[0]]
             return (rgb / (np.iinfo(kind).max if kind.kind in "iu" else 1.0)).clamp(0, 1)
     return torch.full((len(found.rows), 3), 0.5)
+
+
+def _means(found: PlyVertices, path: Path) -> Tensor | None:
+    """(N, 3) float64, however far from the origin; None where the file has no points."""
+    if not {"x", "y", "z"} <= set(found.names):
+        return None
+    values = found.columns(("x", "y", "z"))
+    bad = ~(np.abs(values) <= _FARTHEST)
+    if bad.any():
+        row, column = (int(i) for i in np.argwhere(bad)[0])
+        raise DataError(f"{path}: {'xyz'[column]} of vertex {row} is {values[row, column]}; expected a number of at most {_FARTHEST:g}")
+    return torch.from_numpy(values)
 
 
 def _numbers(found: PlyVertices, names: tuple[str, ...], path: Path) -> Tensor | None:

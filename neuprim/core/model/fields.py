@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor
 
 from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.cameras.world import World
 from neuprim.core.model.forms import Constant, Cosine, LoweredColour, LoweredDensity, Opaque, OpaqueColour, RayNet, Shade, Shading
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pieces import Piece
@@ -61,6 +62,8 @@ class ConditionSpec:
         sweep: a text of ``--NAME TEXT`` that animates the condition, for the commands a report offers; empty: none.
         in_frames: (text, count) -> the text that means the same in so many frames, where the text does not say itself how many; None
             where it does. So an animation without a length takes that of another one beside it. Not asked about ranges of numbers.
+        place: for conditions that are positions: ``parse`` of a text whose numbers are in the world of the user's files, (text, world) ->
+            values in scene units; see :meth:`within`.
     """
 
     name: str
@@ -71,6 +74,16 @@ class ConditionSpec:
     strict: bool = False
     sweep: str = ""
     in_frames: Callable[[str, int], str | None] = lambda text, count: None
+    place: Callable[[str, World], list[Tensor]] | None = None
+
+    def within(self, world: World) -> ConditionSpec:
+        """The condition of a model whose scene lies in ``world``: positions that users write are in the coordinates of their files."""
+        place = self.place
+        return self if place is None or world.identity else replace(self, parse=lambda text: place(text, world))
+
+    def given(self, value: Tensor, world: World) -> Tensor:
+        """A value as users write and read it: float64 world coordinates of a position."""
+        return value if self.place is None else world.world_points(value)
 
 
 # ---------------------------------------------------------------- fields

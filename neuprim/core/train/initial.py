@@ -27,8 +27,8 @@ _USUAL_OPACITY = 0.5
 def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, settings: ModelSettings, seed: int) -> Primitives:
     """Primitives on the data set's starting points, as large as their neighbours are far (RMS distance to the 3 nearest).
 
-    ``model.init.points``: "matter" (the data set's own), "box" (anywhere in its box), or a .ply file of points or 3D Gaussians;
-    the latter bring sizes, orientations and opacities of their own. ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``:
+    ``model.init.points``: "matter" (the data set's own), "box" (anywhere in its box), or a .ply file of points or 3D Gaussians in the
+    coordinates of the data's files; the latter bring sizes, orientations and opacities of their own. ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``:
     share of the primitives that start where views show something and the data set has no points, for photographs; 0 unless said.
 
     Raises:
@@ -42,7 +42,7 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
     generator = torch.Generator().manual_seed(seed)
     where = settings.init.get("points", "matter")
     if isinstance(where, str) and where.lower().endswith(".ply"):
-        points = read_points(Path(where).expanduser(), dataset.channels, dataset.color_space)
+        points = read_points(Path(where).expanduser(), dataset.channels, dataset.color_space).within(dataset.world)
         cloud = subset(points, settings.primitives, generator)
     elif where in ("matter", "box"):
         cloud = (dataset.uniform_points if where == "box" else dataset.initial_points)(settings.primitives, generator)

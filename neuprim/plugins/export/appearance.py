@@ -43,6 +43,14 @@ class Harmonics:
         mixed = basis[:, :1] * self.dc[rows] + (basis[:, 1:, None] * self.rest[rows]).sum(1)
         return (mixed + 0.5).clamp_min(0.0)
 
+    def turned(self, rotation: Tensor | None) -> Harmonics:
+        """The same colours on axes that are turned by ``rotation`` (3, 3): exact, as every band is closed under rotation."""
+        if rotation is None:
+            return self
+        directions = sphere(_DIRECTIONS)
+        after, before = (sh.basis(d, _DEGREE)[:, 1:] for d in (directions @ rotation.T, directions))
+        return Harmonics(self.dc, torch.einsum("bk,nkc->nbc", torch.linalg.pinv(after) @ before, self.rest), self.residual)
+
     def picked(self, channels: tuple[int, ...]) -> Harmonics:
         """The same with these channels alone, in this order."""
         index = list(channels)

@@ -1,7 +1,7 @@
 """``gaussian-ply``: one Gaussian per primitive in the layout of 3D Gaussian splatting, for its viewers; lossy.
 
-Binary little-endian vertices of floats ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``: centre in scene units,
-normals 0, SH coefficients of degree 3 (``f_rest`` channel by channel: 15 of red, 15 of green, 15 of blue), logit of the opacity,
+Binary little-endian vertices of floats ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``: centre in the
+coordinates of the run's data (``double x y z`` where float32 would lose more than 1e-4 of the scene's size, as in UTM), normals 0, SH coefficients of degree 3 (``f_rest`` channel by channel: 15 of red, 15 of green, 15 of blue), logit of the opacity,
 natural logarithm of the standard deviations, quaternion wxyz. How the Gaussians are fitted: :mod:`neuprim.plugins.export.gaussians`.
 Colours are those of the model in its own colour space; viewers show numbers as sRGB. A grey model is written as three equal channels;
 other channels than red, green and blue are refused. A model that depends on time or light is written
@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuprim.core.cameras.world import World
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
@@ -46,6 +47,9 @@ LAYOUT = (
     *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 
+_LOST = 1e-4
+"""Of the size of the cloud of centres: what float32 may round them by."""
+
 
 def _write(job: ExportJob) -> ExportReport:
     size, which = job.choice("size", "auto", *SIZES), job.choice("views", "auto", "test", "orbit")
@@ -60,12 +64,16 @@ def _write(job: ExportJob) -> ExportReport:
     scores = {name: _psnrs(job, fit, colours, images, rgb, name) for name, fit in fits.items()}
     size = max(scores, key=lambda name: float(np.mean(scores[name])))
     gaussians, errors = fits[size], {"psnr": float(np.mean(scores[size])), "psnr_worst": float(np.min(scores[size]))}
-    write_ply(job.out, _rows(gaussians, colours), ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"])
+    rows = _rows(gaussians, colours, job.run.world)
+    write_ply(job.out, rows, ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"])
     space = channels.color_space
     notes = [
         f"{len(gaussians.means)} Gaussians, size={size}; PSNR of them drawn as the 3DGS rasteriser does, against the model's images, {seen}, {space} values",
-        "axes and units are the scene's; degree 3 harmonics",
+        "axes and units are those of the run's data; degree 3 harmonics",
     ]
+    if rows.dtype["x"] == np.float64:
+        kept = float(np.spacing(np.abs(np.stack([rows[axis] for axis in "xyz"])).max().astype(np.float32)))
+        notes.append(f"x y z are double: the coordinates are so large that a program which takes them for float rounds them to {kept:.2g}")
     if colours.residual > 0:
         notes.append(f"the model's colours are no harmonics of the view; fitted at the centres with an RMS error of {colours.residual:.2g}")
     if channels.own is not None:
@@ -77,7 +85,9 @@ def _write(job: ExportJob) -> ExportReport:
     return ExportReport((job.out,), False, errors, tuple(notes))
 
 
-def _rows(gaussians: Gaussians, colours: Harmonics) -> np.ndarray:
+def _rows(gaussians: Gaussians, colours: Harmonics, world: World) -> np.ndarray:
+    """The vertices, in the world of the user's files; centres in doubles where that world is too far away for floats."""
+    gaussians, colours = gaussians.within(world.inverse), colours.turned(world.inverse.rotation)
     scales, quats = gaussians.axes()
     opacity = gaussians.opacities.numpy()
     rest = colours.rest[gaussians.rows].transpose(1, 2).reshape(-1, 45).numpy()
@@ -86,7 +96,9 @@ def _rows(gaussians: Gaussians, colours: Harmonics) -> np.ndarray:
     table = np.concatenate(
         [gaussians.means.numpy(), zero, colours.dc[gaussians.rows].numpy(), rest, logit[:, None], np.log(scales), quats], axis=1
     )
-    rows = np.empty(len(table), [(name, "<f4") for name in LAYOUT])
+    lost = np.abs(table[:, :3].astype(np.float32) - table[:, :3]).max()
+    place = "<f8" if lost > _LOST * np.ptp(table[:, :3], axis=0).max() else "<f4"
+    rows = np.empty(len(table), [(name, place if name in ("x", "y", "z") else "<f4") for name in LAYOUT])
     for i, name in enumerate(LAYOUT):
         rows[name] = table[:, i]
     return rows

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.cameras.world import World
 from neuprim.core.extensions import TrainedModel
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.geometry import Geometry
@@ -44,6 +45,13 @@ class Gaussians:
     covariances: Tensor
     opacities: Tensor
     rows: Tensor
+
+    def within(self, world: World) -> Gaussians:
+        """The same in the scene of ``world``, where these are in the world; of an identity these."""
+        if world.identity:
+            return self
+        linear = world.scene_from_world[:3, :3]
+        return replace(self, means=world.scene_points(self.means), covariances=linear @ self.covariances @ linear.T)
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
         """(M, 3) standard deviations, and (M, 4) quaternions wxyz of the axes."""

@@ -65,6 +65,7 @@ def _write(job: ExportJob) -> ExportReport:
         task=run.task.name,
         data_source=str(run.header.get("data_source", "real")),
         level=level,
+        world=run.world,
     )
     job.progress("measuring", 0.7)
     errors = {} if level == 0 else {"psnr": _error(job, page.model, views, start)}

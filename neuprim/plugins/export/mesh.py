@@ -7,8 +7,8 @@ optical depth passes ln 2, and shows matter if its densest voxel passes the leve
 piece's area are left out.
 
 A vertex has the mean colour of the primitives around it, weighted by their density there, seen from outside along its normal.
-Coordinates are scene units on scene axes; a .glb is turned from z up to glTF's y up (``up=y`` for scenes that are y up already), as
-its readers turn it back. Colours are sRGB in .ply and .obj and linear in .glb, as glTF wants them; they are what the
+Coordinates are those of the run's data; a .glb is turned from z up to glTF's y up (``up=y`` for data that are y up already), as its
+readers turn it back, and has what moves it far from the origin in its node, as its vertices are float32. A .ply has ``double x y z`` there. Colours are sRGB in .ply and .obj and linear in .glb, as glTF wants them; they are what the
 task's display shows, or red, green and blue, or grey. Other channels are refused.
 
 The error is the intersection over union of silhouettes against where the model's alpha passes one half, over views of an orbit.
@@ -26,6 +26,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from neuprim.core.cameras.world import World
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
 from neuprim.core.io import images
@@ -45,7 +46,7 @@ OPTIONS = {
     "level": (None, "extinction of the surface, 1/scene unit (default: the silhouettes that agree best with the opaque parts)"),
     "smooth": (1.0, "standard deviation of the blur before contouring, voxels, 0 to 4"),
     "keep": (0.01, "least area of a piece, as a part of the largest one's"),
-    "up": ("z", "upward axis of the scene, z or y; only .glb files are turned by it"),
+    "up": ("z", "upward axis of the data, z or y; only .glb files are turned by it"),
 }
 _SUFFIXES = (".glb", ".ply", ".obj")
 _CHUNK = 2_000_000
@@ -83,7 +84,7 @@ def _write(job: ExportJob) -> ExportReport:
     colours = torch.from_numpy(_colours(job, conditions, seen, np.array(mesh.vertices), np.array(mesh.vertex_normals))).float()
     colours = channels.display_rows(colours) if rgb is None else colours[:, list(rgb)]
     iou = _silhouettes(job, conditions, mesh)
-    _save(mesh, colours, "srgb" if rgb is None else channels.color_space, path, up)
+    _save(mesh, colours, "srgb" if rgb is None else channels.color_space, path, up, job.run.world)
     notes.append(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles; {dropped} small pieces left out")
     notes.append("colours: of the primitives around each vertex, weighted by density, seen along the normal from outside")
     if channels.shown:
@@ -194,7 +195,7 @@ def _colours(job: ExportJob, conditions: Conditions, colours: Harmonics, points:
     return result
 
 
-def _save(mesh: Any, colours: Tensor, space: str, path: Path, up: str) -> None:
+def _save(mesh: Any, colours: Tensor, space: str, path: Path, up: str, world: World) -> None:
     import trimesh
 
     suffix, values = path.suffix.lower(), colours.clamp(0, 1)
@@ -205,11 +206,38 @@ def _save(mesh: Any, colours: Tensor, space: str, path: Path, up: str) -> None:
     opaque = np.concatenate([values.numpy(), np.ones((len(values), 1), np.float32)], 1)
     written = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.vertex_normals, process=False)
     written.visual = trimesh.visual.ColorVisuals(written, vertex_colors=np.round(opaque * 255).astype(np.uint8))
+    matrix = world.world_from_scene.numpy()
+    linear, offset = np.eye(4), matrix[:3, 3]
+    linear[:3, :3] = matrix[:3, :3]
     if suffix == ".glb" and up == "z":
-        written.apply_transform(_TO_GLTF)
-    data: Any = written.export(file_type=suffix[1:])
+        linear, offset = _TO_GLTF @ linear, _TO_GLTF[:3, :3] @ offset
+    if (linear != np.eye(4)).any():
+        written.apply_transform(linear)
+    data: Any = _far(written, suffix, offset) if offset.any() else written.export(file_type=suffix[1:])
     with atomic_path(path) as temporary:
         temporary.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
+
+
+def _far(mesh: Any, suffix: str, offset: np.ndarray) -> Any:
+    """The file's content with its vertices moved by ``offset`` (3,) float64, which none of them is rounded by."""
+    import trimesh
+
+    if suffix == ".glb":
+        scene = trimesh.Scene()
+        scene.add_geometry(mesh, transform=trimesh.transformations.translation_matrix(offset))
+        return scene.export(file_type="glb")
+    points = np.asarray(mesh.vertices, np.float64) + offset
+    if suffix == ".obj":
+        mesh.vertices = points
+        return mesh.export(file_type="obj")
+    head, body = mesh.export(file_type="ply").split(b"end_header\n", 1)
+    rest = f"V{4 * head.count(b'property float n') + head.count(b'property uchar')}"
+    rows = np.frombuffer(body, [("place", "<f4", 3), ("rest", rest)], len(points))
+    wide = np.empty(len(points), [("place", "<f8", 3), ("rest", rest)])
+    wide["place"], wide["rest"] = points, rows["rest"]
+    return head.replace(
+        b"property float x\nproperty float y\nproperty float z", b"property double x\nproperty double y\nproperty double z"
+    ) + (b"end_header\n" + wide.tobytes() + body[rows.nbytes :])
 
 
 # ---------------------------------------------------------------- error

@@ -1,7 +1,7 @@
 """``npz``: the model itself as numpy arrays; lossless.
 
 ``numpy.load(FILE, allow_pickle=False)`` gives one float32 array (N, ...) per parameter under its own name, and ``header``, a text of
-JSON: the model's header, the shapes of the parameters and the text of the run's ``config.yaml``, paths to its data included. ``neuprim
+JSON: the model's header (where "world" has ``scene_from_world``, if the arrays are in other coordinates than the run's data), the shapes of the parameters and the text of the run's ``config.yaml``, paths to its data included. ``neuprim
 import`` reads it back bit for bit.
 """
 

@@ -1,7 +1,7 @@
 """``ply``: the model itself, every parameter as a vertex property; lossless.
 
-A binary little-endian PLY of one vertex per primitive. Properties, all ``float``: ``x y z``, a copy of the centres for programs that
-show points; then every number of every parameter, as stored (logarithms of semi-axes, unnormalised quaternions wxyz, SH
+A binary little-endian PLY of one vertex per primitive. Properties: ``x y z``, the centres in the coordinates of the run's data for programs
+that show points, ``double`` where these differ from the model's own; then, all ``float`` and in the model's own coordinates, every number of every parameter, as stored (logarithms of semi-axes, unnormalised quaternions wxyz, SH
 coefficients), named PARAMETER_INDEX with the index counted row by row: ``means_0`` to ``means_2``, ``W1_0`` to ``W1_23``. One line
 ``comment neuprim {...}`` of JSON holds the model's header (task, field classes and their settings, background, colour space), the
 shapes of the parameters and the text of the run's ``config.yaml``, paths to its data included. ``neuprim import`` reads it back bit for
@@ -27,11 +27,12 @@ _MARK = "neuprim "
 
 
 def _write(job: ExportJob) -> ExportReport:
-    columns = {axis: job.run.model.params["means"].detach()[:, i].numpy() for i, axis in enumerate("xyz")}
+    centers = job.run.world.world_points(job.run.model.params["means"].detach())
+    columns = {axis: centers[:, i].numpy() for i, axis in enumerate("xyz")}
     for name, value in job.run.model.params.items():
         flat = value.detach().float().reshape(job.run.model.count, -1).numpy()
         columns |= {f"{name}_{i}": flat[:, i] for i in range(flat.shape[1])}
-    rows = np.empty(job.run.model.count, [(name, "<f4") for name in columns])
+    rows = np.empty(job.run.model.count, [(name, column.dtype) for name, column in columns.items()])
     for name, column in columns.items():
         rows[name] = column
     write_ply(job.out, rows, [_MARK + pack_header(job)])

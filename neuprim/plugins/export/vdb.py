@@ -2,8 +2,8 @@
 
 Grid ``density`` is the sum over primitives of their density clamped at 0, at the voxels' centres; what is below ``threshold`` is not
 stored (background 0, inactive). A model that was fitted to .vdb files is written on the voxels and in the units of these files, frame
-by frame, so that both overlay each other; else in scene units on cubic voxels whose lattice has a corner of its index space in the
-scene's origin, one lattice for all frames. Axes are those of the data; nothing is turned.
+by frame, so that both overlay each other; else in the coordinates of the run's data on cubic voxels whose lattice has a corner of its
+index space in the scene's origin, one lattice for all frames. Axes are those of the data; nothing is turned.
 
 Units (metadata ``neuprim_units``): ``source``: sigma divided by the extinction per unit of the file's grid, as the scene's look has
 it; ``world``: extinction per world unit of the file, what a volume shader multiplies with a length; ``scene``: extinction per scene
@@ -65,7 +65,7 @@ def _write(job: ExportJob) -> ExportReport:
         units = "source" if placement else "world"
     if units == "source" and placement is None:
         raise ConfigError("units=source: the model's header names no .vdb files; expected world or scene")
-    scene_from_world = placement.scene_from_world if placement else np.eye(4)
+    scene_from_world = job.run.world.scene_from_world.numpy() if placement is None else placement.scene_from_world
     per_world = abs(np.linalg.det(scene_from_world[:3, :3])) ** (1 / 3)
     factor = {"source": 1 / placement.sigma_per_unit if placement else 1.0, "world": per_world, "scene": 1.0}[units]
     box = np.stack([v.numpy() for v in model_box(job, [f.conditions for f in frames])])
@@ -73,7 +73,7 @@ def _write(job: ExportJob) -> ExportReport:
     threshold = 1e-3 / float((box[1] - box[0]).max()) * factor if threshold is None else threshold
     name = str(job.options["name"])
     own = job.number("grid") is None and job.number("voxel_size") is None and source is not None
-    fallback = _transform(job, box, scene_from_world)
+    fallback = _transform(job, box, scene_from_world, np.zeros(3) if placement else job.run.world.world_from_scene[:3, 3].numpy())
     metadata = {"neuprim_units": units, "neuprim_sigma_per_unit": 1 / factor, "neuprim_threshold": threshold}
     errors: dict[str, float] = {}
     for i, (frame, path) in enumerate(zip(frames, paths, strict=True)):
@@ -95,7 +95,11 @@ def _write(job: ExportJob) -> ExportReport:
     notes.append(f"grid {name!r} is {said[units]}: extinction per scene unit = value x {1 / factor:g}; clamped at 0 per primitive")
     if placement is not None and not placement.exact and units == "source":
         notes.append(f"the look adds extinction of other grids to {what!r}, so the density holds these too, in the units of {what!r}")
-    where = "the source's own voxels and world" if own else "cubic voxels in " + ("the source's world" if placement else "scene units")
+    where = (
+        "the source's own voxels and world"
+        if own
+        else "cubic voxels in " + ("the source's world" if placement else "the coordinates of the run's data")
+    )
     notes.append(f"on {where}; values below {threshold:.3g} are left out")
     if errors:
         notes.append(
@@ -120,7 +124,7 @@ def _origin(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Placemen
     if source is not None:
         return source, source.placement, notes
     record = job.run.header.get("world")
-    if isinstance(record, dict):
+    if isinstance(record, dict) and "grid" in record:
         return None, Placement.from_json(record, str(job.run.directory / "model.safetensors")), notes
     return None, None, notes
 
@@ -164,13 +168,13 @@ def _paths(job: ExportJob, frames: list[_GridFrame]) -> list[Path]:
     return [job.out / f"density_{f.number:0{width}d}.vdb" for f in frames]
 
 
-def _transform(job: ExportJob, box: np.ndarray, scene_from_world: np.ndarray) -> np.ndarray:
-    """(4, 4) index to world of the user's voxels, with the origin of both in one place."""
+def _transform(job: ExportJob, box: np.ndarray, scene_from_world: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(4, 4) index to world of the user's voxels, with the origin of index space at ``origin`` (3,) of the world."""
     count, size = job.count("grid", 8, 2048), job.number("voxel_size", 1e-9, 1e9)
     if count is not None and size is not None:
         raise ConfigError("grid and voxel_size: expected one of them")
     corners = np.linalg.inv(scene_from_world)[:3, :3] @ (box[1] - box[0])
-    return scale_transform(size or float(np.abs(corners).max()) / (count or 128))
+    return scale_transform(size or float(np.abs(corners).max()) / (count or 128), origin.tolist())
 
 
 # ---------------------------------------------------------------- sampling
@@ -191,7 +195,7 @@ def sampled_grid(
     try:
         low, high = (v.numpy() for v in model_box(job, [conditions]))
     except ConfigError:  # nothing lives in this frame: an empty grid is a frame too
-        low = high = scene_from_world[:3, 3]
+        low = high = (scene_from_world @ transform)[:3, 3]
     scene_from_index = scene_from_world @ transform
     corners = np.stack(np.meshgrid(*np.stack([low, high], -1), indexing="ij"), -1).reshape(-1, 3)
     back = np.linalg.inv(scene_from_index)

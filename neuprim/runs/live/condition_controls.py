@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neuprim.core.cameras.world import World
 from neuprim.core.conditions import flag, read_conditions
 from neuprim.core.errors import NeuprimError
 from neuprim.core.model.fields import ConditionSpec
@@ -22,9 +23,10 @@ _WIDE = 1e4
 _FPS = 12.0
 
 
-def shown(value: Tensor) -> str:
+def shown(spec: ConditionSpec, value: Tensor, world: World) -> str:
     """A condition's value as one types it."""
-    return ",".join(f"{x:.4g}" for x in value.flatten().tolist())
+    digits = 4 if spec.place is None or world.identity else 10
+    return ",".join(f"{x:.{digits}g}" for x in spec.given(value, world).flatten().tolist())
 
 
 class ConditionControls:
@@ -48,7 +50,7 @@ class ConditionControls:
         if not spec.shape and high - low <= _WIDE:
             slider = gui.add_slider(name, low, high, (high - low) / 1000, float(self._value(spec).clamp(low, high)))
             slider.on_update(lambda _: self._slid(spec, slider.value))
-        text = gui.add_text(flag(name), shown(self._value(spec)), hint=f"{spec.unit}; as `neuprim render` takes it")
+        text = gui.add_text(flag(name), self._shown(spec, self._value(spec)), hint=f"{spec.unit}; as `neuprim render` takes it")
         handle = self._handle(spec)
         play = gui.add_checkbox(f"play {name}", False, hint=f"{flag(name)} {spec.sweep}, or the values above where they are several")
 
@@ -57,14 +59,17 @@ class ConditionControls:
             near = float(value.clamp(low, high)) if slider is not None else 0.0
             if slider is not None and not math.isclose(slider.value, near, abs_tol=1e-6):
                 slider.value = near
-            if text.value != shown(value) and not play.value and not typed:  # a text of several values stays as it was typed
-                text.value = shown(value)
+            if text.value != self._shown(spec, value) and not play.value and not typed:  # a text of several values stays as it was typed
+                text.value = self._shown(spec, value)
             if handle is not None:
                 handle.position = tuple(value.tolist())
 
         self._shows[name] = show
         text.on_update(lambda _: self._typed(spec, text.value))
         play.on_update(lambda _: self._play(spec, text.value, play) if play.value else None)
+
+    def _shown(self, spec: ConditionSpec, value: Tensor) -> str:
+        return shown(spec, value, self.session.subject.world)
 
     def _value(self, spec: ConditionSpec) -> Tensor:
         return self.session.conditions[spec.name]
@@ -88,7 +93,7 @@ class ConditionControls:
             self._set(spec, torch.tensor(value, dtype=torch.float32))
 
     def _typed(self, spec: ConditionSpec, text: str) -> None:
-        if text == shown(self._value(spec)):
+        if text == self._shown(spec, self._value(spec)):
             return
         try:
             self._set(spec, self._read(spec, text)[0], typed=True)

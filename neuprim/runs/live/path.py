@@ -14,6 +14,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
+from neuprim.core.cameras.world import World
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.files import write_json
 from neuprim.core.model.fields import ConditionSpec
@@ -94,8 +95,8 @@ class CameraPath:
                 frame[spec.name] = part.float()
         return frames
 
-    def to_json(self, size: tuple[int, int]) -> dict[str, Any]:
-        """What :func:`~neuprim.core.cameras.file.read_cameras` reads, one frame per image of the film.
+    def to_json(self, size: tuple[int, int], world: World) -> dict[str, Any]:
+        """What :func:`~neuprim.core.cameras.file.read_cameras` reads, one frame per image of the film, in the coordinates of ``world``.
 
         Raises:
             ConfigError: there is no key.
@@ -105,15 +106,15 @@ class CameraPath:
             "w": width,
             "h": height,
             "fps": self.fps,
-            "frames": [_frame(pose, size) for pose in self.poses(self.frames)],
+            "frames": [_frame(pose, size, world) for pose in self.poses(self.frames)],
         }
 
-    def write(self, path: Path, size: tuple[int, int]) -> None:
+    def write(self, path: Path, size: tuple[int, int], world: World) -> None:
         """Write the file, whole or not at all, with images of ``size`` (width, height) pixels."""
-        write_json(path, self.to_json(size))
+        write_json(path, self.to_json(size, world))
 
 
-def condition_texts(frames: Sequence[Mapping[str, Tensor]], specs: Sequence[ConditionSpec]) -> dict[str, str]:
+def condition_texts(frames: Sequence[Mapping[str, Tensor]], specs: Sequence[ConditionSpec], world: World) -> dict[str, str]:
     """What ``neuprim render`` is given for the conditions of a film's frames: ``{"time": "0,0.1,0.2"}``, or one value where they are equal.
 
     Raises:
@@ -126,13 +127,16 @@ def condition_texts(frames: Sequence[Mapping[str, Tensor]], specs: Sequence[Cond
         if not same and math.prod(spec.shape) != 1:
             raise ConfigError(f"{spec.name}: changes along the path; a film has one {spec.name}, or several that are single numbers")
         shown = values[:1] if same else values
-        texts[spec.name] = ",".join(f"{x:.6g}" for value in shown for x in value.flatten().tolist())
+        digits = 6 if spec.place is None or world.identity else 12
+        texts[spec.name] = ",".join(f"{x:.{digits}g}" for value in shown for x in spec.given(value, world).flatten().tolist())
     return texts
 
 
-def _frame(pose: Pose, size: tuple[int, int]) -> dict[str, Any]:
+def _frame(pose: Pose, size: tuple[int, int], world: World) -> dict[str, Any]:
     """A frame of the file: camera-to-world with OpenGL axes, focal length in pixels."""
     width, height = size
+    if not world.identity:
+        pose = Pose.of(world.world_camera(pose.camera(width, height)))
     matrix = np.eye(4)
     matrix[:3, :3] = pose.rotation.as_matrix() @ np.diag([1.0, -1.0, -1.0])
     matrix[:3, 3] = pose.position

@@ -151,10 +151,11 @@ class PathControls:
     def _written(self) -> tuple[Path, dict[str, str]]:
         """The file of cameras; and the texts of the conditions along it."""
         specs = self.session.subject.task.conditions
-        texts = condition_texts(self.path.conditions(specs, self.path.frames), specs)
+        world = self.session.subject.world
+        texts = condition_texts(self.path.conditions(specs, self.path.frames), specs, world)
         file = free_name(self.run_dir / "cameras" / "path.json")
         file.parent.mkdir(exist_ok=True)
-        self.path.write(file, self._size_asked())
+        self.path.write(file, self._size_asked(), world)
         more = [word for name, text in texts.items() for word in (flag(name), text)]
         if any(len(word) > 80 for word in more):
             self.session.tell(f"{file}")

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, orbit
+from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels
 from neuprim.core.data import Dataset, View
 from neuprim.core.io.images import to_uint8
@@ -51,6 +52,7 @@ class Subject:
         background: (C,) behind everything.
         up: (3,) upward in the scene.
         center: (3,) its middle, which a camera turns around.
+        world: in whose coordinates a person types and reads positions, and files of cameras are written; everything else here is the scene's.
         dataset: for held-out views; None where its files are gone.
         front: of ``neuprim tradeoff``, where that was run.
     """
@@ -63,6 +65,7 @@ class Subject:
     background: Tensor
     up: tuple[float, float, float]
     center: np.ndarray
+    world: World = field(default_factory=World)
     dataset: Dataset | None = None
     front: Front = field(default_factory=Front)
     _kept: dict[tuple[object, ...], Primitives] = field(default_factory=dict)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
@@ -142,5 +143,6 @@ class LiveTraining:
     def _subject(self, fitted: Fitted) -> Subject:
         dataset = fitted.dataset
         x, y, z = (float(value) for value in dataset.up)
-        own = (fitted.task, lambda: fitted.trainer.model, fitted.channels, fitted.trainer.renderer, dataset.background, (x, y, z))
-        return Subject(self.config.output_dir.name, *own, center=np.asarray(dataset.center.numpy()), dataset=dataset)
+        task = replace(fitted.task, conditions=tuple(spec.within(dataset.world) for spec in fitted.task.conditions))
+        own = (task, lambda: fitted.trainer.model, fitted.channels, fitted.trainer.renderer, dataset.background, (x, y, z))
+        return Subject(self.config.output_dir.name, *own, center=np.asarray(dataset.center.numpy()), world=dataset.world, dataset=dataset)

@@ -12,6 +12,7 @@ import torch
 
 from neuprim.config import suspects_of
 from neuprim.config.viewer import ViewerSettings
+from neuprim.core.cameras.world import World
 from neuprim.core.channels import stored_channels
 from neuprim.core.data import Dataset
 from neuprim.core.errors import NeuprimError
@@ -59,7 +60,7 @@ def open_subject(
         up, center = dataset.up, dataset.center
     x, y, z = (float(value) for value in up)
     own = (task, now, channels, config.renderer, background, (x, y, z), np.asarray(center.double().numpy()))
-    return Subject(run_dir.resolve().name, *own, dataset=dataset, front=read_front(run_dir, tell))
+    return Subject(run_dir.resolve().name, *own, World.of(header, str(run_dir)), dataset=dataset, front=read_front(run_dir, tell))
 
 
 def _fact(header: Mapping[str, Any], name: str, otherwise: torch.Tensor) -> torch.Tensor:

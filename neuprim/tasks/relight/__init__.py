@@ -90,7 +90,12 @@ TASK = TaskSpec(
     check=_check,
     trade=_trade,
     conditions=(
-        ConditionSpec("light", (3,), "position, scene units", (-1e6, 1e6), parse_lights, sweep="orbit", in_frames=orbit_in_frames),
+        ConditionSpec(
+            *("light", (3,), "position, scene units", (-1e6, 1e6), parse_lights),
+            sweep="orbit",
+            in_frames=orbit_in_frames,
+            place=parse_lights,
+        ),
         ConditionSpec("light_intensity", (3,), "radiometric", (0.0, 1e6), parse_intensities),
     ),
     fields={"CosineDensity": CosineDensity, "LightNetwork": LightNetwork, "LightHarmonics": LightHarmonics},

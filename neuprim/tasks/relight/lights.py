@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 
@@ -16,8 +17,9 @@ ORBIT = (4.5, 40.0, 60)
 """Distance in scene units, polar angle in degrees and frames of ``--light orbit``."""
 
 
-def parse_lights(text: str) -> list[Tensor]:
-    """Positions (3,) float32 in scene units: "x,y,z" is one; "orbit", or "orbit:DISTANCE:POLAR:FRAMES", goes round the z axis.
+def parse_lights(text: str, world: World | None = None) -> list[Tensor]:
+    """Positions (3,) float32 in scene units: "x,y,z" is one, in the coordinates of the data's files; "orbit", or
+    "orbit:DISTANCE:POLAR:FRAMES", goes round the scene's z axis.
 
     Raises:
         ConfigError: another form, or numbers that are not finite.
@@ -35,7 +37,7 @@ def parse_lights(text: str) -> list[Tensor]:
         across, height = distance * math.sin(math.radians(polar)), distance * math.cos(math.radians(polar))
         turns = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / frames)
         return list(torch.stack([across * turns.cos(), across * turns.sin(), torch.full_like(turns, height)], -1).float())
-    return [_numbers(text, "light", expected)]
+    return [(world or World()).scene_points(_numbers(text, "light", expected)).float()]
 
 
 def orbit_in_frames(text: str, count: int) -> str | None:
@@ -53,7 +55,7 @@ def parse_intensities(text: str) -> list[Tensor]:
         ConfigError: another form, or numbers that are negative or not finite.
     """
     expected = "expected r,g,b or one number, 0 or more"
-    found = _numbers(f"{text},{text},{text}" if "," not in text else text, "light-intensity", expected)
+    found = _numbers(f"{text},{text},{text}" if "," not in text else text, "light-intensity", expected).float()
     if bool((found < 0).any()):
         raise ConfigError(f"--light-intensity {text}: {expected}")
     return [found]
@@ -66,7 +68,7 @@ def _numbers(text: str, name: str, expected: str) -> Tensor:
         values = []
     if len(values) != 3 or not all(math.isfinite(v) for v in values):
         raise ConfigError(f"--{name} {text}: {expected}")
-    return torch.tensor(values)
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def typical_light(dataset: Dataset, falloff: bool) -> float:

@@ -79,6 +79,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         to_linear=True,
         exposure=(lambda views: bright(views, str(folder))) if asked.exposure == "auto" else asked.exposure,
         extra=Lighting(asked.falloff),
+        places=("light",),
     )
 
 
@@ -105,7 +106,7 @@ def read_split(folder: Path, split: str, ignore_corrections: bool = False) -> li
         info = image_info(file)
         fx, fy, cx, cy = _intrinsics(record, document, file, info)
         camera = Camera(_viewmat(record, ignore_corrections), fx, fy, cx, cy, info.width, info.height)
-        light = {"light": record.array("pl_pos", (3,), "the point light's position, 3 numbers").float()}
+        light = {"light": record.array("pl_pos", (3,), "the point light's position, 3 numbers")}
         light["light_intensity"] = _intensity(record if record.has("pl_intensity") else document)
         frames.append(ImageFrame(name, file, camera.validate(record.where), info, conditions=light))
     return frames

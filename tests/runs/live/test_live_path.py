@@ -11,6 +11,7 @@ import torch
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.file import read_cameras
+from neuprim.core.cameras.world import World
 from neuprim.core.errors import ConfigError
 from neuprim.runs.live.film import free_name
 from neuprim.runs.live.path import CameraPath, Key, condition_texts
@@ -66,7 +67,7 @@ def test_keys_change_places_and_one_is_a_still() -> None:
 
 def test_the_file_is_one_that_render_reads(tmp_path: Path) -> None:
     path = CameraPath(keys(-1.0, 1.0), seconds=1.0, fps=6.0)
-    path.write(tmp_path / "path.json", (80, 60))
+    path.write(tmp_path / "path.json", (80, 60), World())
     found = [camera for _, camera in read_cameras(tmp_path / "path.json")]
     assert len(found) == 6 and (found[0].width, found[0].height) == (80, 60)
     for pose, one in zip(path.poses(6), found, strict=True):
@@ -78,8 +79,8 @@ def test_conditions_go_straight_from_key_to_key() -> None:
     path = CameraPath([Key(Pose.of(camera(0.0)), {"time": torch.tensor(t)}) for t in (0.0, 0.8, 0.4)])
     frames = path.conditions(DYNAMIC.conditions, 5)
     assert [round(float(frame["time"]), 6) for frame in frames] == [0.0, 0.4, 0.8, 0.6, 0.4]
-    assert condition_texts(frames, DYNAMIC.conditions) == {"time": "0,0.4,0.8,0.6,0.4"}
-    assert condition_texts(frames[1:2], DYNAMIC.conditions) == {"time": "0.4"}
+    assert condition_texts(frames, DYNAMIC.conditions, World()) == {"time": "0,0.4,0.8,0.6,0.4"}
+    assert condition_texts(frames[1:2], DYNAMIC.conditions, World()) == {"time": "0.4"}
 
 
 def test_a_light_stays_where_it_is_along_a_path() -> None:
@@ -87,9 +88,12 @@ def test_a_light_stays_where_it_is_along_a_path() -> None:
         return Key(Pose.of(camera(x)), {"light": torch.tensor([x, 0.0, 2.0]), "light_intensity": torch.ones(3)})
 
     still = CameraPath([lit(1.0), Key(Pose.of(camera(2.0)), lit(1.0).conditions)])
-    assert condition_texts(still.conditions(RELIGHT.conditions, 4), RELIGHT.conditions) == {"light": "1,0,2", "light_intensity": "1,1,1"}
+    assert condition_texts(still.conditions(RELIGHT.conditions, 4), RELIGHT.conditions, World()) == {
+        "light": "1,0,2",
+        "light_intensity": "1,1,1",
+    }
     with pytest.raises(ConfigError, match="light: changes along the path"):
-        condition_texts(CameraPath([lit(1.0), lit(2.0)]).conditions(RELIGHT.conditions, 4), RELIGHT.conditions)
+        condition_texts(CameraPath([lit(1.0), lit(2.0)]).conditions(RELIGHT.conditions, 4), RELIGHT.conditions, World())
 
 
 def test_names_that_are_taken_are_left_alone(tmp_path: Path) -> None:

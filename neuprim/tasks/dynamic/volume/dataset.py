@@ -13,6 +13,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, View, ViewSet, camera_extent
 from neuprim.core.errors import DataError
 from neuprim.core.io import images
@@ -196,6 +197,7 @@ def volume_dataset(
         center=torch.zeros(3, dtype=torch.float64),
         bounds=torch.from_numpy(capture.bounds),
         exposure=exposure,
+        world=World(torch.from_numpy(capture.normalisation.matrix())),
         placement=placement_of(capture),
         points=FrameVoxels(capture, folder, train.frames, train.times, weights[::every], exposure, memory * _VOXELS),
         extra=recording,

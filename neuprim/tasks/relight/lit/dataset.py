@@ -14,7 +14,8 @@ from PIL import Image
 from torch import Tensor
 
 from neuprim.core.checked import Accepts, checked
-from neuprim.core.data import Clip, Dataset, ViewSet
+from neuprim.core.data import Clip, Dataset
+from neuprim.core.data.common import in_scene
 from neuprim.core.data.settings import HoldOut
 from neuprim.core.data.views import ImageViews
 from neuprim.core.errors import DataError
@@ -62,18 +63,19 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         background=torch.zeros(3),
         bounds=torch.tensor([[-1.0, -1.0, -0.65], [1.0, 1.0, 1.0]]),
         downsampling=f"rendered at {drawn.size}x{drawn.size}, {drawn.supersampling}x{drawn.supersampling} rays per pixel",
-        extra=_known(dataset.test, folder),
+        extra=_known(dataset, folder),
     )
 
 
-def _known(test: ViewSet, folder: Path) -> Lighting:
+def _known(dataset: Dataset, folder: Path) -> Lighting:
     """Classes of pixels, parts of the test split, and the baselines: perfect shading without cast shadows, and the nearest of 25 training
     lights at the same camera. The film is one new camera under a light that goes round."""
+    test = dataset.test
     assert isinstance(test, ImageViews)  # as posed_images makes them
     baselines = {"no_cast_shadows": partial(companion, test, "unshadowed.exr")}
     if _beside(test.file(0), "nearest.exr").is_file():  # not where training views are held out
         baselines[f"nearest_light_of_{NEAR_LIGHTS}"] = partial(companion, test, "nearest.exr")
-    circle = ImageViews(olat.read_split(folder, "circle"), to_linear=True)
+    circle = ImageViews([in_scene(f, dataset.world, ("light",)) for f in olat.read_split(folder, "circle")], to_linear=True)
     film = Clip("light_round", range(len(circle)), 12.0, circle)
     return Lighting("inverse_square", partial(classes, test), PARTS, baselines, (film,))
 

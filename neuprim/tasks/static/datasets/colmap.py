@@ -133,4 +133,4 @@ def _read_points(reconstruction: Any) -> PointCloud | None:
     keep = np.isfinite(means).all(axis=1)
     if not keep.all():
         raise DataError(f"points3D: {int((~keep).sum())} of {len(points)} points are not finite; expected finite coordinates")
-    return PointCloud(torch.from_numpy(means).float(), torch.from_numpy(colors).float())
+    return PointCloud(torch.from_numpy(means), torch.from_numpy(colors).float())

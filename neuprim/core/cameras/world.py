@@ -1,0 +1,140 @@
+"""Where a scene lies in the world of the user's files: one known transform, applied wherever coordinates come in or go out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras.pinhole import Camera
+from neuprim.core.cameras.rays import RayCamera
+from neuprim.core.errors import DataError
+
+__all__ = ["World"]
+
+_ROTATION = 1e-6
+"""How far a matrix over its scale may be from a rotation."""
+
+_Camera = TypeVar("_Camera", Camera, RayCamera)
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """How scene coordinates follow from those of the user's files, the *world*: a rotation, one scale and an offset.
+
+    Everything inside is in scene units, mostly float32. Coordinates that users give or get (cameras, lights, boxes, exported positions) are in
+    the world, float64, and are converted by this class alone.
+
+    Attributes:
+        scene_from_world: (4, 4) float64.
+    """
+
+    scene_from_world: Tensor = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))
+
+    @staticmethod
+    def at(origin: Sequence[float]) -> World:
+        """The world whose point ``origin`` is the scene's origin, with the same axes and units."""
+        matrix = torch.eye(4, dtype=torch.float64)
+        matrix[:3, 3] = -torch.tensor(origin, dtype=torch.float64)
+        return World(matrix)
+
+    @cached_property
+    def identity(self) -> bool:
+        """Whether scene and world are the same."""
+        return torch.equal(self.scene_from_world, torch.eye(4, dtype=torch.float64))
+
+    @cached_property
+    def scale(self) -> float:
+        """Scene units per world unit."""
+        return 1.0 if self.identity else float(torch.linalg.det(self.scene_from_world[:3, :3])) ** (1 / 3)
+
+    @cached_property
+    def rotation(self) -> Tensor | None:
+        """(3, 3) the scene's axes from the world's; None where they are the same."""
+        turn = self.scene_from_world[:3, :3] / self.scale
+        return None if bool((turn - torch.eye(3, dtype=torch.float64)).abs().max() < 1e-12) else turn
+
+    @cached_property
+    def inverse(self) -> World:
+        """The other direction: its "scene" is this world."""
+        back = torch.eye(4, dtype=torch.float64)
+        back[:3, :3] = torch.linalg.inv(self.scene_from_world[:3, :3])
+        back[:3, 3] = -back[:3, :3] @ self.scene_from_world[:3, 3]
+        return World(back)
+
+    @property
+    def world_from_scene(self) -> Tensor:
+        """(4, 4) float64."""
+        return self.inverse.scene_from_world
+
+    def scene_points(self, points: Tensor) -> Tensor:
+        """(..., 3) float64 scene points of world points; of an identity the same tensor."""
+        if self.identity:
+            return points
+        return points.double() @ self.scene_from_world[:3, :3].T + self.scene_from_world[:3, 3]
+
+    def world_points(self, points: Tensor) -> Tensor:
+        """(..., 3) float64 world points of scene points; of an identity the same tensor."""
+        return self.inverse.scene_points(points)
+
+    def scene_camera(self, camera: _Camera) -> _Camera:
+        """The same view of the scene as ``camera`` has of the world. Its rotation stays one, and its depths are in scene units."""
+        if self.identity:
+            return camera
+        view, back = camera.viewmat.detach().double(), self.world_from_scene
+        moved = torch.eye(4, dtype=torch.float64)
+        moved[:3, :3] = view[:3, :3] if self.rotation is None else view[:3, :3] @ self.rotation.T
+        moved[:3, 3] = self.scale * (view[:3, :3] @ back[:3, 3] + view[:3, 3])
+        return replace(camera, viewmat=moved)
+
+    def world_camera(self, camera: _Camera) -> _Camera:
+        """The same view of the world as ``camera`` has of the scene."""
+        return self.inverse.scene_camera(camera)
+
+    def world_box(self, box: np.ndarray) -> np.ndarray:
+        """(2, 3) box around a box of the scene, on the world's axes."""
+        return self.inverse.scene_box(box)
+
+    def scene_box(self, box: np.ndarray) -> np.ndarray:
+        """(2, 3) box around a box of the world, on the scene's axes."""
+        if self.identity:
+            return box
+        corners = np.stack(np.meshgrid(*np.asarray(box, np.float64).T, indexing="ij"), -1).reshape(-1, 3)
+        moved = self.scene_points(torch.from_numpy(corners)).numpy()
+        return np.stack([moved.min(0), moved.max(0)])
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers, exact when read back: the "world" of a model's header."""
+        return {"scene_from_world": self.scene_from_world.tolist()}
+
+    @staticmethod
+    def of(header: Mapping[str, Any], where: str) -> World:
+        """That of a model's header; the identity where it says none. ``where`` names the file in errors.
+
+        Raises:
+            DataError: the header's "world" is something else than :meth:`to_json` makes.
+        """
+        record = header.get("world")
+        if record is None:
+            return World()
+        try:
+            return World(torch.tensor(record["scene_from_world"], dtype=torch.float64)).validate(f"{where}: header field 'world'")
+        except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
+            raise DataError(f"{where}: header field 'world' is damaged ({type(error).__name__})") from None
+
+    def validate(self, where: str) -> World:
+        """Return self, or raise :class:`DataError` naming ``where`` for a matrix that is no rotation with one scale and an offset."""
+        matrix = self.scene_from_world
+        fits = isinstance(matrix, Tensor) and matrix.shape == (4, 4) and matrix.dtype == torch.float64 and bool(matrix.isfinite().all())
+        if fits and matrix[3].tolist() == [0, 0, 0, 1]:
+            square = matrix[:3, :3] @ matrix[:3, :3].T
+            scale = float(square.diagonal().mean())
+            fits = scale > 0 and bool((square / scale - torch.eye(3, dtype=torch.float64)).abs().max() < _ROTATION)
+            if fits and float(torch.linalg.det(matrix[:3, :3])) > 0:
+                return self
+        raise DataError(f"{where} is damaged; expected a (4, 4) float64 matrix of a rotation, one scale and an offset")

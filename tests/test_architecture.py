@@ -76,7 +76,7 @@ CORE: dict[str, set[str]] = {
     "conditions": {"errors", "model"},
     "channels": {"data", "errors", "io", "task"},
     "checkpoint": {"compressed", "errors", "io", "model", "task"},
-    "extensions": {"channels", "checked", "conditions", "data", "errors", "model", "settings", "task", "volumes"},
+    "extensions": {"cameras", "channels", "checked", "conditions", "data", "errors", "model", "settings", "task", "volumes"},
     "render": {"cameras", "compute", "errors", "metrics", "model", "notices", "settings"},
     "train": {"checked", "compute", "data", "errors", "model", "render", "task", "volumes"},
     "uses": {"checked", "errors", "extensions", "task", "train"},

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 import torch
-import trimesh
 
 from neuprim.cli import _parsers
 from neuprim.cli.operating_words import DRAWN, operating_words
@@ -82,19 +81,6 @@ def with_volumes(static_run: Path) -> None:
         write_vdb(path, [grid])
 
 
-def with_model(static_run: Path) -> None:
-    """A run of a model that was twice as large as the scene and stood beside it, and its exported mesh."""
-    folder = Path("outputs/static-mesh")
-    folder.mkdir(parents=True)
-    moved = [[0.5, 0, 0, -1], [0, 0.5, 0, 0], [0, 0, 0.5, 0], [0, 0, 0, 1]]
-    (folder / "metrics.json").write_text(json.dumps({"scene_from_file": moved}))
-    trimesh.creation.box([1, 1, 1]).export(folder / "mesh.ply")
-
-
-def is_back(names: dict[str, Any]) -> None:
-    assert names["mesh"].bounds.tolist() == [[1, -1, -1], [3, 1, 1]]
-
-
 def has_copy(names: dict[str, Any]) -> None:
     assert Path("copy.vdb").stat().st_size > 1000 and names["dense"].shape == (64, 64, 64) and len(names["frames"]) == 2
 
@@ -128,11 +114,10 @@ def has_a_loader_of_photographs(names: dict[str, Any]) -> None:
     assert 0 < len(read.initial_points(50, torch.Generator()).means) <= 50
 
 
-PREPARE: dict[str, Callable[[Path], None]] = {"docs/data_formats.md": with_run, "docs/static.md": with_model, "docs/vdb.md": with_volumes}
+PREPARE: dict[str, Callable[[Path], None]] = {"docs/data_formats.md": with_run, "docs/vdb.md": with_volumes}
 """Page -> puts the files that its blocks talk about into the working directory."""
 
 AFTER: dict[str, Callable[[dict[str, Any]], None]] = {
-    "docs/static.md": is_back,
     "docs/vdb.md": has_copy,
     "docs/rasterize.md": has_frames,
     "docs/getting_started.md": has_same_metrics,

@@ -7,7 +7,7 @@ optical depth passes ln 2, and shows matter if its densest voxel passes the leve
 piece's area are left out.
 
 A vertex has the mean colour of the primitives around it, weighted by their density there, seen from outside along its normal.
-Coordinates are those of the run's data; a .glb is turned from z up to glTF's y up (``up=y`` for data that are y up already), as its
+Coordinates are those of the run's data; a .glb is turned from z up to glTF's y up (but data that are y up already: ``up=y``, or where the model was fitted to such a mesh), as its
 readers turn it back, and has what moves it far from the origin in its node, as its vertices are float32. A .ply has ``double x y z`` there. Colours are sRGB in .ply and .obj and linear in .glb, as glTF wants them; they are what the
 task's display shows, or red, green and blue, or grey. Other channels are refused.
 
@@ -46,7 +46,7 @@ OPTIONS = {
     "level": (None, "extinction of the surface, 1/scene unit (default: the silhouettes that agree best with the opaque parts)"),
     "smooth": (1.0, "standard deviation of the blur before contouring, voxels, 0 to 4"),
     "keep": (0.01, "least area of a piece, as a part of the largest one's"),
-    "up": ("z", "upward axis of the data, z or y; only .glb files are turned by it"),
+    "up": ("auto", "upward axis of the data, z or y; only .glb files are turned by it (auto: that of a mesh that was fitted, else z)"),
 }
 _SUFFIXES = (".glb", ".ply", ".obj")
 _CHUNK = 2_000_000
@@ -61,7 +61,10 @@ def _write(job: ExportJob) -> ExportReport:
     channels = job.run.channels
     rgb = None if channels.own is not None else rgb_of(job.run, f", and task {job.run.task.name!r} has no display that makes these")
     contour = _contour()
-    smooth, keep, up = job.number("smooth", 0, 4) or 0.0, job.number("keep", 0, 1) or 0.0, job.choice("up", "z", "y")
+    smooth, keep, up = job.number("smooth", 0, 4) or 0.0, job.number("keep", 0, 1) or 0.0, job.choice("up", "auto", "z", "y")
+    turn = job.run.world.rotation
+    if up == "auto":
+        up = "y" if turn is not None and float(turn[2, 1]) > 0.5 else "z"  # of the world's axes, the one that is the scene's z
     seen = harmonics_of(job.run, conditions)
     job.progress("sampling the density", 0.0)
     sigma, scene_from_index = _sample(job, conditions, job.count("grid", 8, 1024) or 192)

@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from neuprim.core.cameras.world import World
 from neuprim.core.checked import checked, text
 from neuprim.core.data import Dataset
 from neuprim.core.io.records import read_json
@@ -84,7 +86,9 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
     known = read_json(folder / "transforms_train.json")
     facts = {name: known.values[name] for name in ("rendered_from", "scene_from_file")}
-    return replace(blender.load({"path": str(folder)}, context), name=facts["rendered_from"], data_source="generated", extra=facts)
+    world = World(torch.tensor(facts["scene_from_file"], dtype=torch.float64)).validate(f"{folder}: scene_from_file")
+    dataset = blender.load({"path": str(folder)}, context)
+    return replace(dataset, name=facts["rendered_from"], data_source="generated", world=world, extra=facts)
 
 
 def generate(settings: MeshSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None) -> Path:

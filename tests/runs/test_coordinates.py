@@ -1,0 +1,138 @@
+"""Files that go in and out of a run are in the coordinates of its data, wherever its scene lies inside."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+import trimesh
+
+from neuprim.core.cameras import Camera, look_at
+from neuprim.core.cameras.world import World
+from neuprim.core.data.points_file import read_points
+from neuprim.core.errors import DataError
+from neuprim.core.io.ply import read_ply
+from neuprim.core.io.vdb import read_grid
+from neuprim.runs.draw import render_run
+from neuprim.runs.export import export_run, import_run
+from neuprim.runs.inspect import Request, inspect_run
+from neuprim.runs.live.path import CameraPath, Key, condition_texts
+from neuprim.runs.live.poses import Pose
+from neuprim.runs.open import open_run
+from neuprim.tasks.relight import TASK as RELIGHT
+from tests.plugins import marked
+
+UTM = World.at([448250.0, 5411930.0, 210.0])
+MESH = World(torch.tensor([[0.5, 0, 0, -5], [0, 0, -0.5, 2], [0, 0.5, 0, -1000], [0, 0, 0, 1]], dtype=torch.float64))
+"""As of a mesh with y up, twice as large as its scene."""
+WORLDS = pytest.mark.parametrize("world", [UTM, MESH], ids=["utm", "mesh"])
+LOOK = Camera(
+    look_at(torch.tensor([2.0, -3, 1.5]), torch.tensor([0.1, 0.1, 0.1]), torch.tensor([0.0, 0, 1])), 60.0, 60.0, 24.0, 18.0, 48, 36
+)
+
+
+def run_in(folder: Path, world: World) -> Path:
+    return marked.write_run(folder, marked.static_model(), ["task=static", "scene=solids"], world=world.to_json())
+
+
+def write_cameras(path: Path, *cameras: Camera) -> str:
+    frames = []
+    for camera in cameras:
+        pose = torch.linalg.inv(camera.viewmat) @ torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+        frames.append({"transform_matrix": pose.tolist(), "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy})
+    path.write_text(json.dumps({"w": LOOK.width, "h": LOOK.height, "frames": frames}))
+    return str(path)
+
+
+@WORLDS
+def test_a_files_cameras_are_in_the_world_and_so_is_what_is_written_of_them(tmp_path: Path, world: World) -> None:
+    run = run_in(tmp_path / "run", world)
+    there = write_cameras(tmp_path / "world.json", world.world_camera(LOOK))
+    here = write_cameras(tmp_path / "scene.json", LOOK)
+    (a,) = render_run(run, there, None, "exr", tmp_path / "a.exr", 1, {})
+    (b,) = render_run(run, here, None, "exr", tmp_path / "b.exr", 1, {}, space="scene")
+    with OpenEXR.File(str(a), separate_channels=True) as one, OpenEXR.File(str(b), separate_channels=True) as two:
+        first, second = one.channels(), two.channels()
+        assert np.abs(first["A"].pixels - second["A"].pixels).max() < 1e-5 and first["A"].pixels.max() > 0.9
+        assert np.abs(first["depth.Z"].pixels * world.scale - second["depth.Z"].pixels).max() < 1e-4
+        head = one.header()
+        position = np.linalg.inv(head["neuprim:worldToCamera"])[3, :3]
+        assert np.allclose(position, world.world_points(LOOK.position).numpy(), atol=1e-6)
+        assert head["neuprim:near"] * world.scale == pytest.approx(two.header()["neuprim:near"])
+
+
+def test_empty_images_are_told_and_a_shot_of_them_fails(tmp_path: Path) -> None:
+    run, said = run_in(tmp_path / "run", UTM), list[str]()
+    up = torch.tensor([0.0, 0.0, 1.0])
+    away = UTM.world_camera(replace(LOOK, viewmat=look_at(torch.tensor([2.0, -3, 1.5]), torch.tensor([9.0, -9, 9]), up)))
+    cameras = write_cameras(tmp_path / "c.json", UTM.world_camera(LOOK), away)
+    files = render_run(run, cameras, None, "png", tmp_path / "out", 1, {}, tell=said.append)
+    assert len(files) == 2 and any("1 of 2 images are empty, first camera_001: the model is within (44824" in line for line in said)
+    with pytest.raises(DataError, match=r"all 1 images are empty: the model is within .* looks towards .*--space scene"):
+        render_run(run, write_cameras(tmp_path / "scene.json", LOOK), None, "png", tmp_path / "none", 1, {})
+    assert not list((tmp_path / "none").iterdir())
+
+
+@WORLDS
+def test_exported_places_are_those_of_the_world(tmp_path: Path, world: World) -> None:
+    run = run_in(tmp_path / "run", world)
+    centers = world.world_points(marked.PLACES.double()).numpy()
+    for format in ("ply", "gaussian-ply"):
+        file = tmp_path / f"{format}.ply"
+        export_run(run, format, file, [] if format == "ply" else ["size=moments", "views=orbit"])
+        found = read_ply(file).columns("xyz")
+        assert np.abs(found - centers).max() < 1e-3 / world.scale
+        back = read_points(file, 3, "srgb").within(world)
+        assert torch.allclose(back.means, marked.PLACES, atol=1e-3)
+    assert back.deviations is not None and torch.allclose(back.deviations[0], torch.full((3,), 0.3 / 5**0.5), rtol=0.1)
+    export_run(run, "vdb", tmp_path / "d.vdb", ["grid=64"])
+    grid = read_grid(tmp_path / "d.vdb", "density")
+    low, high = (np.array(corner) for corner in grid.world_bounds())  # type: ignore[union-attr]
+    box = world.world_box(np.array([[-0.3, -0.3, -0.3], [0.9, 0.75, 0.95]]))
+    assert np.abs(np.stack([low, high]) - box).max() < 0.1 / world.scale
+    import_run(tmp_path / "ply.ply", tmp_path / "back")
+    assert torch.equal(open_run(tmp_path / "back").world.scene_from_world, world.scene_from_world)
+
+
+@WORLDS
+@pytest.mark.parametrize("suffix", ["ply", "obj", "glb"])
+def test_meshes_are_in_the_world(tmp_path: Path, world: World, suffix: str) -> None:
+    pytest.importorskip("pyvista")
+    export_run(run_in(tmp_path / "run", world), "mesh", tmp_path / f"m.{suffix}", ["grid=32", "smooth=0", "keep=0"])
+    scene = trimesh.load(tmp_path / f"m.{suffix}", force="scene", process=False)
+    points = np.concatenate([trimesh.transform_points(scene.geometry[g].vertices, m) for m, g in (scene.graph[n] for n in scene.graph.nodes_geometry)])  # fmt: skip
+    if suffix == "glb" and world is UTM:  # back from y up, as readers do
+        points = points[:, [0, 2, 1]] * [1, -1, 1]
+    box = np.stack([points.min(0), points.max(0)])
+    assert np.abs(box - world.world_box(np.array([[-0.3, -0.3, -0.3], [0.9, 0.75, 0.95]]))).max() < 0.1 / world.scale
+    assert len(np.unique(points[:, 0])) > 100, "no coordinate is rounded to the others'"
+
+
+def test_boxes_and_volumes_of_inspect_are_in_the_world(tmp_path: Path) -> None:
+    run = run_in(tmp_path / "run", UTM)
+    box = UTM.world_box(np.array([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]]))
+    inspect_run(Request(run, grid=16, box=box, out=tmp_path / "v.vdb"))
+    grid = read_grid(tmp_path / "v.vdb", "extinction")
+    assert np.abs(np.stack(grid.world_bounds()).mean(0) - box.mean(0)).max() < 0.1  # type: ignore[arg-type]
+    said = list[str]()
+    inspect_run(Request(run, grid=16, against=str(tmp_path / "v.vdb"), out=tmp_path / "w.vdb"), lambda event: said.append(str(event)))
+    assert any("correlation 1.0000" in line for line in said)
+
+
+def test_a_light_and_a_path_are_written_and_read_in_the_world(tmp_path: Path) -> None:
+    light = RELIGHT.conditions[0]
+    (value,) = light.within(UTM).parse("448251.25,5411930,214.5")
+    assert value.tolist() == [1.25, 0.0, 4.5] and value.dtype == torch.float32
+    assert torch.equal(light.within(UTM).parse("orbit:4:40:3")[0], light.parse("orbit:4:40:3")[0])
+    frames = [{"light": value, "light_intensity": torch.ones(3)}]
+    assert condition_texts(frames, RELIGHT.conditions, UTM)["light"] == "448251.25,5411930,214.5"
+    CameraPath([Key(Pose.of(LOOK), {})]).write(tmp_path / "path.json", (48, 36), UTM)
+    run = run_in(tmp_path / "run", UTM)
+    (file,) = render_run(run, str(tmp_path / "path.json"), None, "npy", tmp_path / "a.npy", 1, {})
+    (same,) = render_run(run, write_cameras(tmp_path / "c.json", UTM.world_camera(LOOK)), None, "npy", tmp_path / "b.npy", 1, {})
+    assert np.abs(np.load(file) - np.load(same)).max() < 1e-4

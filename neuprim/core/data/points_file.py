@@ -18,8 +18,8 @@ __all__ = ["read_points"]
 
 _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _LARGEST = 1e6
-_FARTHEST = 1e12
-"""From the origin of the file's coordinates: the Earth's radius in millimetres is less."""
+_FARTHEST = 1e8
+"""From the origin of the file's coordinates: maps reach 1e7 metres."""
 
 
 def read_points(path: Path, channels: int, color_space: str) -> PointCloud:

@@ -11,7 +11,7 @@ from typing import Any
 
 from neuprim.config import RunConfig, scene_of, suspects_of, task_of
 from neuprim.core.cameras.world import World
-from neuprim.core.checkpoint import load_model
+from neuprim.core.checkpoint import load_model, read_header
 from neuprim.core.data import Dataset, View
 from neuprim.core.errors import DataError
 from neuprim.core.extensions import TrainedModel
@@ -59,6 +59,10 @@ def load_dataset(
         NeuprimError: what the loader refuses, or that it crashed.
     """
     context = context_of(config, progress)
+    if (
+        run_dir is not None and model_file(run_dir).exists()
+    ):  # its cameras and points lie as they did for the model, whatever was added since
+        context = replace(context, world=World.of(read_header(model_file(run_dir), "model"), str(model_file(run_dir))))
     load = scene_of(config, task, None if run_dir is None else run_dir / "config.yaml").spec.load
     scene = suspects_of(config).scene
     with blamed(scene.origin, scene.what, (config.output_dir if run_dir is None else run_dir) / LOGS):

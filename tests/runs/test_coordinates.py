@@ -12,12 +12,15 @@ import pytest
 import torch
 import trimesh
 
+from neuprim.core import checkpoint
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.world import World
+from neuprim.core.compressed import LEVELS
 from neuprim.core.data.points_file import read_points
 from neuprim.core.errors import DataError
 from neuprim.core.io.ply import read_ply
 from neuprim.core.io.vdb import read_grid
+from neuprim.plugins.export.appearance import Harmonics, sphere
 from neuprim.runs.draw import render_run
 from neuprim.runs.export import export_run, import_run
 from neuprim.runs.inspect import Request, inspect_run
@@ -136,3 +139,22 @@ def test_a_light_and_a_path_are_written_and_read_in_the_world(tmp_path: Path) ->
     (file,) = render_run(run, str(tmp_path / "path.json"), None, "npy", tmp_path / "a.npy", 1, {})
     (same,) = render_run(run, write_cameras(tmp_path / "c.json", UTM.world_camera(LOOK)), None, "npy", tmp_path / "b.npy", 1, {})
     assert np.abs(np.load(file) - np.load(same)).max() < 1e-4
+
+
+def test_a_page_and_a_compressed_model_say_where_they_are(tmp_path: Path) -> None:
+    run = run_in(tmp_path / "run", UTM)
+    (page,) = export_run(run, "html", tmp_path / "m.html", ["views=0", "level=0"]).files
+    assert json.dumps(UTM.to_json())[1:-1] in page.read_text()
+    model, header = open_run(run).model, open_run(run).header
+    checkpoint.save_compressed(
+        tmp_path / "m.neuprim", model, "static", checkpoint.extra_of(header), LEVELS[1], (run / "config.yaml").read_text()
+    )
+    assert torch.equal(open_run(import_run(tmp_path / "m.neuprim", tmp_path / "back")).world.scene_from_world, UTM.scene_from_world)
+
+
+def test_colours_turn_with_the_axes() -> None:
+    generator = torch.Generator().manual_seed(3)
+    colours = Harmonics(torch.randn(2, 3, generator=generator), torch.randn(2, 15, 3, generator=generator), 0.0)
+    turn, directions, rows = MESH.rotation, sphere(20), torch.zeros(20, dtype=torch.int64)
+    assert turn is not None
+    assert torch.allclose(colours.turned(turn).towards(rows, directions @ turn.T), colours.towards(rows, directions), atol=1e-9)

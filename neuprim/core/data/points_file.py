@@ -13,11 +13,15 @@ from neuprim.core.errors import DataError
 from neuprim.core.io import images
 from neuprim.core.io.ply import PlyVertices, read_ply
 from neuprim.core.model.colours.sh import C0
+from neuprim.core.notices import warn_once
 
 __all__ = ["read_points"]
 
 _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _LARGEST = 1e6
+_COARSE = 1e-3
+"""Of the size of the cloud: what coordinates may be rounded to without a word."""
+
 _FARTHEST = 1e8
 """From the origin of the file's coordinates: maps reach 1e7 metres."""
 
@@ -81,6 +85,11 @@ def _means(found: PlyVertices, path: Path) -> Tensor | None:
     if bad.any():
         row, column = (int(i) for i in np.argwhere(bad)[0])
         raise DataError(f"{path}: {'xyz'[column]} of vertex {row} is {values[row, column]}; expected a number of at most {_FARTHEST:g}")
+    size, step = np.ptp(values, axis=0).max() if len(values) else 0.0, np.spacing(np.abs(values).max(initial=0.0).astype(np.float32))
+    if found.rows.dtype["x"].itemsize == 4 and step > _COARSE * size > 0:
+        warn_once(
+            f"{path}: x y z are float, which rounds coordinates as large as {np.abs(values).max():.7g} to {step:.2g}; expected double there"
+        )
     return torch.from_numpy(values)
 
 

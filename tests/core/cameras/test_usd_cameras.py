@@ -70,7 +70,9 @@ def test_a_camera_that_stands_still(tmp_path: Path) -> None:
     ((_, camera),) = found.named
     assert close(camera, projected(path, "/World/Cam", 0, POINTS, (640, 480)))
     assert camera.fx == camera.fy == pytest.approx(35 / 36 * 640) and camera.cx < 320 and camera.cy < 240
-    assert found.notes == ("Z is up and a unit is 0.01 m in this file; taken as the axes and units of the run's data",) and found.fps is None
+    assert (
+        found.notes == ("Z is up and a unit is 0.01 m in this file; taken as the axes and units of the run's data",) and found.fps is None
+    )
 
 
 def test_all_formats_are_known_by_what_is_in_them(tmp_path: Path) -> None:

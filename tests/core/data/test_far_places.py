@@ -14,6 +14,7 @@ from neuprim.core.data import PointCloud
 from neuprim.core.data.place import world_around
 from neuprim.core.data.points_file import read_points
 from neuprim.core.io.ply import write_ply
+from neuprim.core.notices import NeuprimWarning
 
 
 def ring(offset: tuple[float, ...], radius: float = 4.0) -> list[Camera]:
@@ -76,3 +77,13 @@ def test_gaussians_turn_and_grow_with_their_places() -> None:
     found = cloud.within(world)
     assert found.means.tolist() == [[3, 8, 9]] and found.deviations is not None and found.deviations.tolist() == [[2, 4, 6]]
     assert found.quats is not None and torch.allclose(found.quats.abs(), torch.tensor([[0.5**0.5, 0, 0, 0.5**0.5]]))
+
+
+def test_floats_that_are_far_away_are_told(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    rows = np.zeros(3, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+    rows["x"], rows["y"] = [0, 1, 2], 5411932.25
+    write_ply(tmp_path / "p.ply", rows)
+    with pytest.warns(
+        NeuprimWarning, match=r"x y z are float, which rounds coordinates as large as 5411932 to 0\.5; expected double there"
+    ):
+        read_points(tmp_path / "p.ply", 3, "srgb")

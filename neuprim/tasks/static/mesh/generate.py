@@ -87,7 +87,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     known = read_json(folder / "transforms_train.json")
     facts = {name: known.values[name] for name in ("rendered_from", "scene_from_file")}
     world = World(torch.tensor(facts["scene_from_file"], dtype=torch.float64)).validate(f"{folder}: scene_from_file")
-    dataset = blender.load({"path": str(folder)}, context)
+    dataset = blender.load({"path": str(folder)}, replace(context, world=None))  # the images are of the scene itself
     return replace(dataset, name=facts["rendered_from"], data_source="generated", world=world, extra=facts)
 
 

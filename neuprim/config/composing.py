@@ -16,17 +16,17 @@ from neuprim.config.declared import check_names, check_preset, check_typed, comp
 from neuprim.config.effort import EFFORT, LEVELS, Level, chosen_level
 from neuprim.config.from_file import chosen_beside, settings_below
 from neuprim.config.groups import check_groups, check_scene, presets, task_choices
-from neuprim.config.outputs import output_directory
-from neuprim.config.overrides import Assignment, expand_sweep, parse, sweep_names, swept_keys, without_place
+from neuprim.config.outputs import DEFAULT_TASK, output_directory, run_name
+from neuprim.config.overrides import Assignment, assigned, expand_sweep, key_of, parse, sweep_names, swept_keys
 from neuprim.config.record import RunConfig, RunSettings
-from neuprim.config.resuming import not_installed, units_as_begun
+from neuprim.config.resuming import begun_run, chosen_again, new_words, not_installed, refuse_contradictions, words_of_both
 from neuprim.config.schema import REQUIRED, defaults, is_free, like, setting_names
+from neuprim.config.trust import check_stored, refuse_links
 from neuprim.core.checked import checked, shown
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.settings import MetricsSettings
 from neuprim.core.uses import build_settings
 from neuprim.plugins.blame import blamed
-from neuprim.plugins.names import split
 from neuprim.plugins.provenance import MadeBy, Maker
 from neuprim.plugins.registry import LOSSES, TASKS, UnknownPlugin, find_scene, load_loss
 from neuprim.version import __version__
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
 __all__ = ["compose", "compose_all", "preset_settings"]
 
-DEFAULT_TASK = "static"
 CHOICES = ("task", "scene", "preset", EFFORT)
 PRESET_KEYS = ("model", "train", "renderer")
 PATHS = "_paths_"
@@ -64,15 +63,32 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
 def _compose(overrides: Sequence[str], check_output: bool, files: Files, stored: RunConfig | None) -> RunConfig:
     assignments = parse(overrides)
     chosen = {key: _choice(assignments, key) for key in CHOICES}
-    if stored is not None:
-        chosen = chosen_beside(stored, chosen)
     try:
+        begun = begun_run(assignments, chosen, stored is not None)
+        if begun is not None:
+            return _resumed(begun, overrides, chosen, check_output, files, stored)
+        if stored is not None:
+            check_stored(stored, {a.key: a.value for a in assignments})
+            chosen = chosen_beside(stored, chosen)
         return _composed(overrides, assignments, chosen, check_output, files, stored)
     except UnknownPlugin as error:
         told = not_installed(assignments, chosen["task"] or DEFAULT_TASK, chosen["scene"])
         if told is None:
             raise
         raise told from error
+
+
+def _resumed(
+    begun: RunConfig, overrides: Sequence[str], chosen: Mapping[str, str | None], check_output: bool, files: Files, stored: RunConfig | None
+) -> RunConfig:
+    """The configuration of a run that goes on: its own, under what is typed now and not what was typed then."""
+    assert begun.source is not None, "it was read from its directory"
+    words = new_words(begun, overrides) if stored is None else list(overrides)
+    assignments = parse(words)
+    refuse_links(begun.source.parent)
+    check_stored(begun, {a.key: a.value for a in parse(overrides)})
+    chosen = {**chosen_again(begun, chosen), EFFORT: _choice(assignments, EFFORT)}
+    return _composed(overrides, assignments, chosen, check_output, files, stored, begun)
 
 
 def _composed(
@@ -82,6 +98,7 @@ def _composed(
     check_output: bool,
     files: Files,
     stored: RunConfig | None,
+    begun: RunConfig | None = None,
 ) -> RunConfig:
     values = [a for a in assignments if a.key not in CHOICES]
     task_word = chosen["task"] or DEFAULT_TASK
@@ -98,9 +115,8 @@ def _composed(
         raise ConfigError(f"preset={preset}: task {spec.name!r} has no such preset{nearest(preset, presets(spec))}")
 
     base, declared_paths = _base(spec, scene_name, preset, own.options, files, package)
-    below = () if level is None else level.settings
-    if stored is not None:
-        below = tuple(settings_below(stored, scene_word, values))
+    files_settings = [a for one in (begun, stored) if one is not None for a in settings_below(one, scene_word, values)]
+    below = (*files_settings, *(() if level is None else level.settings))
     for assignment in (*below, *values):
         _check_key(assignment, base, scene_name)
     plain, full = _merge(base, values, below)
@@ -114,15 +130,13 @@ def _composed(
         spec.check(build_settings(spec, settings.model, options))
     scene = _scene(full["scene"], base["scene"], declared_paths)
     added = None if found.added_by is None else Maker.of(found.added_by, scene_name)
-    directory = output_directory(settings.output_dir, f"{_in_path(task_word)}-{_in_path(scene_word)}", settings.resume, check_output)
+    directory = output_directory(settings.output_dir, run_name(task_word, scene_word), settings.resume, check_output)
     full["scene"] = scene
     if settings.metrics.lpips is not None:
         settings.metrics = MetricsSettings(str(Path(settings.metrics.lpips).expanduser().absolute()))
-    units = plain["train"]["rate_units"]
-    if settings.resume and settings.train.rate_units == units:
-        settings.train.rate_units = dict(units_as_begun(directory, preset, units))
     changed = {"preset": (own.preset, preset)} if preset != own.preset else {}
-    return RunConfig(
+    before = begun or stored
+    made = RunConfig(
         task=spec.name,
         scene_name=scene_name,
         scene=scene,
@@ -136,10 +150,13 @@ def _composed(
         resume=settings.resume,
         options=options,
         unused=unused(spec, declared),
-        overrides=[*([] if stored is None else without_place(stored.overrides)), *overrides],
+        overrides=list(overrides) if before is None else words_of_both(before, overrides),
         non_default={**changed, **_differences(_typed(plain), _typed(full, settings))},
         made_by=MadeBy(__version__, Maker.of(task_info), added, None if loss is None else Maker.of(loss[0])),
     )
+    if begun is not None:
+        refuse_contradictions(begun, made, declared_paths)
+    return made
 
 
 def compose_all(overrides: Sequence[str], check_output: bool = True, stored: RunConfig | None = None) -> list[RunConfig]:
@@ -152,19 +169,26 @@ def compose_all(overrides: Sequence[str], check_output: bool = True, stored: Run
         return [compose(overrides, check_output, stored)]
     combinations = expand_sweep(overrides)
     files: Files = {}
-    configs = [_compose([*c, "output_dir=null"], False, files, stored) for c in combinations]
+    resume = [word for word in overrides if key_of(word) == "resume"]  # of each run below, not of one in the sweep's directory
+    alone = [[word for word in c if key_of(word) != "resume"] for c in combinations]
+    configs = [_compose([*c, "output_dir=null"], False, files, stored) for c in alone]
     first = configs[0]
     typed = parse(combinations[0])
+    goes_on = any(a.value is True for a in parse(resume)[-1:])
     words = [(key, _choice(typed, key) or name) for key, name in (("task", first.task), ("scene", first.scene_name))]
-    fixed = [_in_path(word) for key, word in words if not swept & {key, "task"}]
+    fixed = [run_name(word, "") for key, word in words if not swept & {key, "task"}]
     asked = [a.value for a in typed if a.key == "output_dir"]
-    explicit = str(_compose(combinations[0], False, files, stored).output_dir) if asked and asked[-1] is not None else None
-    base = output_directory(explicit, "-".join([*fixed, "sweep"]), first.resume, check_output)
+    explicit = str(_compose(alone[0], False, files, stored).output_dir) if asked and asked[-1] is not None else None
+    base = output_directory(explicit, "-".join([*fixed, "sweep"]), goes_on, check_output)
     names = sweep_names(overrides, combinations)
-    return [
-        dataclasses.replace(config, output_dir=base / name, overrides=config.overrides[:-1])
-        for config, name in zip(configs, names, strict=True)
-    ]
+    made = []
+    for config, words_alone, name in zip(configs, alone, names, strict=True):
+        if goes_on and (base / name / "config.yaml").is_file():
+            config = _compose([*words_alone, "resume=true", assigned("output_dir", str(base / name))], False, files, stored)
+        own = [*(word for word in config.overrides if key_of(word) != "resume"), *resume]
+        own = [word for word in own if word not in ("output_dir=null", assigned("output_dir", str(base / name)))]
+        made.append(dataclasses.replace(config, output_dir=base / name, resume=goes_on, overrides=own))
+    return made
 
 
 # ---------------------------------------------------------------- choosing
@@ -181,11 +205,6 @@ def _choice(assignments: Sequence[Assignment], key: str) -> str | None:
             + (f"a level from {LEVELS[0]} (fast) to {LEVELS[-1]} (good)" if key == EFFORT else f"the name of a {key}")
         )
     return str(value)
-
-
-def _in_path(word: str) -> str:
-    """``NAME`` or ``PACKAGE:NAME`` as part of a folder's name."""
-    return "-".join(part for part in split(word) if part)
 
 
 # ---------------------------------------------------------------- Hydra
@@ -270,7 +289,7 @@ def _merge(
         OmegaConf.update(tree, "model.density", {}, merge=False)
     for a in (*below, *values):
         try:
-            OmegaConf.update(tree, a.key, a.value, merge=not a.whole, force_add=True)
+            OmegaConf.update(tree, a.key, _as_data(a.value) if a.whole else a.value, merge=not a.whole, force_add=True)
         except (OmegaConfBaseException, ValueError, TypeError, AssertionError) as error:
             raise ConfigError(f"{a.text}: {' '.join(str(error).split())}") from error
     seconds = _said(values, "max_seconds")
@@ -279,7 +298,21 @@ def _merge(
     strategy = _said(values, "strategy", "train.population")
     if strategy and strategy[-1] != base["train"]["population"]["strategy"] and not _said(values, "grow_from", "train.population"):
         OmegaConf.update(tree, "train.population.grow_from", 1.0)  # the preset's is for populations that grow that way
-    return _plain(OmegaConf.create(dict(base))), _plain(tree)
+    return _plain(OmegaConf.create(dict(base))), _as_data(_plain(tree), back=True)
+
+
+def _as_data(value: Any, back: bool = False) -> Any:
+    """A stored value with every ``${`` hidden from OmegaConf, which would look up what follows; or shown again.
+
+    Rule: what a file says is data, and only what is typed or comes with a package may refer to something. No YAML text has the character 0.
+    """
+    if isinstance(value, Mapping):
+        return {_as_data(key, back): _as_data(item, back) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_as_data(item, back) for item in value]
+    if not isinstance(value, str):
+        return value
+    return value.replace("$\0", "$") if back else value.replace("$", "$\0")
 
 
 def _said(values: Sequence[Assignment], name: str, group: str = "train") -> list[Any]:

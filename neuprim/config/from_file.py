@@ -12,7 +12,7 @@ from neuprim.config.record import RunConfig, RunSettings
 from neuprim.core.errors import ConfigError
 from neuprim.plugins.names import BUILT_IN, qualified, split
 
-__all__ = ["chosen_beside", "settings_below", "stored_config"]
+__all__ = ["choices_of", "chosen_beside", "settings_below", "stored_config"]
 
 _NOT_TAKEN = ("output_dir", "resume")
 
@@ -29,14 +29,19 @@ def stored_config(path: Path) -> RunConfig:
     return RunConfig.from_yaml(path)
 
 
+def choices_of(stored: RunConfig) -> dict[str, str]:
+    """Task, scene and preset of a stored run, as words."""
+    made = stored.made_by
+    return {"task": _word(stored.task, made and made.task), "scene": _word(stored.scene_name, made and made.scene), "preset": stored.preset}
+
+
 def chosen_beside(stored: RunConfig, chosen: Mapping[str, str | None]) -> dict[str, str | None]:
     """Task, scene and preset: what was typed, else what the stored run had.
 
     Raises:
         ConfigError: another task, preset or level of effort was typed: every setting of theirs is in the file already.
     """
-    made = stored.made_by
-    own = {"task": _word(stored.task, made and made.task), "scene": _word(stored.scene_name, made and made.scene), "preset": stored.preset}
+    own = choices_of(stored)
     for key in ("task", "preset", "effort"):
         typed = chosen.get(key)
         if typed is not None and split(typed)[1] != split(own.get(key, ""))[1]:

@@ -7,10 +7,17 @@ import re
 from pathlib import Path
 
 from neuprim.core.errors import ConfigError
+from neuprim.plugins.names import split
 
-__all__ = ["output_directory"]
+__all__ = ["DEFAULT_TASK", "output_directory", "run_name"]
 
 ROOT = Path("outputs")
+DEFAULT_TASK = "static"
+
+
+def run_name(task: str, scene: str) -> str:
+    """The name of a run's directory in the output root, where users chose none; ``PACKAGE:NAME`` becomes a part of it."""
+    return "-".join(part for word in (task, scene) for part in split(word) if part)
 
 
 def output_directory(asked: str | None, name: str, resume: bool, check: bool = True) -> Path:

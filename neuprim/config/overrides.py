@@ -109,8 +109,11 @@ class Typed:
     def resuming(self, directory: Path) -> list[str]:
         """The words that go on with what these began: a run in ``directory``, or the sweep it is a part of."""
         sweep = bool(swept_keys(self.words))
+        words = without_place(self.words)
+        if not words and self.file is None and not (directory / "config.yaml").is_file():
+            words = ["task=static"]  # nothing was said and nothing is written yet: the default, which a bare resume=true does not begin
         flags = [*(["-m"] if sweep else []), *([] if self.file is None else ["--config", str(self.file)])]
-        return [*flags, *without_place(self.words), assigned("output_dir", str(directory.parent if sweep else directory)), "resume=true"]
+        return [*flags, *words, assigned("output_dir", str(directory.parent if sweep else directory)), "resume=true"]
 
 
 def key_of(word: str) -> str:

@@ -12,6 +12,7 @@ import yaml
 
 from neuprim.core.checked import Range, checked, refuse_unknown, verify
 from neuprim.core.errors import CheckpointError, ConfigError
+from neuprim.core.io.plain import load_yaml
 from neuprim.core.render import backends
 from neuprim.core.settings import MetricsSettings, RenderSettings
 from neuprim.core.train import population
@@ -20,7 +21,7 @@ from neuprim.core.uses import OPTIONAL
 from neuprim.plugins.names import split
 from neuprim.plugins.provenance import MadeBy
 
-__all__ = ["RunConfig", "RunSettings", "recorded"]
+__all__ = ["RunConfig", "RunSettings"]
 
 MAX_BYTES = 1_000_000
 """A configuration has a few kilobytes; anything larger is another file."""
@@ -59,6 +60,7 @@ class RunConfig:
         resume: continue from the checkpoint in ``output_dir``, if there is one.
         overrides: what the user typed.
         non_default: dotted key -> (value with the same task, scene and preset and nothing typed, value of this run).
+        source: the file that it was read from; None for one that the user composed. See :mod:`neuprim.config.trust`.
         made_by: the packages that task, scene and loss come from; None where nobody said, and their names alone decide.
     """
 
@@ -78,6 +80,7 @@ class RunConfig:
     overrides: list[str] = field(default_factory=list)
     non_default: dict[str, tuple[Any, Any]] = field(default_factory=dict)
     made_by: MadeBy | None = None
+    source: Path | None = field(default=None, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested values, in the layout of the command line's keys."""
@@ -120,7 +123,7 @@ class RunConfig:
             raise CheckpointError(f"{path}: no such run directory")
         data = _read(file)
         try:
-            return cls.from_dict(data)
+            return dataclasses.replace(cls.from_dict(data), source=file)
         except ConfigError as error:
             raise ConfigError(f"{file}: {error}") from error
 
@@ -187,7 +190,7 @@ def _read(file: Path) -> Mapping[str, Any]:
     try:
         if file.stat().st_size > MAX_BYTES:
             raise CheckpointError(f"{file}: larger than {MAX_BYTES} bytes; not a run's configuration")
-        data = yaml.safe_load(file.read_text(encoding="utf-8"))
+        data = load_yaml(file.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise CheckpointError(f"{file}: missing; expected a directory written by `neuprim run`") from error
     except yaml.YAMLError as error:
@@ -200,14 +203,6 @@ def _read(file: Path) -> Mapping[str, Any]:
     if not isinstance(data, Mapping):
         raise CheckpointError(f"{file}: not a run's configuration (expected a mapping, found {type(data).__name__})")
     return data
-
-
-def recorded(directory: Path) -> Mapping[str, Any] | None:
-    """What a run directory's ``config.yaml`` says, as it stands there; None where there is no such file or it is damaged."""
-    try:
-        return _read(directory / "config.yaml")
-    except CheckpointError:
-        return None
 
 
 def _has(data: Mapping[str, Any], name: str) -> bool:

@@ -1,22 +1,25 @@
-"""What a run that goes on has from its directory: who made it, where that is not installed, and the units that its rates began in."""
+"""What a run that goes on has from its directory: its own configuration, and who made it, where that is not installed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neuprim.config.outputs import ROOT
-from neuprim.config.overrides import Assignment
-from neuprim.config.record import RunConfig, recorded
+from neuprim.config.from_file import choices_of
+from neuprim.config.groups import task_choices
+from neuprim.config.outputs import DEFAULT_TASK, ROOT, output_directory, run_name
+from neuprim.config.overrides import NOT_SWEPT, Assignment, key_of, without_place
+from neuprim.config.record import RunConfig
+from neuprim.core.checked import shown
 from neuprim.core.errors import ConfigError, NeuprimError
-from neuprim.core.notices import warn_once
 from neuprim.plugins.mechanism import Group, UnknownPlugin
 from neuprim.plugins.names import qualified, split
 from neuprim.plugins.provenance import Maker, missing
 from neuprim.plugins.registry import LOSSES, SCENES, TASKS
 
-__all__ = ["not_installed", "units_as_begun"]
+__all__ = ["begun_run", "chosen_again", "new_words", "not_installed", "refuse_contradictions", "words_of_both"]
 
 
 def not_installed(assignments: Sequence[Assignment], task: str, scene: str | None) -> ConfigError | None:
@@ -52,25 +55,114 @@ def not_installed(assignments: Sequence[Assignment], task: str, scene: str | Non
     return None
 
 
-def units_as_begun(directory: Path, preset: str, units: Mapping[str, Any]) -> Mapping[str, Any]:
-    """``train.rate_units`` of a run that goes on and for which none were typed.
-
-    A run that is older than these, or than those of its preset, had its rates in the parameters' own units: others would change its speed
-    half way.
+def begun_run(assignments: Sequence[Assignment], chosen: Mapping[str, str | None], file: bool) -> RunConfig | None:
+    """The configuration of the run that ``resume=true`` goes on with; None where nothing is resumed, or nothing was begun there yet.
 
     Args:
-        directory: of the run; it may be new.
-        preset: as chosen now.
-        units: the preset's.
+        assignments: what was typed.
+        chosen: the words of task and scene among it.
+        file: whether the settings of a file (``--config``) stand below.
+
+    Raises:
+        ConfigError: only the place is said, and no run is there.
+        CheckpointError, ConfigError: its ``config.yaml`` is damaged.
+        UnknownPlugin: the place follows from a task, which is not installed.
     """
-    begun = recorded(directory)
-    if not units or begun is None or begun.get("preset") != preset or (begun.get("train") or {}).get("rate_units"):
-        return units
-    names = ", ".join(units)
-    warn_once(
-        f"{directory / 'config.yaml'}: without train.rate_units; rates of {names} go on in the unit that they began in, the parameter's own"
+    given: dict[str, Any] = {a.key: a.value for a in assignments}
+    if given.get("resume") is not True:
+        return None
+    directory, bare = _directory(given.get("output_dir"), chosen), not file and given.keys() <= {"resume", "output_dir"}
+    if (directory / "config.yaml").is_file() and (bare or not (directory / _SEARCH).exists()):
+        return RunConfig.from_yaml(directory)
+    if bare:
+        hint = ", or -m for the sweep there" if (directory / _SWEEP).is_file() else ""
+        raise ConfigError(f"output_dir={directory} resume=true: no run was begun there (no config.yaml); expected a run's directory{hint}")
+    return None
+
+
+def chosen_again(begun: RunConfig, chosen: Mapping[str, str | None]) -> dict[str, str | None]:
+    """Task, scene and preset of a run that goes on.
+
+    Raises:
+        ConfigError: another one was typed.
+    """
+    own = choices_of(begun)
+    for key, word in own.items():
+        typed = chosen.get(key)
+        if typed is not None and split(typed)[1] != split(word)[1]:
+            raise _contradiction(begun, key, typed, word)
+    return {**chosen, **{key: chosen.get(key) or word for key, word in own.items()}}
+
+
+def new_words(begun: RunConfig, overrides: Sequence[str]) -> list[str]:
+    """The words that say something else than those that the run was begun with, and those of its place."""
+    last = {key_of(word): word for word in begun.overrides}
+    return [word for word in overrides if key_of(word) in NOT_SWEPT or last.get(key_of(word)) != word]
+
+
+def words_of_both(begun: RunConfig, overrides: Sequence[str]) -> list[str]:
+    """What was typed for a run by now: of words with the same key, the later."""
+    again = {key_of(word) for word in overrides}
+    return [*(word for word in without_place(begun.overrides) if key_of(word) not in again), *overrides]
+
+
+def refuse_contradictions(begun: RunConfig, now: RunConfig, paths: Iterable[str]) -> None:
+    """Refuse settings that a run cannot change on its way. Rule: what a model is, and what it is trained on and for, stays; budgets, rates,
+    renderers, where data lie and how much memory they take may change.
+
+    Args:
+        paths: the scene's settings that are paths.
+
+    Raises:
+        ConfigError: names the setting, and what the run was begun with.
+    """
+    free = {*(f"scene.{name}" for name in (*paths, *_FREE))}
+    before, after = dict(_fixed(begun)), dict(_fixed(now))
+    for key, value in before.items():
+        if key not in free and key in after and after[key] != value:
+            raise _contradiction(begun, key, after[key], value)
+
+
+_FREE = ("memory", "chunks")
+"""Settings of scenes that may change: what is decoded at once, and the chunks, of which the record of what is done has its own word."""
+
+_SEARCH, _SWEEP = "target.json", "sweep.json"
+"""Records of the directories that hold more than a run, and go on with the words of a search or of a sweep."""
+
+
+def _contradiction(begun: RunConfig, key: str, typed: Any, was: Any) -> ConfigError:
+    return ConfigError(
+        f"{key}={shown(typed)}: the run to resume was begun with {key}={shown(was)} ({begun.source}); expected that, no {key}, or another output_dir"
     )
-    return {}
+
+
+def _fixed(config: RunConfig) -> Iterator[tuple[str, Any]]:
+    def below(key: str, value: Any) -> Iterator[tuple[str, Any]]:
+        if isinstance(value, Mapping) and value:
+            for name, item in value.items():
+                yield from below(f"{key}.{name}", item)
+        else:
+            yield key, list(value) if isinstance(value, tuple) else value
+
+    yield from (("seed", config.seed), ("train.loss", config.train.loss))
+    yield from below("model", dataclasses.asdict(config.model))
+    yield from below("scene", config.scene)
+    yield from below("task.options", config.options)
+
+
+def _directory(asked: Any, chosen: Mapping[str, str | None]) -> Path:
+    """Where the run to resume is, as :func:`~neuprim.config.outputs.output_directory` finds it."""
+    if asked is not None:
+        from omegaconf import OmegaConf
+        from omegaconf.errors import OmegaConfBaseException
+
+        try:
+            return Path(str(OmegaConf.to_container(OmegaConf.create({"at": asked}), resolve=True)["at"])).expanduser()  # type: ignore[index, call-overload]
+        except OmegaConfBaseException as error:
+            raise ConfigError(f"output_dir={shown(asked)}: {' '.join(str(error).split())}; expected a directory, to resume its run") from error
+    task = chosen["task"] or DEFAULT_TASK
+    scene = chosen["scene"] or task_choices(TASKS.loaded(task)[1]).scene
+    return output_directory(None, run_name(task, scene), True)
 
 
 def _latest(task: str) -> Path | None:

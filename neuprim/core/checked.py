@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from neuprim.core.errors import ConfigError, nearest
+from neuprim.core.errors import ConfigError, cut, nearest
 
 __all__ = [
     "Accepts",
@@ -243,7 +243,7 @@ def refuse_unknown(values: Iterable[object], names: Iterable[str], where: str) -
     for key in values:
         if key not in known:
             hint = nearest(str(key), known, prefix=joined(where, "")) or "; there is none"
-            raise ConfigError(f"{joined(where, str(key))}: no such setting{hint}")
+            raise ConfigError(f"{cut(joined(where, str(key)))}: no such setting{hint}")
 
 
 def joined(where: str, name: str) -> str:
@@ -252,7 +252,11 @@ def joined(where: str, name: str) -> str:
 
 
 def shown(value: object) -> str:
-    """A value as users type it; text that reads as something else is quoted, and so is what would break the line."""
+    """A value as users type it, cut where it is long; text that reads as something else is quoted, and so is what would break the line."""
+    return cut(_whole(value))
+
+
+def _whole(value: object) -> str:
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, str) and (not value.isprintable() or value.lower() in ("", "null", "true", "false") or _reads_as_number(value)):

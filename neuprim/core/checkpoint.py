@@ -17,9 +17,10 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from neuprim.core import compressed
-from neuprim.core.errors import CheckpointError, nearest
+from neuprim.core.errors import CheckpointError, cut, nearest
 from neuprim.core.io.files import atomic_path
 from neuprim.core.io.pieces import Kind, write_pieces
+from neuprim.core.io.plain import finite, load_json
 from neuprim.core.model.fields import ColourField, DensityField, pieces_by_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.zeros import of_pieces, split_off, whole
@@ -42,6 +43,8 @@ __all__ = [
 
 FORMAT = 1
 _KEY = "neuprim"
+_NUMBERS = ("step", "elapsed", "views", "iterations", "train_seconds", "primitives")
+"""Of a header: what any reader may take for a number of at least 0, or nothing."""
 
 
 def write(path: Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
@@ -77,7 +80,7 @@ def read_header(path: Path, kind: str) -> dict[str, Any]:
     if _KEY not in metadata:
         raise CheckpointError(f"{path}: no {_KEY!r} header found; expected a {kind} written by neuprim")
     try:
-        header = json.loads(metadata[_KEY])
+        header = load_json(metadata[_KEY])
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{path}: the {_KEY!r} header is not valid JSON ({error})") from error
     return _checked(path, header, kind)
@@ -86,9 +89,16 @@ def read_header(path: Path, kind: str) -> dict[str, Any]:
 def _checked(path: Path, header: Any, kind: str) -> dict[str, Any]:
     if not isinstance(header, dict) or header.get("kind") != kind:
         found = header.get("kind") if isinstance(header, dict) else type(header).__name__
-        raise CheckpointError(f"{path}: kind is {found!r}; expected {kind!r}")
+        raise CheckpointError(f"{path}: kind is {cut(repr(found))}; expected {kind!r}")
     if header.get("format") != FORMAT:
-        raise CheckpointError(f"{path}: format version is {header.get('format')!r}; this neuprim reads {FORMAT}")
+        raise CheckpointError(f"{path}: format version is {cut(repr(header.get('format')))}; this neuprim reads {FORMAT}")
+    for name in _NUMBERS:  # in any header; null: not known
+        number = 0.0 if header.get(name) is None else finite(header[name])
+        if number is None or number < 0:
+            raise CheckpointError(f"{path}: {name} is {cut(repr(header[name]))}; expected a number of at least 0")
+    background = header.get("background", [])
+    if not isinstance(background, list) or any(finite(value) is None for value in background):
+        raise CheckpointError(f"{path}: background is {cut(repr(background))}; expected finite numbers")
     return header
 
 
@@ -214,7 +224,7 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
     """
     header = read_header(path, "model")
     if header.get("task") != task.name:
-        raise CheckpointError(f"{path}: written for task {header.get('task')!r}; expected {task.name!r}")
+        raise CheckpointError(f"{path}: written for task {cut(repr(header.get('task')))}; expected {task.name!r}")
     density, colour = (_field(path, header, task, kind) for kind in ("density", "colour"))
     _, tensors = read(path, "model")
     if not isinstance(density, DensityField) or not isinstance(colour, ColourField):
@@ -241,14 +251,14 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
 def _field(path: Path, header: Mapping[str, Any], task: TaskSpec, kind: str) -> Any:
     entry = header.get(kind)
     if not isinstance(entry, dict) or not isinstance(entry.get("class"), str) or not isinstance(entry.get("settings"), dict):
-        raise CheckpointError(f"{path}: header field {kind!r} is {entry!r}; expected {{'class': ..., 'settings': {{...}}}}")
+        raise CheckpointError(f"{path}: header field {kind!r} is {cut(repr(entry))}; expected {{'class': ..., 'settings': {{...}}}}")
     known = task.fields or {}
     if entry["class"] not in known:
-        raise CheckpointError(f"{path}: unknown {kind} field {entry['class']!r} for task {task.name!r}{nearest(entry['class'], known)}")
+        raise CheckpointError(f"{path}: unknown {kind} field {cut(entry['class'])!r} for task {task.name!r}{nearest(entry['class'], known)}")
     for name, value in entry["settings"].items():
         if not isinstance(value, (int, float, str, bool, type(None), list)) or (isinstance(value, int) and abs(value) > 10_000):
-            raise CheckpointError(f"{path}: {kind} setting {name}={value!r} is not plausible")
+            raise CheckpointError(f"{path}: {kind} setting {cut(name)}={cut(repr(value))} is not plausible")
     try:
         return known[entry["class"]](**entry["settings"])
     except (TypeError, ValueError) as error:
-        raise CheckpointError(f"{path}: {kind} field {entry['class']!r} refused its settings {entry['settings']}: {error}") from error
+        raise CheckpointError(f"{path}: {kind} field {entry['class']!r} refused its settings {cut(str(entry['settings']))}: {error}") from error

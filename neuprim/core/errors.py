@@ -21,6 +21,7 @@ __all__ = [
     "NeuprimError",
     "NonFiniteError",
     "RankError",
+    "cut",
     "nearest",
     "one_line",
 ]
@@ -76,17 +77,25 @@ class FormError(NeuprimError):
     """A field handed over tensors that the renderer or the training cannot take; the message names field, method and tensor."""
 
 
+def cut(text: str, most: int = 80) -> str:
+    """A value's text as messages show it: at most so many characters. Rule: what files and users gave goes into a message through this."""
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
 def nearest(name: str, choices: Iterable[str], limit: int = 3, prefix: str = "") -> str:
     """``"; did you mean 'a' or 'b'?"`` for the valid names closest to ``name``, or the list of all when none is close.
 
     ``prefix`` is what users type before each of them.
     """
     options = sorted(set(choices))
-    close = difflib.get_close_matches(name, options, n=limit, cutoff=0.5)
+    close = difflib.get_close_matches(name[:200], options, n=limit, cutoff=0.5)
     if close:
         return "; did you mean " + " or ".join(repr(prefix + c) for c in close) + "?"
     return "; valid: " + ", ".join(prefix + o for o in options) if options else ""
 
+
+_LONGEST = 4000
+"""Characters of a line: a message with several paths of any length fits, a megabyte of a damaged file does not."""
 
 _FULL_CARD = (
     "the card's memory is full; expected a smaller image or grid, fewer primitives, or CUDA_VISIBLE_DEVICES= in the environment, "
@@ -97,7 +106,7 @@ _FULL_CARD = (
 def one_line(error: BaseException) -> str | None:
     """What is said of an error that a user can act on, in one line; None of a bug, which keeps its traceback."""
     if isinstance(error, NeuprimError):
-        return " ".join(str(error).split())
+        return cut(" ".join(str(error).split()), _LONGEST)
     if isinstance(error, OSError) and error.errno in DISK:
         return f"{error.filename or 'writing'}: {error.strerror}"
     torch = sys.modules.get("torch")  # what was not imported raised nothing

@@ -7,7 +7,6 @@ beside them, ``worst.json`` and its pictures, ``clip_<name>.webp`` with ground t
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections import defaultdict
@@ -19,6 +18,7 @@ from typing import Any
 import yaml
 
 from neuprim.core.errors import DataError
+from neuprim.core.io.plain import load_json, load_yaml
 from neuprim.report.regions import RegionFile, read_regions
 
 __all__ = ["RunRecord", "ViewFiles", "number", "read_run"]
@@ -147,8 +147,8 @@ def _text(path: Path) -> str | None:
 
 def _parsed_config(path: Path, text: str) -> Mapping[str, Any]:
     try:
-        config = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+        config = load_yaml(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
     if config is None:
         return {}
@@ -162,8 +162,8 @@ def _metrics(path: Path) -> Mapping[str, Any] | None:
     if text is None:
         return None
     try:
-        metrics = json.loads(text)
-    except json.JSONDecodeError as error:
+        metrics = load_json(text, infinite=True)
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: not valid JSON ({error})") from error
     if not isinstance(metrics, Mapping):
         raise DataError(f"{path}: expected an object, found {type(metrics).__name__}")
@@ -178,8 +178,8 @@ def _log(text: str) -> tuple[list[Mapping[str, Any]], int]:
         if not raw.strip():
             continue
         try:
-            line = json.loads(raw)
-        except json.JSONDecodeError:
+            line = load_json(raw, infinite=True)
+        except (ValueError, RecursionError):
             line = None
         step = number(line.get("step")) if isinstance(line, Mapping) else None
         if step is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -16,6 +15,7 @@ from torch import Tensor
 from neuprim.core.errors import DataError
 from neuprim.core.io import images
 from neuprim.core.io.files import write_json
+from neuprim.core.io.plain import finite, load_json
 from neuprim.report.pictures import error_map
 
 __all__ = ["FILE", "Region", "RegionFile", "Regions", "read_regions", "worst_region"]
@@ -115,7 +115,7 @@ def read_regions(folder: Path) -> list[RegionFile]:
     if not file.is_file():
         return []
     try:
-        entries = json.loads(file.read_text(encoding="utf-8"))
+        entries = load_json(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise DataError(f"{file}: not valid JSON ({error})") from error
     if not isinstance(entries, list):
@@ -131,7 +131,7 @@ def _entry(folder: Path, one: Any) -> RegionFile | None:
     numbers = [one.get(key) for key in ("x", "y", "side")]
     if not isinstance(name, str) or Path(name).name != name or not name.startswith("worst_") or not (folder / name).is_file():
         return None
-    if not isinstance(psnr, int | float) or not all(isinstance(n, int) for n in numbers):
+    if finite(psnr) is None or not all(isinstance(n, int) for n in numbers):
         return None
     x, y, side = numbers
     return RegionFile(folder / name, str(one.get("name")), float(psnr), f"{side}×{side} at ({x}, {y})")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from neuprim.core.io.files import write_text
+from neuprim.core.io.plain import load_json
 from neuprim.core.metrics import psnr
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.settings import TrainSettings
@@ -25,7 +25,7 @@ def open_curve(path: Path, step: int) -> Any:
     if step and path.exists():
         for text in path.read_text(encoding="utf-8").splitlines():
             try:
-                if json.loads(text)["step"] <= step:
+                if load_json(text, infinite=True)["step"] <= step:
                     kept.append(text)
             except (ValueError, KeyError, TypeError):
                 continue  # a line that a kill cut short
@@ -38,7 +38,7 @@ def read_curve(path: Path, settings: TrainSettings) -> tuple[tuple[float, float]
     found = []
     for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
         try:
-            line = json.loads(text)
+            line = load_json(text, infinite=True)
             value, step, seconds = line.get("eval_psnr"), line["step"], line["seconds"]
         except (ValueError, KeyError, TypeError, AttributeError):
             continue  # a line that a kill cut short

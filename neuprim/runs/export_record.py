@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,6 +11,7 @@ from typing import Any
 
 from neuprim.core.extensions import ExportJob, ExportReport
 from neuprim.core.io.files import write_json
+from neuprim.core.io.plain import load_json
 from neuprim.plugins.registry import EXPORTERS
 from neuprim.version import __version__
 
@@ -84,10 +84,10 @@ def _read(path: Path) -> list[Any]:
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise ValueError(f"larger than {_MAX_BYTES} bytes; expected a list of exports")
-        entries = json.loads(path.read_text(encoding="utf-8"))
+        entries = load_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return []
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError("not JSON; expected a list of exports") from error
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise ValueError("expected a list of exports")

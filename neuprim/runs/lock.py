@@ -18,6 +18,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from neuprim.core.errors import ConfigError
+from neuprim.core.io.plain import load_json
 
 __all__ = ["FILE", "held"]
 
@@ -64,7 +65,7 @@ def held(directory: Path, what: str = "run") -> Iterator[None]:
 
 def _holder(file: Path) -> str:
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
+        data = load_json(file.read_text(encoding="utf-8"))
         return f"process {int(data['pid'])} on {data['host']} (since {data['since']})"
     except (OSError, ValueError, KeyError, TypeError):
         return "another process"

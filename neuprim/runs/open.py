@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +14,7 @@ from neuprim.core.data import Dataset, View
 from neuprim.core.errors import DataError
 from neuprim.core.extensions import TrainedModel
 from neuprim.core.io.files import cache_directory
+from neuprim.core.io.plain import finite, load_json
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.backends import at_hand, computing_device
@@ -136,9 +135,9 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
     """
     path = run_dir / "metrics.json"
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        data = load_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: {error}") from error
-    if not isinstance(data, dict) or not math.isfinite(float(data.get("ssim") or 0.0)):
+    if not isinstance(data, dict) or any(finite(data[name]) is None for name in ("ssim", "train_seconds") if data.get(name) is not None):
         raise DataError(f"{path}: expected an object with metrics")
     return data

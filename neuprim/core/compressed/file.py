@@ -36,6 +36,7 @@ from neuprim.core.compressed.sections import (
 )
 from neuprim.core.errors import CheckpointError
 from neuprim.core.io.files import atomic_path
+from neuprim.core.io.plain import load_json
 
 __all__ = ["CONFIG", "MAGIC", "MOST_TIMES", "VERSION", "is_compressed", "read_compressed", "read_head", "write_compressed"]
 
@@ -229,7 +230,7 @@ def _head(path: Path, file: BinaryIO) -> _Head:
     if zlib.crc32(start[:-4] + text + table) != checksum:
         raise CheckpointError(f"{path}: the check sum of header and table is not {checksum:08x}; the file is damaged")
     try:
-        header = json.loads(text)
+        header = load_json(text)
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{path}: the header is not valid JSON ({error})") from error
     if not isinstance(header, dict):

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuprim.core.errors import DataError
+from neuprim.core.io.plain import load_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -110,7 +111,7 @@ def read_json(path: Path, what: str, instead: str) -> Any:
         DataError: it cannot be read, or is no JSON.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = load_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
     except (OSError, ValueError, RecursionError) as error:

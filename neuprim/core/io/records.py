@@ -12,7 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.errors import DataError
+from neuprim.core.errors import DataError, cut
+from neuprim.core.io.plain import finite
 
 __all__ = ["Record", "read_json"]
 
@@ -25,8 +26,7 @@ def _found(value: Any) -> str:
         return f"a list of {len(value)}"
     if isinstance(value, dict):
         return "an object"
-    text = json.dumps(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+    return cut(json.dumps(value), 60)
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Record:
 
     def number(self, key: str, expected: str = "a finite number", low: float = -math.inf, high: float = math.inf) -> float:
         """A finite number strictly between ``low`` and ``high``."""
-        value = _finite(self.values.get(key))
+        value = finite(self.values.get(key))
         if value is None or not low < value < high:
             raise self.fail(key, expected)
         return value
@@ -85,13 +85,13 @@ class Record:
         rows = self.values.get(key)
         if not isinstance(rows, list) or len(rows) not in (3, 4) or not all(isinstance(r, list) and len(r) == 4 for r in rows):
             raise self.fail(key, "4 rows of 4 numbers")
-        numbers = [[_finite(v) for v in row] for row in rows]
+        numbers = [[finite(v) for v in row] for row in rows]
         for i, row in enumerate(numbers):
             for j, number in enumerate(row):
                 if number is None:
                     raise DataError(f"{self.where}: {key}[{i}][{j}] is {_found(rows[i][j])}; expected a finite number")
         if len(numbers) == 4 and max(abs(float(a or 0.0) - b) for a, b in zip(numbers[3], (0, 0, 0, 1), strict=True)) > 1e-6:
-            raise DataError(f"{self.where}: {key}[3] is {rows[3]}; expected 0 0 0 1")
+            raise DataError(f"{self.where}: {key}[3] is {cut(str(rows[3]))}; expected 0 0 0 1")
         return torch.tensor([*numbers[:3], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
 
     def array(self, key: str, shape: tuple[int, ...], expected: str) -> Tensor:
@@ -99,7 +99,7 @@ class Record:
 
         def read(value: Any, shape: tuple[int, ...], place: str) -> Any:
             if not shape:
-                number = _finite(value)
+                number = finite(value)
                 if number is None:
                     raise DataError(f"{self.where}: {key}{place} is {_found(value)}; expected a finite number")
                 return number
@@ -118,16 +118,6 @@ class Record:
             if not isinstance(item, dict):
                 raise DataError(f"{self.where}: {key}[{i}] is {_found(item)}; expected an object")
             yield Record(item, f"{self.where}: {key}[{i}]")
-
-
-def _finite(value: Any) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return None
-    try:
-        number = float(value)
-    except OverflowError:  # JSON integers have no upper bound
-        return None
-    return number if math.isfinite(number) else None
 
 
 def read_json(path: Path, most: float = math.inf) -> Record:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.extensions import ExportJob
+from neuprim.core.io.plain import load_json
 from neuprim.core.model.fields import Conditions
 
 __all__ = ["model_box", "pack_header", "unpack_header"]
@@ -66,7 +67,7 @@ def unpack_header(text: str, path: Path) -> tuple[dict[str, Any], dict[str, tupl
         DataError: it is something else.
     """
     try:
-        record = json.loads(text)
+        record = load_json(text)
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: the neuprim header is not valid JSON ({error})") from error
     if not isinstance(record, dict) or record.get("format") != _FORMAT:

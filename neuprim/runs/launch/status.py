@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from neuprim.core.io.plain import load_json
 from neuprim.runs.events import Evaluated, Event, Finishing, Preparing, Step
 
 __all__ = ["ENDED", "Listener", "Status", "read_status", "write_status"]
@@ -71,7 +72,7 @@ def write_status(file: Path, status: Status) -> None:
 def read_status(file: Path) -> Status | None:
     """None where there is none yet, or none that can be read."""
     try:
-        data: Any = json.loads(file.read_text(encoding="utf-8"))
+        data: Any = load_json(file.read_text(encoding="utf-8"))
         return Status(**{f.name: data[f.name] for f in fields(Status)})
     except (OSError, ValueError, KeyError, TypeError):
         return None

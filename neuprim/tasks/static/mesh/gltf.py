@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuprim.core.errors import DataError
+from neuprim.core.io.plain import load_json
 from neuprim.core.notices import warn_once
 from neuprim.tasks.static.mesh.files import MAX_FACES, MAX_PARTS, MAX_VERTICES, Folder, Material, Model, check_counts
 
@@ -41,7 +42,7 @@ def read_gltf(folder: Folder) -> Model:
     path, data = folder.file, folder.own()
     try:
         text, binary = _chunks(data) if path.suffix.lower() == ".glb" else (data, None)
-        document = json.loads(text.decode("utf-8-sig"))
+        document = load_json(text.decode("utf-8-sig"))
         if not isinstance(document, dict):
             raise ValueError(f"top level is a {type(document).__name__}, no object")
         return _Document(folder, document, binary).model()

@@ -1,0 +1,95 @@
+"""JSON and YAML text as plain data.
+
+Rule: every JSON or YAML file that a run or a user's folder brings is parsed here. Its numbers are finite, and whole ones have at most 64 bits,
+so that no conversion of them can overflow later. YAML has neither anchors nor aliases, of which a few lines describe more than any memory
+holds. Nothing in the text is executed or looked up.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import yaml
+
+from neuprim.core.errors import cut
+
+__all__ = ["finite", "load_json", "load_yaml"]
+
+_DIGITS = 20
+"""A whole number of 64 bits has no more."""
+
+
+def finite(value: object) -> float | None:
+    """A number of a file as a float; None for what is no finite number: text, true, a list, NaN, 1e400."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def load_json(text: str | bytes, infinite: bool = False) -> Any:
+    """What a JSON text holds.
+
+    Args:
+        infinite: whether NaN and Infinity are read, for a report, which shows a dash in their place.
+
+    Raises:
+        ValueError, RecursionError: no JSON, or a number beyond the limits.
+    """
+    return json.loads(text, parse_int=_whole, parse_float=float if infinite else _float, parse_constant=float if infinite else _constant)
+
+
+def load_yaml(text: str) -> Any:
+    """What a YAML text holds.
+
+    Raises:
+        yaml.YAMLError, ValueError, RecursionError: no YAML, an anchor or an alias, or a number beyond the limits.
+    """
+    return yaml.load(text, Loader=_Loader)
+
+
+def _whole(text: str) -> int:
+    if len(text.lstrip("-")) > _DIGITS or not -(2**63) <= int(text) < 2**64:
+        raise ValueError(f"{cut(text)} has more than 64 bits")
+    return int(text)
+
+
+def _float(text: str) -> float:
+    value = float(text)
+    if math.isinf(value):
+        raise ValueError(f"{cut(text)} is larger than any number here")
+    return value
+
+
+def _constant(text: str) -> float:
+    raise ValueError(f"{text} is no finite number")
+
+
+class _Loader(yaml.SafeLoader):
+    """``yaml.SafeLoader`` with the limits of this module."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event = self.peek_event()
+        if getattr(event, "anchor", None) is not None:  # of an alias, too
+            raise yaml.composer.ComposerError(None, None, "anchors and aliases are not read", event.start_mark)
+        return super().compose_node(parent, index)
+
+    def number(self, node: Any) -> Any:
+        kind = node.tag.rpartition(":")[2]
+        plain = self.construct_yaml_int if kind == "int" else self.construct_yaml_float
+        try:
+            value = None if len(node.value) > 4 * _DIGITS else plain(node)
+        except (ValueError, OverflowError):
+            value = None
+        if value is None or (kind == "int" and not -(2**63) <= value < 2**64):
+            raise yaml.constructor.ConstructorError(None, None, f"{cut(node.value)} is larger than any number here", node.start_mark)
+        return value
+
+
+for _kind in ("int", "float"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _Loader.number)

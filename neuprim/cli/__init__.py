@@ -25,12 +25,16 @@ from neuprim.cli.truth import TRUTH_HELP, for_truth, truth
 from neuprim.cli.view import for_view, view
 from neuprim.core.errors import ConfigError, NeuprimError, nearest, one_line
 from neuprim.core.notices import warnings_as_lines
+from neuprim.core.trust import FLAG, trusting
 from neuprim.version import __version__
 
 if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
 
 __all__ = ["main"]
+
+_STORED = ("run", "eval", "render", "tradeoff", "export", "compress", "prune", "inspect", "view")
+"""Commands that open a run somebody made."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -88,7 +92,8 @@ def _dispatch(words: list[str]) -> int:
         known = [flag for flag in commands[args.command]._option_string_actions if flag.startswith("--")]
         raise ConfigError(f"{rest[0]}: no such argument of `neuprim {args.command}`{nearest(rest[0], known)}")
     call: Callable[[argparse.Namespace], int] = args.call
-    return call(args)
+    with trusting(getattr(args, "trust", False)):
+        return call(args)
 
 
 def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[str, argparse.ArgumentParser]]:
@@ -100,6 +105,8 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
         raw = argparse.RawDescriptionHelpFormatter
         made = sub.add_parser(name, help=summary, description=summary, epilog=epilog, formatter_class=raw, allow_abbrev=False)
         made.set_defaults(call=call)
+        if name in _STORED:
+            made.add_argument(FLAG, action="store_true", help="use addresses, and write to folders outside of it, that a stored config.yaml names")
         return made
 
     run = command("run", _run, "fit a scene", "\n\n".join([COMMON_KEYS, *([_task_names()] if with_tasks else []), EXAMPLES]))
@@ -135,7 +142,7 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
     export = command("export", _export, "write a run's model in another format", export_help(asked))
     export.usage = "neuprim export RUN_DIR --format NAME [KEY=VALUE ...] [--CONDITION TEXT ...] [--out PATH] [--force] [--json]"
     export.add_argument("run_dir", type=Path, metavar="RUN_DIR")
-    export.add_argument("--format", required=True, metavar="vdb|ply|gaussian-ply|mesh|npz", help="or a plugin's")
+    export.add_argument("--format", required=True, metavar="NAME", help="which format; all of them, those of plugins too, are listed below")
     export.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR/export)")
     export.add_argument("--force", action="store_true", help="replace files that exist")
     export.add_argument("--json", action="store_true", help="print JSON")
@@ -260,7 +267,8 @@ def _render(args: argparse.Namespace) -> int:
             progress=progress.show,
             words=args.words,
             space=args.space,
-            **{name: value for name, value in (("layers", args.layers), ("datatype", args.datatype)) if value is not None},
+            **{name: value for name in ("layers", "datatype") if (value := getattr(args, name)) is not None},
+            **({"overwrite": True} if args.force else {}),
         )
     for path in paths:
         print(path)

@@ -53,6 +53,7 @@ def for_render(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fps", type=rate, metavar="F", help="frames per second of an animation (default: about four seconds in all)")
     parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
     parser.add_argument("--frames", type=count, default=60, metavar="N", help="frames of an orbit (default: 60)")
+    parser.add_argument("--force", action="store_true", help="replace pictures of the run's report")
 
 
 def for_inspect(parser: argparse.ArgumentParser) -> None:

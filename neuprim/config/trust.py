@@ -8,35 +8,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from neuprim.config.record import RunConfig
 from neuprim.core.errors import ConfigError, cut
+from neuprim.core.trust import ENVIRONMENT, FLAG, trusted
 
-__all__ = ["ENVIRONMENT", "FLAG", "check_stored", "refuse_links", "trusting"]
-
-FLAG = "--trust"
-ENVIRONMENT = "NEUPRIM_TRUST"
-"""Environment variable that says the flag for every command; processes that a command starts inherit it."""
+__all__ = ["check_stored", "refuse_links"]
 
 _WRITTEN = "cache"
 """The setting of scenes that is written to."""
-
-
-@contextmanager
-def trusting(said: bool) -> Iterator[None]:
-    """Inside, runs are trusted if the user ``said`` so now, or in the environment."""
-    before = os.environ.get(ENVIRONMENT)
-    if said:
-        os.environ[ENVIRONMENT] = "1"
-    try:
-        yield
-    finally:
-        if said:
-            os.environ.pop(ENVIRONMENT)
-            os.environ.update({} if before is None else {ENVIRONMENT: before})
 
 
 def check_stored(config: RunConfig, typed: Mapping[str, Any] | None = None) -> None:
@@ -49,7 +31,7 @@ def check_stored(config: RunConfig, typed: Mapping[str, Any] | None = None) -> N
     Raises:
         ConfigError: names file, key and value, and what to type.
     """
-    if config.source is None or _trusted():
+    if config.source is None or trusted():
         return
     tree = {"scene": config.scene, "task.options": config.options, "model.init": config.model.init, "metrics.lpips": config.metrics.lpips}
     for key, value in _texts("", tree):
@@ -67,16 +49,12 @@ def refuse_links(run_dir: Path) -> None:
     Raises:
         ConfigError: names the link.
     """
-    if _trusted() or not run_dir.is_dir():
+    if trusted() or not run_dir.is_dir():
         return
     whole = run_dir.resolve()
     for entry in os.scandir(run_dir):
         if entry.is_symlink() and entry.is_dir() and whole not in (there := Path(entry.path).resolve()).parents:
             raise ConfigError(f"{entry.path}: is a link to {there}, outside of the run; expected a folder, or {FLAG} to write there")
-
-
-def _trusted() -> bool:
-    return os.environ.get(ENVIRONMENT, "") not in ("", "0")
 
 
 def _is_address(value: str) -> bool:

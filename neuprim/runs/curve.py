@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
-from typing import Any
+from types import TracebackType
 
 from neuprim.core.io.files import write_text
 from neuprim.core.io.plain import load_json
@@ -19,7 +21,31 @@ _VIEWS = 5  # held-out views behind the curve's eval_psnr
 _PSNR_MAX = 200.0  # dB; equal images have an infinite one
 
 
-def open_curve(path: Path, step: int) -> Any:
+class Curve:
+    """``metrics.jsonl``, to which lines are added whole or not at all: those that a full disk did not take are gone."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = open(path, "ab", buffering=0)
+
+    def add(self, line: str) -> None:
+        """Raises OSError; what was there is intact."""
+        data, end = line.encode(), os.fstat(self._file.fileno()).st_size
+        try:
+            if self._file.write(data) != len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError:
+            os.truncate(self._file.fileno(), end)
+            raise
+
+    def __enter__(self) -> Curve:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._file.close()
+
+
+def open_curve(path: Path, step: int) -> Curve:
     """metrics.jsonl, cut back to what the checkpoint knows."""
     kept = []
     if step and path.exists():
@@ -30,7 +56,7 @@ def open_curve(path: Path, step: int) -> Any:
             except (ValueError, KeyError, TypeError):
                 continue  # a line that a kill cut short
     write_text(path, "".join(f"{text}\n" for text in kept))
-    return open(path, "a", encoding="utf-8")
+    return Curve(path)
 
 
 def read_curve(path: Path, settings: TrainSettings) -> tuple[tuple[float, float], ...]:

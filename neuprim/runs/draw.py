@@ -29,6 +29,7 @@ from neuprim.runs.layers import Layers
 from neuprim.runs.measure import draw_sum
 from neuprim.runs.open import LOGS, load_dataset, load_run, placed
 from neuprim.runs.operating import read_point
+from neuprim.runs.results import refuse_results
 
 __all__ = ["FORMATS", "SETS", "render_run", "with_conditions"]
 
@@ -62,6 +63,7 @@ def render_run(
     layers: str | None = None,
     datatype: str | None = None,
     space: str = WORLD,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Draw a run's model: ``camera`` is "orbit", "test" or a file of cameras (see :mod:`neuprim.core.cameras.file`).
 
@@ -79,6 +81,7 @@ def render_run(
         space: "world": a file's cameras, lights, and what is written of cameras and depths are in the coordinates of the data's files; "scene":
             in those of the model, for volumes their unit box.
         datatype: of light and alpha in an OpenEXR file, "half" or "float" (16 or 32 bits, the default).
+        overwrite: replace pictures of the run's report.
 
     Raises:
         DataError, ConfigError, CheckpointError: bad cameras, conditions, or run directory; no image shows anything of the model.
@@ -136,6 +139,14 @@ def render_run(
         raise ConfigError(
             f"--out {out}: {len(views)} views do not fit one .{format} file; give a folder, or --format webp for an animation"
         )
+    if animate:
+        targets = [out if single and out is not None else folder.with_suffix(f".{format}")]
+    else:
+        targets = [out if single and out is not None else folder / f"{name}.{format}" for name in _file_names(views)]
+    if not overwrite:
+        refuse_results(run_dir, targets)
+    for target in targets:
+        target.parent.mkdir(parents=True, exist_ok=True)
     done = 0
     full = [False] * len(views)
 
@@ -170,29 +181,23 @@ def render_run(
         raise DataError(f"--camera {camera}: all {len(views)} images are empty: {where}{hint}")
 
     if animate:
-        target = out if single and out is not None else folder.with_suffix(f".{format}")
-        target.parent.mkdir(parents=True, exist_ok=True)
         stack = [channels.display(image(v)) for v in views]
         refuse_empty()
-        write_film(target, stack, fps or min(30.0, max(len(views) / 4.0, 5.0)))
-        return [target]
-    paths = []
-    for v, name in zip(views, _file_names(views), strict=True):
-        path = out if single and out is not None else folder / f"{name}.{format}"
-        path.parent.mkdir(parents=True, exist_ok=True)
+        write_film(targets[0], stack, fps or min(30.0, max(len(views) / 4.0, 5.0)))
+        return targets
+    for v, path in zip(views, targets, strict=True):
         if layered is None:
             _write(path, format, image(v), channels, fps)
         else:
             with watch:
                 layered.write(path, model, v, drawn)
-        paths.append(path)
     try:
         refuse_empty()
     except DataError:
-        for path in paths:
+        for path in targets:
             path.unlink()
         raise
-    return paths
+    return targets
 
 
 def _apart(model: Primitives, view: View, world: World) -> str:

@@ -8,8 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config import RunConfig, scene_of, suspects_of, task_of
+<<<<<<< HEAD
 from neuprim.core.cameras.world import World
 from neuprim.core.checkpoint import load_model, read_header
+=======
+from neuprim.config.trust import check_stored, refuse_links
+from neuprim.core.checkpoint import load_model
+>>>>>>> 2a3c7a5 (Keep code caches private, name pictures outside of their data set, refuse chained URLs)
 from neuprim.core.data import Dataset, View
 from neuprim.core.errors import DataError
 from neuprim.core.extensions import TrainedModel
@@ -83,6 +88,7 @@ def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Pr
     Raises:
         CheckpointError, ConfigError: naming the file that is missing or damaged.
     """
+    refuse_links(run_dir)
     file = run_dir / "config.yaml"
     config, place = RunConfig.from_yaml(file), file if named else None
     task = task_of(config, place)
@@ -100,7 +106,12 @@ def placed(model: Primitives, settings: RenderSettings, view: View) -> Primitive
 
 
 def context_of(config: RunConfig, progress: Progress) -> SceneContext:
-    """What a run's scene is loaded with."""
+    """What a run's scene is loaded with.
+
+    Raises:
+        ConfigError: a stored configuration has the scene contact an address, or write outside of the run (:mod:`neuprim.config.trust`).
+    """
+    check_stored(config)
     return SceneContext(config.seed, cache_directory() / "scenes", progress, computing_device(config.renderer))
 
 

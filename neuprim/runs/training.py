@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.errors import CheckpointError, RankError
 from neuprim.core.io.files import write_text
 from neuprim.core.model.edge import EDGES
+from neuprim.core.notices import warn_once
 from neuprim.core.render.backends import choose, compiled_ahead
 from neuprim.core.train.ranks import ALONE, Alone
 from neuprim.core.train.restoring import part
@@ -31,6 +33,7 @@ from neuprim.runs.events import Events, Note, Preparing, silent
 from neuprim.runs.fit import Fitted, Make, compile_kernels, one_torch_thread, start, steps
 from neuprim.runs.interrupt import interruptible
 from neuprim.runs.parts import in_parts, read_part, write_parts
+from neuprim.runs.results import discard_results
 
 __all__ = ["COMPILING", "Between", "alone", "make_ready", "save", "train"]
 
@@ -82,6 +85,8 @@ def train(
         _resume(fitted, events)
         if ranks.first:
             config.output_dir.mkdir(parents=True, exist_ok=True)
+            if config.resume and not fitted.trainer.finished:
+                discard_results(config.output_dir)
             write_text(config.output_dir / "config.yaml", fitted.config.to_yaml())
         if kernels.running:
             events(Preparing(COMPILING))
@@ -149,10 +154,11 @@ def _train(fitted: Fitted, events: Events, between: Between) -> bool:
                 line["change"] = report.change
             if line or report.step % config.train.log_every == 0 or trainer.finished:
                 line = {"step": report.step, "seconds": round(report.seconds, 4), "loss": report.loss, **report.parts, "psnr": report.psnr, "primitives": report.primitives, **line}  # fmt: skip
-                curve.write(json.dumps(line) + "\n")
-                curve.flush()
+                with _full(fitted, curve.path):
+                    curve.add(json.dumps(line) + "\n")
             if due():
-                save(fitted)
+                with _full(fitted, config.output_dir / "checkpoint.safetensors"):
+                    save(fitted)
                 last_saved = time.monotonic()
             between(fitted, stop)
             if last():
@@ -160,6 +166,19 @@ def _train(fitted: Fitted, events: Events, between: Between) -> bool:
                 break
     save(fitted)
     return interrupted
+
+
+@contextmanager
+def _full(fitted: Fitted, file: Path) -> Iterator[None]:
+    """A file of the way that cannot be written, as on a full disk, is one warning: training goes on to the next checkpoint, and only the last
+    one is an error. Where several ranks write one file together, it is an error at once."""
+    try:
+        yield
+    except (CheckpointError, OSError) as error:
+        if fitted.trainer.ranks.parts:
+            raise
+        said = str(error) if isinstance(error, CheckpointError) else f"{file}: cannot be written ({error.strerror or error})"
+        warn_once(f"{said}; training goes on from step {fitted.trainer.step} to the next checkpoint")
 
 
 def _follow(fitted: Fitted) -> bool:

@@ -20,6 +20,7 @@ import numba
 from numba import njit
 from numba.extending import overload
 
+from neuprim.core.compute.code_cache import code_cache
 from neuprim.core.io import files
 from neuprim.version import __version__
 
@@ -75,16 +76,23 @@ def sources_hash(package: Path) -> str:
 
 
 def cache_directory() -> Path:
-    """Folder of the compiled kernels for this version of the sources."""
+    """Folder of the compiled kernels for this version of the sources, which nobody else may write."""
     if os.environ.get("NUMBA_CACHE_DIR"):
-        return Path(os.environ["NUMBA_CACHE_DIR"])
-    return files.cache_directory() / "kernels" / f"{__version__}-{sources_hash(Path(__file__).parents[2])}"
+        return code_cache(Path(os.environ["NUMBA_CACHE_DIR"]))
+    own = files.cache_directory() / "kernels" / f"{__version__}-{sources_hash(Path(__file__).parents[2])}"
+    chosen = code_cache(own)
+    if chosen != own.absolute():
+        os.environ["NUMBA_CACHE_DIR"] = str(chosen)  # processes that this one starts use the private folder too
+    return chosen
+
+
+_cache_directory = functools.cache(cache_directory)  # once a process: every kernel asks
 
 
 def _jit(**options: Any) -> Callable[[Any], Any]:
     def decorate(function: Any) -> Any:
         previous = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-        numba.config.CACHE_DIR = str(cache_directory())  # type: ignore[attr-defined]
+        numba.config.CACHE_DIR = str(_cache_directory())  # type: ignore[attr-defined]
         try:
             return njit(**options)(function)
         finally:  # other packages keep their own cache

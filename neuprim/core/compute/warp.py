@@ -17,6 +17,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from neuprim.core.compute.code_cache import code_cache
 from neuprim.core.io import files
 
 __all__ = ["BLOCK", "FAST", "OPTIONS", "array", "launch", "wp"]
@@ -38,7 +39,7 @@ def _start() -> None:
     wp.config.log_level = wp.LOG_ERROR
     wp.config.enable_backward = False
     wp.config.enable_cpu_blocks = True  # without it a block on the CPU is one thread, and nothing complains
-    wp.config.kernel_cache_dir = os.fspath(files.cache_directory() / "warp")
+    wp.config.kernel_cache_dir = os.fspath(code_cache(files.cache_directory() / "warp"))
     wp.init()
 
 

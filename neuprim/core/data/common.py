@@ -20,8 +20,9 @@ from neuprim.core.data.place import world_around
 from neuprim.core.data.settings import FolderSettings
 from neuprim.core.data.views import ImageFrame, ImageViews
 from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.notices import warn_once
 
-__all__ = ["IMAGE_SUFFIXES", "every_nth", "find_image", "in_scene", "missing_files", "posed_images", "unique_names"]
+__all__ = ["IMAGE_SUFFIXES", "every_nth", "find_image", "in_scene", "missing_files", "posed_images", "say_outside", "unique_names"]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG", ".EXR")
 _LISTED = 10
@@ -34,6 +35,16 @@ def find_image(folder: Path, text: str) -> Path | None:
         return next((Path(text + s) for s in ("", *IMAGE_SUFFIXES) if Path(text + s).is_file()), None)
     except OSError:  # a name longer than the file system can hold
         return None
+
+
+def say_outside(where: str, paths: Iterable[Path]) -> None:
+    """Warn of images that lie elsewhere than the data set that names them. Rule: other tools write such paths, so that they are read; but whoever
+    made the data set chose them, and not who trains on it, who is told once."""
+    own = Path(where).resolve()
+    own = own if own.is_dir() else own.parent
+    outside = [path for path in paths if not path.resolve().is_relative_to(own)]
+    if outside:
+        warn_once(f"{where}: {len(outside)} of its images lie outside of {own}, the first {outside[0].resolve()}; they are read as it says")
 
 
 def missing_files(where: str, names: Sequence[str], hint: str = "") -> DataError:
@@ -116,6 +127,7 @@ def posed_images(
             raise DataError(
                 f"{frame.path}: image has {frame.info.channels} channels, {both[0].path} has {both[0].info.channels}; expected all RGB or all RGBA"
             )
+    say_outside(where, [frame.path for frame in both])
     alpha = both[0].info.channels == 4
     background: str = settings.background
     if background == "auto":

@@ -77,7 +77,7 @@ def drafted(final: Path, overwrite: bool) -> Iterator[Draft]:
     """A draft that is gone after the block, published or not; what errors say about its paths they say about the final ones."""
     there = final if final.is_dir() else next(p for p in (*final.parents, Path(".")) if p.exists())
     try:
-        folder = Path(tempfile.mkdtemp(prefix=".neuprim-", dir=there))
+        folder = Path(tempfile.mkdtemp(prefix=f".neuprim.{os.getpid()}.", dir=there))
     except OSError as error:
         error.filename = str(final)  # rather than a name nobody knows
         raise

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +20,7 @@ from neuprim.core.io.plain import load_json
 if TYPE_CHECKING:
     import numpy as np
 
-__all__ = ["atomic_path", "cache_directory", "publish_folder", "read_json", "write_json", "write_npy", "write_text", "writing"]
+__all__ = ["atomic_path", "cache_directory", "publish_folder", "read_json", "remove_left", "write_json", "write_npy", "write_text", "writing"]
 
 
 def cache_directory() -> Path:
@@ -36,12 +38,17 @@ def cache_directory() -> Path:
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary file beside ``path`` that replaces it when the block ends well; the old file survives any failure."""
+    """A temporary file beside ``path`` that replaces it when the block ends well; the old file survives any failure.
+
+    Raises:
+        OSError: it cannot be written, as on a full disk; names ``path``.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-    os.close(handle)
-    temporary = Path(name)
+    temporary: Path | None = None
     try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.{os.getpid()}.", suffix=".tmp")
+        os.close(handle)
+        temporary = Path(name)
         yield temporary
         with open(temporary, "r+b") as written:  # Windows flushes only what may be written
             os.fsync(written.fileno())
@@ -49,8 +56,49 @@ def atomic_path(path: Path) -> Iterator[Path]:
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)  # mkstemp makes private files
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename is None or str(error.filename).endswith(".tmp"):
+            error.filename = str(path)  # of a failed write there is no name, and nobody knows the temporary one
+        raise
     finally:
-        temporary.unlink(missing_ok=True)
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def remove_left(folder: Path) -> None:
+    """Remove the temporary files and drafts of writers that were killed, from a folder and those in it; for whoever holds its lock.
+
+    A writer of this machine that is at work keeps its files, any for a day.
+    """
+    for place in (folder, *(path for path in folder.iterdir() if path.is_dir() and not path.is_symlink())):
+        for path in place.iterdir():
+            match = _TEMPORARY.fullmatch(path.name)
+            with suppress(OSError):
+                if match is None or (_works(match["pid"] or match["draft"]) and time.time() - path.lstat().st_mtime < _DAY):
+                    continue
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    path.unlink()
+
+
+_TEMPORARY = re.compile(r"\..+?\.(?:(?P<pid>\d{1,10})\.)?\w{8}\.tmp|\.neuprim\.(?P<draft>\d{1,10})\.\w{8}")
+_DAY = 86400.0
+
+
+def _works(number: str | None) -> bool:
+    """Whether another process of this machine has that number."""
+    if number is None or int(number) == os.getpid():  # in a container numbers come again: whoever asks holds the lock, and writes nothing yet
+        return False
+    if sys.platform == "win32":  # where this question would end it
+        return True
+    try:
+        os.kill(int(number), 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, NeuprimError
+from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, NeuprimError, cut
 from neuprim.core.io.files import atomic_path
 from neuprim.core.io.store import LocalStore, Store, check_size
 
@@ -17,11 +17,13 @@ __all__ = ["ObjectStore", "is_url", "store_at"]
 
 _BUCKETS = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl", "oss")
 _LOCAL = ("file://", "local://")
+PROTOCOLS = ("file", "local", "memory", *_BUCKETS)
+"""Those that an address may have. Rule: what fsspec knows beyond these runs commands, opens archives or goes through other stores."""
 
 
 def is_url(address: str) -> bool:
     """Whether it is more than a path: ``s3://BUCKET/FOLDER``, ``memory://NAME``, ``file:///FOLDER``."""
-    return "://" in address
+    return "://" in address or "::" in address
 
 
 def store_at(address: str, copies: Path) -> Store:
@@ -31,9 +33,13 @@ def store_at(address: str, copies: Path) -> Store:
         copies: local folder for copies of what is fetched from another place.
 
     Raises:
-        ConfigError: no such protocol.
+        ConfigError: none of :data:`PROTOCOLS`, or several in a chain.
         BackendUnavailable: its package is not installed.
     """
+    protocol = address.partition("://")[0]
+    if is_url(address) and ("::" in address or protocol not in PROTOCOLS):
+        found = "a chain of protocols" if "::" in address else f"protocol {cut(protocol)!r}"
+        raise ConfigError(f"{cut(address)}: {found}; expected a folder, or a URL of {', '.join(PROTOCOLS)}, as s3://BUCKET/FOLDER")
     for start in _LOCAL:
         if address.startswith(start):
             return LocalStore(Path(address.removeprefix(start)).absolute())
@@ -41,7 +47,6 @@ def store_at(address: str, copies: Path) -> Store:
         return LocalStore(Path(address).expanduser().absolute())
     import fsspec
 
-    protocol = address.partition("://")[0]
     try:
         system, root = fsspec.core.url_to_fs(address)
     except ImportError as error:

@@ -7,6 +7,7 @@ queued again by submitit and goes on from its run's checkpoint.
 from __future__ import annotations
 
 import shutil
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,7 +61,9 @@ class Slurm:
             raise ConfigError(f"launcher.address={address}: expected {' or '.join(_EXECUTORS)}")
         local = address == "local"
         self.workers, self.threads = shared_out(settings, jobs) if local else (settings.workers or jobs, settings.threads or 1)
-        self._folder, self._died = folder.absolute() / "submitit", False
+        folder.mkdir(parents=True, exist_ok=True)
+        # Results are pickles, which run code when they are read: they come from a folder that only this launch and its user write.
+        self._folder, self._died = Path(tempfile.mkdtemp(prefix="submitit-", dir=folder.absolute())), False
         self._jobs: list[Any] = []
         try:
             self._executor = submitit.AutoExecutor(self._folder, cluster=address)

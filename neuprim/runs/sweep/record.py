@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config.overrides import parse
-from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.errors import ConfigError, DataError, cut
 from neuprim.core.io.files import read_json, write_json
 
 __all__ = ["FILE", "Row", "SweepRecord", "begun_words", "read_sweep"]
@@ -111,6 +111,9 @@ def begun_words(words: Sequence[str]) -> list[str]:
     if before is None:
         said = " ".join(words) or "nothing"
         raise ConfigError(f"{said}: no values to sweep; expected KEY=A,B,C, or output_dir=DIR resume=true of a sweep ({FILE} in it)")
+    for word in before.words:
+        if "${" in word:  # what a file says is data; see neuprim.config.composing
+            raise ConfigError(f"{Path(str(where)) / FILE}: {cut(word)} refers to something outside of the file; type the sweep's words again, with resume=true")
     return [*before.words, *words]
 
 

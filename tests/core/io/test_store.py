@@ -107,8 +107,10 @@ def test_no_bucket_is_made(tmp_path: Path) -> None:
 
 
 def test_addresses_that_nothing_can_be_made_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigError, match=r"^nonsense://x: Protocol not known.*expected a folder or a URL that fsspec knows"):
-        store_at("nonsense://x", tmp_path)
+    for address in ("nonsense://x", "ftp://user:pw@127.0.0.1:1/x", "simplecache::s3://x", "zip://x::https://y", "github://a:b@c", "memory::x"):
+        with pytest.raises(ConfigError, match=r"expected a folder, or a URL of file, local, memory, s3, .*, as s3://BUCKET/FOLDER$") as refused:
+            store_at(address, tmp_path)
+        assert str(refused.value).startswith(f"{address}: {'a chain' if '::' in address else 'protocol'}")
     monkeypatch.setitem(sys.modules, "s3fs", None)
     with pytest.raises(BackendUnavailable, match=r"^s3://bucket: s3:// needs a package .*: pip install 'neuprim\[s3\]'$"):
         store_at("s3://bucket", tmp_path)

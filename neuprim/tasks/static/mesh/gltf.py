@@ -42,7 +42,7 @@ def read_gltf(folder: Folder) -> Model:
     path, data = folder.file, folder.own()
     try:
         text, binary = _chunks(data) if path.suffix.lower() == ".glb" else (data, None)
-        document = load_json(text.decode("utf-8-sig"))
+        document = load_json(text.decode("utf-8-sig"), infinite=True)  # said of the value that has it, below
         if not isinstance(document, dict):
             raise ValueError(f"top level is a {type(document).__name__}, no object")
         return _Document(folder, document, binary).model()

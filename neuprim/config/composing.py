@@ -17,7 +17,7 @@ from neuprim.config.effort import EFFORT, LEVELS, Level, chosen_level
 from neuprim.config.from_file import chosen_beside, settings_below
 from neuprim.config.groups import check_groups, check_scene, presets, task_choices
 from neuprim.config.outputs import DEFAULT_TASK, output_directory, run_name
-from neuprim.config.overrides import Assignment, assigned, expand_sweep, key_of, parse, sweep_names, swept_keys
+from neuprim.config.overrides import Assignment, assigned, expand_sweep, key_of, parse, sweep_names, swept_keys, without_place
 from neuprim.config.record import RunConfig, RunSettings
 from neuprim.config.resuming import begun_run, chosen_again, new_words, not_installed, refuse_contradictions, words_of_both
 from neuprim.config.schema import REQUIRED, defaults, is_free, like, setting_names
@@ -181,14 +181,22 @@ def compose_all(overrides: Sequence[str], check_output: bool = True, stored: Run
     explicit = str(_compose(alone[0], False, files, stored).output_dir) if asked and asked[-1] is not None else None
     base = output_directory(explicit, "-".join([*fixed, "sweep"]), goes_on, check_output)
     names = sweep_names(overrides, combinations)
-    made = []
+    made, recorded = [], (base / "sweep.json").is_file()
     for config, words_alone, name in zip(configs, alone, names, strict=True):
-        if goes_on and (base / name / "config.yaml").is_file():
+        begun = _begun_as(base / name, words_alone) if goes_on else None
+        if begun is True or (begun is False and not recorded):  # else the record of the sweep refuses other words
             config = _compose([*words_alone, "resume=true", assigned("output_dir", str(base / name))], False, files, stored)
         own = [*(word for word in config.overrides if key_of(word) != "resume"), *resume]
         own = [word for word in own if word not in ("output_dir=null", assigned("output_dir", str(base / name)))]
         made.append(dataclasses.replace(config, output_dir=base / name, resume=goes_on, overrides=own))
     return made
+
+
+def _begun_as(directory: Path, words: Sequence[str]) -> bool | None:
+    """Whether the run of a sweep was begun with these words; None where it was not begun."""
+    if not (directory / "config.yaml").is_file():
+        return None
+    return without_place(RunConfig.from_yaml(directory).overrides) == without_place(words)
 
 
 # ---------------------------------------------------------------- choosing

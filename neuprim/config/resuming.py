@@ -90,6 +90,8 @@ def chosen_again(begun: RunConfig, chosen: Mapping[str, str | None]) -> dict[str
     for key, word in own.items():
         typed = chosen.get(key)
         if typed is not None and split(typed)[1] != split(word)[1]:
+            if key == "task":
+                TASKS.find(typed)  # a typing error is none
             raise _contradiction(begun, key, typed, word)
     return {**chosen, **{key: chosen.get(key) or word for key, word in own.items()}}
 

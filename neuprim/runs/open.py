@@ -8,13 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config import RunConfig, scene_of, suspects_of, task_of
-<<<<<<< HEAD
+from neuprim.config.trust import check_stored, refuse_links
 from neuprim.core.cameras.world import World
 from neuprim.core.checkpoint import load_model, read_header
-=======
-from neuprim.config.trust import check_stored, refuse_links
-from neuprim.core.checkpoint import load_model
->>>>>>> 2a3c7a5 (Keep code caches private, name pictures outside of their data set, refuse chained URLs)
 from neuprim.core.data import Dataset, View
 from neuprim.core.errors import DataError
 from neuprim.core.extensions import TrainedModel

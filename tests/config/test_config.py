@@ -5,10 +5,8 @@ from pathlib import Path
 import pytest
 
 from neuprim.config import RunConfig, compose, compose_all, expand_sweep
-from neuprim.core import notices
 from neuprim.core.checked import checked
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
-from neuprim.core.notices import NeuprimWarning
 from neuprim.core.task import SceneContext
 from neuprim.plugins.registry import load_task
 from tests.plugins.fakes import install, site, toy
@@ -439,14 +437,12 @@ def test_a_run_older_than_units_of_rates_goes_on_in_those_it_began_in(tmp_path: 
     Path("run").mkdir()
     for _ in range(2):  # the second time its config.yaml says that there are none
         Path("run/config.yaml").write_text(begun.replace(units, ""))
-        with pytest.warns(NeuprimWarning, match=r"run/config.yaml: without train.rate_units; rates of means go on"):
-            notices._said.clear()
-            resumed = compose([*words, "resume=true"])
+        resumed = compose([*words, "resume=true"])
         assert resumed.train.rate_units == {} and resumed.non_default["train.rate_units.means"] == ("absolute", None)
         begun = resumed.to_yaml()
-    assert compose([*words, "resume=true", "train.rate_units.quats=extent"]).train.rate_units == {"means": "absolute", "quats": "extent"}
-    assert compose([*words[::2], "resume=true"]).preset == "quick"
-    Path("run/config.yaml").write_text(compose(["preset=paper"]).to_yaml())
+    assert compose([*words, "resume=true", "train.rate_units.quats=extent"]).train.rate_units == {"quats": "extent"}
+    assert compose([*words[::2], "resume=true"]).preset == "paper", "as it was begun"
+    Path("run/config.yaml").write_text(compose(words, check_output=False).to_yaml())
     assert compose([*words, "resume=true"]).train.rate_units == {"means": "absolute"}
     Path("run/config.yaml").unlink()
     assert compose([*words, "resume=true"]).train.rate_units == {"means": "absolute"}

@@ -61,7 +61,7 @@ def test_what_loses_nothing_is_converted() -> None:
         ({"path": "x", "form": "soft\n"}, "scene.form='soft\\n': expected sharp or soft"),
         ({"path": "x", "exposure": 0}, "scene.exposure=0: expected a number above 0, or auto"),
         ({"path": "x", "exposure": math.nan}, "scene.exposure=nan: expected a finite number above 0, or auto"),
-        ({"path": "x", "exposure": 10**400}, f"scene.exposure={10**400}: expected a finite number above 0, or auto"),
+        ({"path": "x", "exposure": 10**400}, f"scene.exposure=1{76 * '0'}...: expected a finite number above 0, or auto"),
         ({"path": "x", "rates": {"a": -1}}, "scene.rates.a=-1: expected a number of at least 0"),
         ({"path": "x", "rates": 1}, "scene.rates=1: expected entries, each as scene.rates.KEY=VALUE"),
         ({"path": "x", "grids": {"smoke": "s"}}, "scene.grids.smoke: no such setting; valid: scene.grids.density, scene.grids.flames"),

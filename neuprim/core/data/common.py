@@ -37,10 +37,10 @@ def find_image(folder: Path, text: str) -> Path | None:
         return None
 
 
-def say_outside(where: str, paths: Iterable[Path]) -> None:
+def say_outside(where: str, home: Path, paths: Iterable[Path]) -> None:
     """Warn of images that lie elsewhere than the data set that names them. Rule: other tools write such paths, so that they are read; but whoever
     made the data set chose them, and not who trains on it, who is told once."""
-    own = Path(where).resolve()
+    own = home.resolve()
     own = own if own.is_dir() else own.parent
     outside = [path for path in paths if not path.resolve().is_relative_to(own)]
     if outside:
@@ -96,6 +96,7 @@ def posed_images(
     exposure: float | Callable[[ImageViews], float] = 1.0,
     extra: object = None,
     places: Sequence[str] = (),
+    home: Path | None = None,
 ) -> Dataset:
     """The data set of two splits, whose view sets are :class:`~neuprim.core.data.views.ImageViews`.
 
@@ -111,6 +112,7 @@ def posed_images(
         exposure: what linear values are divided by, or how that number follows from the training views.
         extra: see :class:`~neuprim.core.data.dataset.Dataset`.
         places: conditions that are positions, in the coordinates of the file, float64.
+        home: the data set's folder, where it is not that of ``where``.
 
     Raises:
         DataError: an empty split, an image without alpha beside one with, sRGB beside linear files, or damaged images.
@@ -127,7 +129,7 @@ def posed_images(
             raise DataError(
                 f"{frame.path}: image has {frame.info.channels} channels, {both[0].path} has {both[0].info.channels}; expected all RGB or all RGBA"
             )
-    say_outside(where, [frame.path for frame in both])
+    say_outside(where, home or Path(where), [frame.path for frame in both])
     alpha = both[0].info.channels == 4
     background: str = settings.background
     if background == "auto":

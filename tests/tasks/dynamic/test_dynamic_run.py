@@ -13,7 +13,7 @@ from PIL import Image
 
 from neuprim.cli import main
 from neuprim.config import compose
-from neuprim.core.errors import CheckpointError, ConfigError, DataError
+from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import write_vdb
 from neuprim.runs.draw import render_run
 from neuprim.runs.measure import evaluate_run
@@ -221,7 +221,7 @@ def test_windows_that_never_open(files: Path, tmp_path: Path) -> None:
 
 def test_resuming_with_other_frames(files: Path, tmp_path: Path) -> None:
     fit(files, tmp_path / "run", "train.iterations=2", "scene.frames=1:2")
-    with pytest.raises(CheckpointError, match="views with other names"):
+    with pytest.raises(ConfigError, match=r"^scene\.frames=3:4: the run to resume was begun with scene\.frames=1:2"):
         fit(files, tmp_path / "run", "train.iterations=4", "scene.frames=3:4", "resume=true")
 
 

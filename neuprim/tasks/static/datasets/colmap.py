@@ -65,7 +65,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     train, test = every_nth(frames, asked.test_every)
     prefix = "" if asked.images == "images" else asked.images
     points = _read_points(reconstruction)
-    return posed_images(str(model), folder.resolve().name, train, test, asked, context, points=points, prefix=prefix)
+    return posed_images(str(model), folder.resolve().name, train, test, asked, context, points=points, prefix=prefix, home=folder)
 
 
 def _read_frames(model: Path, folder: Path, reconstruction: Any, skip_missing: bool) -> list[ImageFrame]:

@@ -22,7 +22,7 @@ from neuprim.core.data.views import ImageFrame, ImageViews
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.notices import warn_once
 
-__all__ = ["IMAGE_SUFFIXES", "every_nth", "find_image", "in_scene", "missing_files", "posed_images", "say_outside", "unique_names"]
+__all__ = ["IMAGE_SUFFIXES", "every_nth", "find_image", "in_scene", "missing_files", "posed_images", "unique_names"]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG", ".EXR")
 _LISTED = 10
@@ -37,7 +37,7 @@ def find_image(folder: Path, text: str) -> Path | None:
         return None
 
 
-def say_outside(where: str, home: Path, paths: Iterable[Path]) -> None:
+def _say_outside(where: str, home: Path, paths: Iterable[Path]) -> None:
     """Warn of images that lie elsewhere than the data set that names them. Rule: other tools write such paths, so that they are read; but whoever
     made the data set chose them, and not who trains on it, who is told once."""
     own = home.resolve()
@@ -129,7 +129,7 @@ def posed_images(
             raise DataError(
                 f"{frame.path}: image has {frame.info.channels} channels, {both[0].path} has {both[0].info.channels}; expected all RGB or all RGBA"
             )
-    say_outside(where, home or Path(where), [frame.path for frame in both])
+    _say_outside(where, home or Path(where), [frame.path for frame in both])
     alpha = both[0].info.channels == 4
     background: str = settings.background
     if background == "auto":

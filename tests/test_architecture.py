@@ -65,7 +65,7 @@ CORE: dict[str, set[str]] = {
     "settings": {"checked"},
     "metrics": {"errors"},
     "cameras": {"errors", "io"},
-    "compute": {"io"},
+    "compute": {"io", "notices"},
     "environment": {"errors", "io"},
     "model": {"cameras", "checked", "compute", "errors", "settings"},
     "compressed": {"errors", "io", "model"},

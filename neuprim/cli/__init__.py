@@ -24,17 +24,14 @@ from neuprim.cli.tradeoff import FORMS, for_tradeoff, of_words, tradeoff
 from neuprim.cli.truth import TRUTH_HELP, for_truth, truth
 from neuprim.cli.view import for_view, view
 from neuprim.core.errors import ConfigError, NeuprimError, nearest, one_line
+from neuprim.core.io.trust import trusting
 from neuprim.core.notices import warnings_as_lines
-from neuprim.core.trust import FLAG, trusting
 from neuprim.version import __version__
 
 if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
 
 __all__ = ["main"]
-
-_STORED = ("run", "eval", "render", "tradeoff", "export", "compress", "prune", "inspect", "view")
-"""Commands that open a run somebody made."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -105,8 +102,7 @@ def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[
         raw = argparse.RawDescriptionHelpFormatter
         made = sub.add_parser(name, help=summary, description=summary, epilog=epilog, formatter_class=raw, allow_abbrev=False)
         made.set_defaults(call=call)
-        if name in _STORED:
-            made.add_argument(FLAG, action="store_true", help="use addresses, and write to folders outside of it, that a stored config.yaml names")
+        arguments.for_stored(made, name)
         return made
 
     run = command("run", _run, "fit a scene", "\n\n".join([COMMON_KEYS, *([_task_names()] if with_tasks else []), EXAMPLES]))

@@ -7,6 +7,8 @@ import math
 import re
 from pathlib import Path
 
+from neuprim.core.io.trust import FLAG
+
 __all__ = [
     "count",
     "decibels",
@@ -15,6 +17,7 @@ __all__ = [
     "for_compress",
     "for_inspect",
     "for_render",
+    "for_stored",
     "numbers",
     "rate",
     "row",
@@ -35,6 +38,18 @@ def for_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", type=count, default=1, metavar="N", help="runs of each, with seeds from 0 (default: 1)")
     parser.add_argument("--out", type=Path, default=Path("outputs/paper"), metavar="DIR", help="gets a run directory each")
     parser.add_argument("--estimate", action="store_true", help="only say what would run, and for how long")
+
+
+_STORED = ("run", "eval", "render", "tradeoff", "export", "compress", "prune", "inspect", "view")
+"""Commands that open a run somebody made."""
+
+
+def for_stored(parser: argparse.ArgumentParser, name: str) -> None:
+    """Adds the user's word for what a stored configuration would reach (:mod:`neuprim.config.trust`), to the commands that read one."""
+    if name in _STORED:
+        parser.add_argument(
+            FLAG, action="store_true", help="use addresses, and write to folders outside of it, that a stored config.yaml names"
+        )
 
 
 def for_render(parser: argparse.ArgumentParser) -> None:

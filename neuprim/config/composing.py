@@ -12,14 +12,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuprim.config.comparing import differences, flat
 from neuprim.config.declared import check_names, check_preset, check_typed, complete_options, options_of, unused
 from neuprim.config.effort import EFFORT, LEVELS, Level, chosen_level
-from neuprim.config.from_file import chosen_beside, settings_below
+from neuprim.config.from_file import as_data, chosen_beside, settings_below
 from neuprim.config.groups import check_groups, check_scene, presets, task_choices
 from neuprim.config.outputs import DEFAULT_TASK, output_directory, run_name
-from neuprim.config.overrides import Assignment, assigned, expand_sweep, key_of, parse, sweep_names, swept_keys, without_place
+from neuprim.config.overrides import Assignment, assigned, expand_sweep, key_of, parse, sweep_names, swept_keys
 from neuprim.config.record import RunConfig, RunSettings
-from neuprim.config.resuming import begun_run, chosen_again, new_words, not_installed, refuse_contradictions, words_of_both
+from neuprim.config.resuming import begun_as, begun_run, chosen_again, new_words, not_installed, refuse_contradictions, words_of_both
 from neuprim.config.schema import REQUIRED, defaults, is_free, like, setting_names
 from neuprim.config.trust import check_stored, refuse_links
 from neuprim.core.checked import checked, shown
@@ -151,7 +152,7 @@ def _composed(
         options=options,
         unused=unused(spec, declared),
         overrides=list(overrides) if before is None else words_of_both(before, overrides),
-        non_default={**changed, **_differences(_typed(plain), _typed(full, settings))},
+        non_default={**changed, **differences(_typed(plain), _typed(full, settings))},
         made_by=MadeBy(__version__, Maker.of(task_info), added, None if loss is None else Maker.of(loss[0])),
     )
     if begun is not None:
@@ -183,20 +184,13 @@ def compose_all(overrides: Sequence[str], check_output: bool = True, stored: Run
     names = sweep_names(overrides, combinations)
     made, recorded = [], (base / "sweep.json").is_file()
     for config, words_alone, name in zip(configs, alone, names, strict=True):
-        begun = _begun_as(base / name, words_alone) if goes_on else None
+        begun = begun_as(base / name, words_alone) if goes_on else None
         if begun is True or (begun is False and not recorded):  # else the record of the sweep refuses other words
             config = _compose([*words_alone, "resume=true", assigned("output_dir", str(base / name))], False, files, stored)
         own = [*(word for word in config.overrides if key_of(word) != "resume"), *resume]
         own = [word for word in own if word not in ("output_dir=null", assigned("output_dir", str(base / name)))]
         made.append(dataclasses.replace(config, output_dir=base / name, resume=goes_on, overrides=own))
     return made
-
-
-def _begun_as(directory: Path, words: Sequence[str]) -> bool | None:
-    """Whether the run of a sweep was begun with these words; None where it was not begun."""
-    if not (directory / "config.yaml").is_file():
-        return None
-    return without_place(RunConfig.from_yaml(directory).overrides) == without_place(words)
 
 
 # ---------------------------------------------------------------- choosing
@@ -297,7 +291,7 @@ def _merge(
         OmegaConf.update(tree, "model.density", {}, merge=False)
     for a in (*below, *values):
         try:
-            OmegaConf.update(tree, a.key, _as_data(a.value) if a.whole else a.value, merge=not a.whole, force_add=True)
+            OmegaConf.update(tree, a.key, as_data(a.value) if a.whole else a.value, merge=not a.whole, force_add=True)
         except (OmegaConfBaseException, ValueError, TypeError, AssertionError) as error:
             raise ConfigError(f"{a.text}: {' '.join(str(error).split())}") from error
     seconds = _said(values, "max_seconds")
@@ -306,21 +300,7 @@ def _merge(
     strategy = _said(values, "strategy", "train.population")
     if strategy and strategy[-1] != base["train"]["population"]["strategy"] and not _said(values, "grow_from", "train.population"):
         OmegaConf.update(tree, "train.population.grow_from", 1.0)  # the preset's is for populations that grow that way
-    return _plain(OmegaConf.create(dict(base))), _as_data(_plain(tree), back=True)
-
-
-def _as_data(value: Any, back: bool = False) -> Any:
-    """A stored value with every ``${`` hidden from OmegaConf, which would look up what follows; or shown again.
-
-    Rule: what a file says is data, and only what is typed or comes with a package may refer to something. No YAML text has the character 0.
-    """
-    if isinstance(value, Mapping):
-        return {_as_data(key, back): _as_data(item, back) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_as_data(item, back) for item in value]
-    if not isinstance(value, str):
-        return value
-    return value.replace("$\0", "$") if back else value.replace("$", "$\0")
+    return _plain(OmegaConf.create(dict(base))), as_data(_plain(tree), back=True)
 
 
 def _said(values: Sequence[Assignment], name: str, group: str = "train") -> list[Any]:
@@ -422,25 +402,4 @@ def _typed(full: Mapping[str, Any], settings: RunSettings | None = None) -> dict
     made = dataclasses.asdict(settings or _settings(full))
     tree = {**made, "scene": full["scene"], "task": full["task"]}
     del tree["output_dir"], tree["resume"]
-    return _flat(tree)
-
-
-def _flat(node: Mapping[str, Any], where: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in node.items():
-        name = f"{where}.{key}" if where else str(key)
-        if isinstance(value, Mapping) and value:
-            flat.update(_flat(value, name))
-        elif not isinstance(value, Mapping):
-            flat[name] = value
-    return flat
-
-
-def _differences(default: Mapping[str, Any], actual: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    found: dict[str, tuple[Any, Any]] = {}
-    for key in [*default, *(k for k in actual if k not in default)]:
-        before, after = default.get(key), actual.get(key)
-        before = None if before == REQUIRED else before
-        if before != after:
-            found[key] = (before, after)
-    return found
+    return flat(tree)

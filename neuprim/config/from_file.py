@@ -12,7 +12,7 @@ from neuprim.config.record import RunConfig, RunSettings
 from neuprim.core.errors import ConfigError
 from neuprim.plugins.names import BUILT_IN, qualified, split
 
-__all__ = ["choices_of", "chosen_beside", "settings_below", "stored_config"]
+__all__ = ["as_data", "choices_of", "chosen_beside", "settings_below", "stored_config"]
 
 _NOT_TAKEN = ("output_dir", "resume")
 
@@ -66,6 +66,20 @@ def settings_below(stored: RunConfig, scene: str | None, values: Sequence[Assign
             continue
         other = {"train.max_seconds": "train.iterations", "train.iterations": "train.max_seconds"}.get(name)
         yield _assigned(name, None if other in typed else value)
+
+
+def as_data(value: Any, back: bool = False) -> Any:
+    """A stored value with every ``${`` hidden from OmegaConf, which would look up what follows; or shown again.
+
+    Rule: what a file says is data, and only what is typed or comes with a package may refer to something. No YAML text has the character 0.
+    """
+    if isinstance(value, Mapping):
+        return {as_data(key, back): as_data(item, back) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_data(item, back) for item in value]
+    if not isinstance(value, str):
+        return value
+    return value.replace("$\0", "$") if back else value.replace("$", "$\0")
 
 
 def _leaves(stored: RunConfig) -> Iterator[tuple[str, Any]]:

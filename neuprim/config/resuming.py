@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from neuprim.config.comparing import flat
 from neuprim.config.from_file import choices_of
 from neuprim.config.groups import task_choices
 from neuprim.config.outputs import DEFAULT_TASK, ROOT, output_directory, run_name
@@ -19,7 +20,7 @@ from neuprim.plugins.names import qualified, split
 from neuprim.plugins.provenance import Maker, missing
 from neuprim.plugins.registry import LOSSES, SCENES, TASKS
 
-__all__ = ["begun_run", "chosen_again", "new_words", "not_installed", "refuse_contradictions", "words_of_both"]
+__all__ = ["begun_as", "begun_run", "chosen_again", "new_words", "not_installed", "refuse_contradictions", "words_of_both"]
 
 
 def not_installed(assignments: Sequence[Assignment], task: str, scene: str | None) -> ConfigError | None:
@@ -80,6 +81,13 @@ def begun_run(assignments: Sequence[Assignment], chosen: Mapping[str, str | None
     return None
 
 
+def begun_as(directory: Path, words: Sequence[str]) -> bool | None:
+    """Whether the run of a sweep was begun with these words; None where it was not begun."""
+    if not (directory / "config.yaml").is_file():
+        return None
+    return without_place(RunConfig.from_yaml(directory).overrides) == without_place(words)
+
+
 def chosen_again(begun: RunConfig, chosen: Mapping[str, str | None]) -> dict[str, str | None]:
     """Task, scene and preset of a run that goes on.
 
@@ -119,7 +127,7 @@ def refuse_contradictions(begun: RunConfig, now: RunConfig, paths: Iterable[str]
         ConfigError: names the setting, and what the run was begun with.
     """
     free = {*(f"scene.{name}" for name in (*paths, *_FREE))}
-    before, after = dict(_fixed(begun)), dict(_fixed(now))
+    before, after = _fixed(begun), _fixed(now)
     for key, value in before.items():
         if key not in free and key in after and after[key] != value:
             raise _contradiction(begun, key, after[key], value)
@@ -138,18 +146,10 @@ def _contradiction(begun: RunConfig, key: str, typed: Any, was: Any) -> ConfigEr
     )
 
 
-def _fixed(config: RunConfig) -> Iterator[tuple[str, Any]]:
-    def below(key: str, value: Any) -> Iterator[tuple[str, Any]]:
-        if isinstance(value, Mapping) and value:
-            for name, item in value.items():
-                yield from below(f"{key}.{name}", item)
-        else:
-            yield key, list(value) if isinstance(value, tuple) else value
-
-    yield from (("seed", config.seed), ("train.loss", config.train.loss))
-    yield from below("model", dataclasses.asdict(config.model))
-    yield from below("scene", config.scene)
-    yield from below("task.options", config.options)
+def _fixed(config: RunConfig) -> dict[str, Any]:
+    tree = {"model": dataclasses.asdict(config.model), "scene": config.scene, "task": {"options": config.options}}
+    found = flat({**tree, "seed": config.seed, "train": {"loss": config.train.loss}})
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in found.items()}
 
 
 def _directory(asked: Any, chosen: Mapping[str, str | None]) -> Path:
@@ -161,7 +161,9 @@ def _directory(asked: Any, chosen: Mapping[str, str | None]) -> Path:
         try:
             return Path(str(OmegaConf.to_container(OmegaConf.create({"at": asked}), resolve=True)["at"])).expanduser()  # type: ignore[index, call-overload]
         except OmegaConfBaseException as error:
-            raise ConfigError(f"output_dir={shown(asked)}: {' '.join(str(error).split())}; expected a directory, to resume its run") from error
+            raise ConfigError(
+                f"output_dir={shown(asked)}: {' '.join(str(error).split())}; expected a directory, to resume its run"
+            ) from error
     task = chosen["task"] or DEFAULT_TASK
     scene = chosen["scene"] or task_choices(TASKS.loaded(task)[1]).scene
     return output_directory(None, run_name(task, scene), True)

@@ -13,7 +13,7 @@ from typing import Any
 
 from neuprim.config.record import RunConfig
 from neuprim.core.errors import ConfigError, cut
-from neuprim.core.trust import ENVIRONMENT, FLAG, trusted
+from neuprim.core.io.trust import ENVIRONMENT, FLAG, trusted
 
 __all__ = ["check_stored", "refuse_links"]
 
@@ -40,7 +40,9 @@ def check_stored(config: RunConfig, typed: Mapping[str, Any] | None = None) -> N
             continue
         what = "an address, which would be contacted" if _is_address(value) else "a folder outside of the run, which would be written to"
         allow = f"type {key}=... to use it" if typed is not None else f"{FLAG} allows it"
-        raise ConfigError(f"{config.source}: {key} is {cut(value)!r}, {what}; {allow}, {ENVIRONMENT}=1 in the environment does so for all runs")
+        raise ConfigError(
+            f"{config.source}: {key} is {cut(value)!r}, {what}; {allow}, {ENVIRONMENT}=1 in the environment does so for all runs"
+        )
 
 
 def refuse_links(run_dir: Path) -> None:

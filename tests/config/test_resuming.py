@@ -60,7 +60,13 @@ def test_contradictions_are_refused_by_name(run: Path, words: list[str], key: st
 
 
 def test_what_may_change_does(run: Path) -> None:
-    words = ["train.iterations=90", "renderer.threads=1", "renderer.backend=reference", "train.checkpoint_every_seconds=5", "scene.memory=99"]
+    words = [
+        "train.iterations=90",
+        "renderer.threads=1",
+        "renderer.backend=reference",
+        "train.checkpoint_every_seconds=5",
+        "scene.memory=99",
+    ]
     config = resumed(*words, "scene.vdb=/moved/fire", "scene.cache=/cache", "train.rates={means: 1e-4}")
     assert (config.train.iterations, config.renderer.threads, config.renderer.backend) == (90, 1, "reference")
     assert (config.scene["vdb"], config.scene["size"], config.model.primitives, config.seed) == ("/moved/fire", 24, 40, 5)
@@ -81,6 +87,9 @@ def test_runs_of_a_sweep_go_on_as_they_were_begun(run: Path) -> None:
         config.output_dir.mkdir(parents=True)
         config.output_dir.joinpath("config.yaml").write_text(config.to_yaml().replace("log_every: 20", "log_every: 7"))
     again = compose_all([*words, "resume=true"])
-    assert [(c.seed, c.train.log_every, c.resume, str(c.output_dir)) for c in again] == [(1, 7, True, "sweep/seed-1"), (2, 7, True, "sweep/seed-2")]
+    assert [(c.seed, c.train.log_every, c.resume, str(c.output_dir)) for c in again] == [
+        (1, 7, True, "sweep/seed-1"),
+        (2, 7, True, "sweep/seed-2"),
+    ]
     with pytest.raises(ConfigError, match=r"^model\.primitives=8: the run to resume was begun with model\.primitives=9"):
         compose_all([*words[:2], "model.primitives=8", "output_dir=sweep", "resume=true"])

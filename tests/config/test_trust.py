@@ -11,7 +11,7 @@ from neuprim.cli import main
 from neuprim.config import RunConfig, compose, stored_config
 from neuprim.config.trust import check_stored, refuse_links
 from neuprim.core.errors import CheckpointError, ConfigError
-from neuprim.core.trust import ENVIRONMENT, trusting
+from neuprim.core.io.trust import ENVIRONMENT, trusting
 from neuprim.runs.open import context_of
 
 VOLUMES = ["task=dynamic", "scene=vdb", "scene.vdb=/data/fire"]
@@ -24,7 +24,9 @@ def stored(folder: Path, *words: str) -> RunConfig:
     return stored_config(folder)
 
 
-@pytest.mark.parametrize("address", ["ftp://user:pw@127.0.0.1:1/x", "s3://bucket/x", "simplecache::s3://b/x", r"\\\\host\\share", "/tmp/other/cache"])
+@pytest.mark.parametrize(
+    "address", ["ftp://user:pw@127.0.0.1:1/x", "s3://bucket/x", "simplecache::s3://b/x", r"\\\\host\\share", "/tmp/other/cache"]
+)
 def test_caches_elsewhere_need_the_users_word(tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     config = stored(tmp_path / "run", *VOLUMES)
     config.scene["cache"] = address

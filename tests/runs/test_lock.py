@@ -66,3 +66,33 @@ def test_a_killed_process_lets_go(tmp_path: Path) -> None:
         other.wait()
     with held(tmp_path):
         assert f'"pid": {os.getpid()}' in (tmp_path / FILE).read_text()
+
+
+@posix
+def test_what_killed_writers_left_is_gone_and_what_others_write_stays(tmp_path: Path) -> None:
+    script = "import sys, time; from pathlib import Path; from neuprim.core.io.files import atomic_path\nwith atomic_path(Path(sys.argv[1])): time.sleep(600)"
+    run = tmp_path / "run"
+    (run / "renders").mkdir(parents=True)
+    writers = [
+        subprocess.Popen([sys.executable, "-c", script, str(run / name)]) for name in ("model.safetensors", "renders/a.png", "b.npz")
+    ]
+    draft = run / f".neuprim.{writers[0].pid}.abcd1234"
+    draft.mkdir()
+    (draft / "out").touch()
+    mine = [run / "model.safetensors", run / ".hidden", run / ".notes.tmp"]
+    try:
+        while len(list(run.rglob("*.tmp"))) < 3:
+            assert all(writer.poll() is None for writer in writers)
+        for path in mine:
+            path.touch()
+        for writer in writers[:2]:
+            writer.kill()
+            writer.wait()
+        with held(run):
+            left = [path.name for path in run.rglob("*.tmp") if path not in mine]
+        assert len(left) == 1 and left[0].startswith(f".b.npz.{writers[2].pid}."), "that one is at work"
+        assert not draft.exists() and all(path.exists() for path in mine)
+    finally:
+        for writer in writers:
+            writer.kill()
+            writer.wait()

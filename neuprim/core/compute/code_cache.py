@@ -32,7 +32,9 @@ def code_cache(folder: Path) -> Path:
         why = f"cannot be used ({error.strerror or error})"
     if not why:
         return folder
-    warn_once(f"{folder}: {why}; compiled code is not taken from there, and this process compiles its own. Expected a folder of yours alone")
+    warn_once(
+        f"{folder}: {why}; compiled code is not taken from there, and this process compiles its own. Expected a folder of yours alone"
+    )
     return _private()
 
 

@@ -20,7 +20,17 @@ from neuprim.core.io.plain import load_json
 if TYPE_CHECKING:
     import numpy as np
 
-__all__ = ["atomic_path", "cache_directory", "publish_folder", "read_json", "remove_left", "write_json", "write_npy", "write_text", "writing"]
+__all__ = [
+    "atomic_path",
+    "cache_directory",
+    "publish_folder",
+    "read_json",
+    "remove_left",
+    "write_json",
+    "write_npy",
+    "write_text",
+    "writing",
+]
 
 
 def cache_directory() -> Path:
@@ -70,7 +80,7 @@ def remove_left(folder: Path) -> None:
 
     A writer of this machine that is at work keeps its files, any for a day.
     """
-    for place in (folder, *(path for path in folder.iterdir() if path.is_dir() and not path.is_symlink())):
+    for place in (folder, *(path for path in folder.iterdir() if path.name[0] != "." and path.is_dir() and not path.is_symlink())):
         for path in place.iterdir():
             match = _TEMPORARY.fullmatch(path.name)
             with suppress(OSError):
@@ -88,7 +98,9 @@ _DAY = 86400.0
 
 def _works(number: str | None) -> bool:
     """Whether another process of this machine has that number."""
-    if number is None or int(number) == os.getpid():  # in a container numbers come again: whoever asks holds the lock, and writes nothing yet
+    if (
+        number is None or int(number) == os.getpid()
+    ):  # in a container numbers come again: whoever asks holds the lock, and writes nothing yet
         return False
     if sys.platform == "win32":  # where this question would end it
         return True

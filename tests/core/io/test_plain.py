@@ -34,7 +34,17 @@ def test_what_is_no_finite_number(value: object) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["a: &x 1", "a: &x [1]\nb: *x", "a: *x", "? &k a\n: 1", f"a: {'9' * 400}", "a: " + ":".join(["59"] * 100_000), "a: !!int abc", "a: !!python/object:os.system {}"]
+    "text",
+    [
+        "a: &x 1",
+        "a: &x [1]\nb: *x",
+        "a: *x",
+        "? &k a\n: 1",
+        f"a: {'9' * 400}",
+        "a: " + ":".join(["59"] * 100_000),
+        "a: !!int abc",
+        "a: !!python/object:os.system {}",
+    ],
 )
 def test_yaml_with_references_huge_numbers_or_code_is_refused_at_once(text: str) -> None:
     begun = time.perf_counter()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,6 +69,9 @@ class Slurm:
         try:
             self._executor = submitit.AutoExecutor(self._folder, cluster=address)
         except RuntimeError as error:
+            self.close(False)
+            with suppress(OSError):  # it has files of others
+                folder.rmdir()
             raise BackendUnavailable(f"launcher=slurm: {_line(error)}; launcher.address=local does without a cluster") from None
         try:
             self._executor.update_parameters(

@@ -119,6 +119,20 @@ def test_submitit_does_jobs(tmp_path: Path) -> None:
     assert not (tmp_path / "launch").exists()
 
 
+@posix
+def test_submitits_results_come_from_a_folder_of_this_launch_alone(tmp_path: Path) -> None:
+    pytest.importorskip("submitit")
+    from neuprim.runs.launch.slurm import Slurm
+
+    (tmp_path / "submitit").mkdir(mode=0o777)  # where somebody may have put pickles of theirs
+    engines = [Slurm(LauncherSettings("slurm", workers=1, address="local"), 1, tmp_path) for _ in range(2)]
+    folders = [Path(engine._executor.folder) for engine in engines]
+    assert len({*folders, tmp_path / "submitit"}) == 3
+    assert all(folder.parent == tmp_path and folder.stat().st_mode & 0o777 == 0o700 and not any(folder.iterdir()) for folder in folders)
+    for engine in engines:
+        engine.close(False)
+
+
 @pytest.mark.slow
 def test_submitit_does_all_sorts_of_jobs(tmp_path: Path) -> None:
     """It waits fifteen seconds for the result of a process that was killed."""

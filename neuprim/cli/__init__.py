@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from neuprim.cli import arguments
 from neuprim.cli.environment_flags import add_environment_flags, environment_of
@@ -88,9 +88,8 @@ def _dispatch(words: list[str]) -> int:
     if rest:
         known = [flag for flag in commands[args.command]._option_string_actions if flag.startswith("--")]
         raise ConfigError(f"{rest[0]}: no such argument of `neuprim {args.command}`{nearest(rest[0], known)}")
-    call: Callable[[argparse.Namespace], int] = args.call
     with trusting(getattr(args, "trust", False)):
-        return call(args)
+        return int(args.call(args))
 
 
 def _parsers(with_tasks: bool, asked: Sequence[str] = ()) -> tuple[Parser, dict[str, argparse.ArgumentParser]]:
@@ -255,6 +254,8 @@ def _render(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.runs.draw import render_run
 
+    given = {"layers": args.layers, "datatype": args.datatype, "overwrite": args.force or None}
+    more: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     with DrawProgress(plain_console(stderr=True)) as progress:
         paths = render_run(
             *(run_dir, args.camera, args.size, args.format, args.out, args.frames, args.conditions, args.fps),
@@ -263,8 +264,7 @@ def _render(args: argparse.Namespace) -> int:
             progress=progress.show,
             words=args.words,
             space=args.space,
-            **{name: value for name in ("layers", "datatype") if (value := getattr(args, name)) is not None},
-            **({"overwrite": True} if args.force else {}),
+            **more,
         )
     for path in paths:
         print(path)

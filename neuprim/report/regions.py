@@ -131,7 +131,8 @@ def _entry(folder: Path, one: Any) -> RegionFile | None:
     numbers = [one.get(key) for key in ("x", "y", "side")]
     if not isinstance(name, str) or Path(name).name != name or not name.startswith("worst_") or not (folder / name).is_file():
         return None
-    if finite(psnr) is None or not all(isinstance(n, int) for n in numbers):
+    value = finite(psnr)
+    if value is None or not all(isinstance(n, int) for n in numbers):
         return None
     x, y, side = numbers
-    return RegionFile(folder / name, str(one.get("name")), float(psnr), f"{side}×{side} at ({x}, {y})")
+    return RegionFile(folder / name, str(one.get("name")), value, f"{side}×{side} at ({x}, {y})")

@@ -67,7 +67,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary.chmod(0o666 & ~umask)  # mkstemp makes private files
         os.replace(temporary, path)
     except OSError as error:
-        if error.filename is None or str(error.filename).endswith(".tmp"):
+        if error.errno is not None and (error.filename is None or str(error.filename).endswith(".tmp")):
             error.filename = str(path)  # of a failed write there is no name, and nobody knows the temporary one
         raise
     finally:

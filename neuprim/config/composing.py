@@ -73,7 +73,7 @@ def _compose(overrides: Sequence[str], check_output: bool, files: Files, stored:
             chosen = chosen_beside(stored, chosen)
         return _composed(overrides, assignments, chosen, check_output, files, stored)
     except UnknownPlugin as error:
-        told = not_installed(assignments, chosen["task"] or DEFAULT_TASK, chosen["scene"])
+        told = not_installed(assignments, chosen["task"], chosen["scene"])
         if told is None:
             raise
         raise told from error

@@ -23,17 +23,17 @@ from neuprim.plugins.registry import LOSSES, SCENES, TASKS
 __all__ = ["begun_as", "begun_run", "chosen_again", "new_words", "not_installed", "refuse_contradictions", "words_of_both"]
 
 
-def not_installed(assignments: Sequence[Assignment], task: str, scene: str | None) -> ConfigError | None:
+def not_installed(assignments: Sequence[Assignment], task: str | None, scene: str | None) -> ConfigError | None:
     """The error that names what made the run to resume, where that is missing; None where nothing is resumed or the fault is another.
 
     Args:
         assignments: all that was typed.
-        task, scene: words that chose them; None: nothing was typed.
+        task, scene: words that chose them; None: nothing was typed, and the run has its own.
     """
     given: dict[str, Any] = {a.key: a.value for a in assignments}
     if given.get("resume") is not True:
         return None
-    directory = _latest(task) if given.get("output_dir") is None else Path(str(given["output_dir"])).expanduser()
+    directory = _latest(task or DEFAULT_TASK) if given.get("output_dir") is None else Path(str(given["output_dir"])).expanduser()
     try:
         made_by = None if directory is None else RunConfig.from_yaml(directory).made_by
     except NeuprimError:  # a damaged run says nothing
@@ -46,7 +46,7 @@ def not_installed(assignments: Sequence[Assignment], task: str, scene: str | Non
         (LOSSES, made_by.loss, given.get("train.loss")),
     )
     for group, maker, word in kinds:
-        if maker is None or split(str(word))[1] != maker.name:
+        if maker is None or (word is not None and split(str(word))[1] != maker.name):
             continue  # the run had none, or another one is wanted now
         entry = f"{made_by.task.name}.{maker.name}" if group is SCENES else maker.name
         try:

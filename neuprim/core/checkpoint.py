@@ -254,11 +254,15 @@ def _field(path: Path, header: Mapping[str, Any], task: TaskSpec, kind: str) -> 
         raise CheckpointError(f"{path}: header field {kind!r} is {cut(repr(entry))}; expected {{'class': ..., 'settings': {{...}}}}")
     known = task.fields or {}
     if entry["class"] not in known:
-        raise CheckpointError(f"{path}: unknown {kind} field {cut(entry['class'])!r} for task {task.name!r}{nearest(entry['class'], known)}")
+        raise CheckpointError(
+            f"{path}: unknown {kind} field {cut(entry['class'])!r} for task {task.name!r}{nearest(entry['class'], known)}"
+        )
     for name, value in entry["settings"].items():
         if not isinstance(value, (int, float, str, bool, type(None), list)) or (isinstance(value, int) and abs(value) > 10_000):
             raise CheckpointError(f"{path}: {kind} setting {cut(name)}={cut(repr(value))} is not plausible")
     try:
         return known[entry["class"]](**entry["settings"])
     except (TypeError, ValueError) as error:
-        raise CheckpointError(f"{path}: {kind} field {entry['class']!r} refused its settings {cut(str(entry['settings']))}: {error}") from error
+        raise CheckpointError(
+            f"{path}: {kind} field {entry['class']!r} refused its settings {cut(str(entry['settings']))}: {error}"
+        ) from error

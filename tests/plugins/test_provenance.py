@@ -120,6 +120,7 @@ def test_without_the_package_every_command_names_it(made: Path, site: Path, caps
         ["render", "r", "--camera", "orbit", "--time", "0.5"],
         ["export", "r", "--format", "ply"],
         ["inspect", "r", "--out", "x.html"],
+        ["run", "output_dir=r", "resume=true"],
         ["run", "task=glow", "output_dir=r", "resume=true"],
         ["run", "task=neuprim-glow:glow", "output_dir=r", "resume=true"],
     ):

@@ -107,8 +107,17 @@ def test_no_bucket_is_made(tmp_path: Path) -> None:
 
 
 def test_addresses_that_nothing_can_be_made_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for address in ("nonsense://x", "ftp://user:pw@127.0.0.1:1/x", "simplecache::s3://x", "zip://x::https://y", "github://a:b@c", "memory::x"):
-        with pytest.raises(ConfigError, match=r"expected a folder, or a URL of file, local, memory, s3, .*, as s3://BUCKET/FOLDER$") as refused:
+    for address in (
+        "nonsense://x",
+        "ftp://user:pw@127.0.0.1:1/x",
+        "simplecache::s3://x",
+        "zip://x::https://y",
+        "github://a:b@c",
+        "memory::x",
+    ):
+        with pytest.raises(
+            ConfigError, match=r"expected a folder, or a URL of file, local, memory, s3, .*, as s3://BUCKET/FOLDER$"
+        ) as refused:
             store_at(address, tmp_path)
         assert str(refused.value).startswith(f"{address}: {'a chain' if '::' in address else 'protocol'}")
     monkeypatch.setitem(sys.modules, "s3fs", None)

@@ -15,12 +15,13 @@ from neuprim.config.overrides import NOT_SWEPT, Assignment, key_of, without_plac
 from neuprim.config.record import RunConfig
 from neuprim.core.checked import shown
 from neuprim.core.errors import ConfigError, NeuprimError
+from neuprim.core.notices import warn_once
 from neuprim.plugins.mechanism import Group, UnknownPlugin
 from neuprim.plugins.names import qualified, split
 from neuprim.plugins.provenance import Maker, missing
 from neuprim.plugins.registry import LOSSES, SCENES, TASKS
 
-__all__ = ["begun_as", "begun_run", "chosen_again", "new_words", "not_installed", "refuse_contradictions", "words_of_both"]
+__all__ = ["SHARD", "begun_as", "begun_run", "chosen_again", "new_words", "not_installed", "refuse_contradictions", "words_of_both"]
 
 
 def not_installed(assignments: Sequence[Assignment], task: str | None, scene: str | None) -> ConfigError | None:
@@ -66,7 +67,7 @@ def begun_run(assignments: Sequence[Assignment], chosen: Mapping[str, str | None
 
     Raises:
         ConfigError: only the place is said, and no run is there.
-        CheckpointError, ConfigError: its ``config.yaml`` is damaged.
+        CheckpointError, ConfigError: its ``config.yaml`` is damaged; of settings that do not exist it warns where others were typed.
         UnknownPlugin: the place follows from a task, which is not installed.
     """
     given: dict[str, Any] = {a.key: a.value for a in assignments}
@@ -74,7 +75,13 @@ def begun_run(assignments: Sequence[Assignment], chosen: Mapping[str, str | None
         return None
     directory, bare = _directory(given.get("output_dir"), chosen), not file and given.keys() <= {"resume", "output_dir"}
     if (directory / "config.yaml").is_file() and (bare or not (directory / _SEARCH).exists()):
-        return RunConfig.from_yaml(directory)
+        try:
+            return RunConfig.from_yaml(directory)
+        except ConfigError as error:  # as of a version with other settings
+            if bare:
+                raise
+            warn_once(f"{error}; the run goes on with what was typed alone")
+            return None
     if bare:
         hint = ", or -m for the sweep there" if (directory / _SWEEP).is_file() else ""
         raise ConfigError(f"output_dir={directory} resume=true: no run was begun there (no config.yaml); expected a run's directory{hint}")
@@ -106,8 +113,8 @@ def chosen_again(begun: RunConfig, chosen: Mapping[str, str | None]) -> dict[str
 
 def new_words(begun: RunConfig, overrides: Sequence[str]) -> list[str]:
     """The words that say something else than those that the run was begun with, and those of its place."""
-    last = {key_of(word): word for word in begun.overrides}
-    return [word for word in overrides if key_of(word) in NOT_SWEPT or last.get(key_of(word)) != word]
+    before, now = ({key_of(word): word for word in words} for words in (begun.overrides, overrides))  # of each key the last
+    return [word for word in overrides if key_of(word) in (*NOT_SWEPT, SHARD) or before.get(key_of(word)) != now[key_of(word)]]
 
 
 def words_of_both(begun: RunConfig, overrides: Sequence[str]) -> list[str]:
@@ -132,6 +139,9 @@ def refuse_contradictions(begun: RunConfig, now: RunConfig, paths: Iterable[str]
         if key not in free and key in after and after[key] != value:
             raise _contradiction(begun, key, after[key], value)
 
+
+SHARD = "train.shard"
+"""The setting that is of how a run is launched: with several processes it goes on as it was begun, with one it is what was typed."""
 
 _FREE = ("memory", "chunks")
 """Settings of scenes that may change: what is decoded at once, and the chunks, of which the record of what is done has its own word."""

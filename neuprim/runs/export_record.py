@@ -84,9 +84,11 @@ def _read(path: Path) -> list[Any]:
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise ValueError(f"larger than {_MAX_BYTES} bytes; expected a list of exports")
-        entries = load_json(path.read_text(encoding="utf-8"))
+        text = path.read_bytes()
     except FileNotFoundError:
         return []
+    try:
+        entries = load_json(text)
     except (ValueError, RecursionError) as error:
         raise ValueError("not JSON; expected a list of exports") from error
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):

@@ -20,13 +20,21 @@ from neuprim.config.groups import check_groups, check_scene, presets, task_choic
 from neuprim.config.outputs import DEFAULT_TASK, output_directory, run_name
 from neuprim.config.overrides import Assignment, assigned, expand_sweep, key_of, parse, sweep_names, swept_keys
 from neuprim.config.record import RunConfig, RunSettings
-from neuprim.config.resuming import SHARD, begun_as, begun_run, chosen_again, new_words, not_installed, refuse_contradictions, words_of_both
+from neuprim.config.resuming import (
+    begun_as,
+    begun_run,
+    chosen_again,
+    new_words,
+    not_installed,
+    of_launch,
+    refuse_contradictions,
+    words_of_both,
+)
 from neuprim.config.schema import REQUIRED, defaults, is_free, like, setting_names
 from neuprim.config.trust import check_stored, refuse_links
 from neuprim.core.checked import checked, shown
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.settings import MetricsSettings
-from neuprim.core.train.ranks.place import place_of
 from neuprim.core.uses import build_settings
 from neuprim.plugins.blame import blamed
 from neuprim.plugins.provenance import MadeBy, Maker
@@ -117,9 +125,8 @@ def _composed(
         raise ConfigError(f"preset={preset}: task {spec.name!r} has no such preset{nearest(preset, presets(spec))}")
 
     base, declared_paths = _base(spec, scene_name, preset, own.options, files, package)
-    files_settings = [
-        a for one in (begun, stored) if one is not None for a in settings_below(one, scene_word, values) if a.key != SHARD or place_of()
-    ]
+    again = () if begun is None else (a for a in settings_below(begun, scene_word, values) if a.key not in of_launch(overrides))
+    files_settings = (*again, *(() if stored is None else settings_below(stored, scene_word, values)))
     below = (*files_settings, *(() if level is None else level.settings))
     for assignment in (*below, *values):
         _check_key(assignment, base, scene_name)

@@ -16,12 +16,13 @@ from neuprim.config.record import RunConfig
 from neuprim.core.checked import shown
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.notices import warn_once
+from neuprim.core.train.ranks.place import place_of
 from neuprim.plugins.mechanism import Group, UnknownPlugin
 from neuprim.plugins.names import qualified, split
 from neuprim.plugins.provenance import Maker, missing
 from neuprim.plugins.registry import LOSSES, SCENES, TASKS
 
-__all__ = ["SHARD", "begun_as", "begun_run", "chosen_again", "new_words", "not_installed", "refuse_contradictions", "words_of_both"]
+__all__ = ["begun_as", "begun_run", "chosen_again", "new_words", "not_installed", "of_launch", "refuse_contradictions", "words_of_both"]
 
 
 def not_installed(assignments: Sequence[Assignment], task: str | None, scene: str | None) -> ConfigError | None:
@@ -114,7 +115,15 @@ def chosen_again(begun: RunConfig, chosen: Mapping[str, str | None]) -> dict[str
 def new_words(begun: RunConfig, overrides: Sequence[str]) -> list[str]:
     """The words that say something else than those that the run was begun with, and those of its place."""
     before, now = ({key_of(word): word for word in words} for words in (begun.overrides, overrides))  # of each key the last
-    return [word for word in overrides if key_of(word) in (*NOT_SWEPT, SHARD) or before.get(key_of(word)) != now[key_of(word)]]
+    return [word for word in overrides if key_of(word) in (*NOT_SWEPT, _SHARD, _VIEWS) or before.get(key_of(word)) != now[key_of(word)]]
+
+
+def of_launch(overrides: Sequence[str]) -> set[str]:
+    """The settings that a run does not take over from how it was launched before: one process has all primitives, and where the words that
+    describe the run are given to several, each has the views that these say."""
+    if place_of() is None:
+        return {_SHARD}
+    return {_VIEWS} if {key_of(word) for word in overrides} & {"task", "scene"} else set()
 
 
 def words_of_both(begun: RunConfig, overrides: Sequence[str]) -> list[str]:
@@ -140,8 +149,8 @@ def refuse_contradictions(begun: RunConfig, now: RunConfig, paths: Iterable[str]
             raise _contradiction(begun, key, after[key], value)
 
 
-SHARD = "train.shard"
-"""The setting that is of how a run is launched: with several processes it goes on as it was begun, with one it is what was typed."""
+_SHARD, _VIEWS = "train.shard", "train.views_per_step"
+"""Settings of each process, which follow from how many are launched."""
 
 _FREE = ("memory", "chunks")
 """Settings of scenes that may change: what is decoded at once, and the chunks, of which the record of what is done has its own word."""

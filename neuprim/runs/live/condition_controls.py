@@ -90,7 +90,7 @@ class ConditionControls:
 
     def _slid(self, spec: ConditionSpec, value: float) -> None:
         if not math.isclose(value, float(self._value(spec).clamp(*spec.range)), abs_tol=1e-6):  # beyond its ends the slider says nothing
-            self._set(spec, torch.tensor(value, dtype=torch.float32))
+            self._set(spec, torch.tensor(value, dtype=torch.float32).clamp(*spec.range))
 
     def _typed(self, spec: ConditionSpec, text: str) -> None:
         if text == self._shown(spec, self._value(spec)):

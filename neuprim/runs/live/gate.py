@@ -1,4 +1,4 @@
-"""Who may talk to the page's server: those who know its token, from the server's own page, and nobody else.
+"""Who may talk to the page's server: those who know its token, from the server's own page under one of its names, and nobody else.
 
 viser itself lets everybody in, also every web page that its user has open (browsers let any page open a WebSocket to this machine). Its server
 asks a function of viser's about each request before anything is sent; the gate stands before that function. The address that is printed holds
@@ -7,10 +7,13 @@ the token once; the page that it opens gets it as a cookie, which other sites' p
 
 from __future__ import annotations
 
+import functools
 import hmac
 import http
+import ipaddress
 import re
 import secrets
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -36,27 +39,36 @@ class Gate:
         stands: whether it was put before a server.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, host: str = "localhost") -> None:
+        """``host``: that the server listens on."""
         self.token = secrets.token_urlsafe(32)
         self.stands = False
+        self._hosts = _hosts(host)
 
     def address(self, host: str, port: int) -> str:
         """What one opens in a browser."""
         return f"http://{f'[{host}]' if ':' in host else host}:{port}/?token={self.token}"
 
     @contextmanager
-    def before_viser(self) -> Iterator[None]:
+    def before_viser(self, refusal: Callable[[Any], str | None], refused: Callable[[Any, str], None]) -> Iterator[None]:
         """Servers of viser that start inside have the gate before them; check :attr:`stands` afterwards.
+
+        Args:
+            refusal, refused: of messages, see :class:`~neuprim.runs.live.incoming.CheckedConnection`.
 
         viser hands its check of requests to ``websockets.asyncio.server.serve`` and has no place for another one; so it finds there, for the
         moment of its start, a ``serve`` that puts the gate in front.
         """
         from websockets.asyncio import server
 
+        from neuprim.runs.live.incoming import LARGEST, CheckedConnection
+
         plain = server.serve
+        connection: Any = functools.partial(CheckedConnection, refusal=refusal, refused=refused)
 
         def guarded(*args: Any, process_request: Callable[..., Any] | None = None, **more: Any) -> Any:
             self.stands = True
+            more |= {"max_size": LARGEST, "create_connection": connection}
             return plain(*args, process_request=self.guarding(process_request), **more)
 
         server.serve = guarded  # type: ignore[assignment, misc]
@@ -90,12 +102,19 @@ class Gate:
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not _HOST.fullmatch(hosts[0]):
             return "no host, or several"
+        if not self._answers(hosts[0]):  # a name of somebody else's that leads here, by which his page would pass for ours
+            return f"this server's name is {' or '.join(self._hosts)}"
         if origins and (len(origins) != 1 or origins[0] != f"http://{hosts[0]}"):
             return "another site's page may not come in here"
         given = parse_qs(urlsplit(path).query).get("token", []) + self._cookies(headers, hosts[0])
         if not any(hmac.compare_digest(one.encode(), self.token.encode()) for one in given):
             return "open the address that neuprim printed, with its token"
         return None
+
+    def _answers(self, host: str) -> bool:
+        """Whether a Host header has one of the server's names; where it listens on every address, also one of those, as nobody can bend it."""
+        name = re.sub(r":\d+$", "", host).lower()
+        return name in self._hosts or (_is_everywhere(self._hosts[-1]) and _is_address(name))
 
     def _more(self, headers: Any) -> dict[str, str]:
         """Headers of every answer."""
@@ -111,6 +130,25 @@ class Gate:
     def _cookies(self, headers: Any, host: str) -> list[str]:
         parts = [part.strip().partition("=") for line in headers.get_all("Cookie") for part in line.split(";")]
         return [value for name, _, value in parts if name == _name(host)]
+
+
+def _hosts(host: str) -> tuple[str, ...]:
+    """Names of a server that listens on ``host``, as a Host header has them."""
+    own = [socket.gethostname(), socket.getfqdn()] if _is_everywhere(host) else []
+    asked = f"[{host}]" if ":" in host else host
+    return tuple(dict.fromkeys(name.lower() for name in ("localhost", "127.0.0.1", "[::1]", *own, asked)))
+
+
+def _is_everywhere(host: str) -> bool:
+    return _is_address(host) and ipaddress.ip_address(host.strip("[]")).is_unspecified
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host.strip("[]"))
+    except ValueError:
+        return False
+    return True
 
 
 def _name(host: str) -> str:

@@ -43,7 +43,7 @@ class Page:
         self._lock = threading.Lock()
         self._start: View | None = None
         server.viser.scene.set_up_direction(subject.up)
-        server.on_visit(self._come, self._gone)
+        server.on_visit(self._come, self._gone, self._refused)
 
     def _come(self, client: Any) -> None:
         """A page was opened: what it needs of the model is asked of the desk."""
@@ -55,6 +55,10 @@ class Page:
         if session is not None:
             session.end()
         self.desk.forget(client.client_id)
+
+    def _refused(self, client: int, reason: str) -> None:
+        if (session := self.sessions.get(client)) is not None:
+            session.say(f"refused: {reason}")
 
     def _failed(self, client: Any, error: Exception) -> None:
         client.add_notification("neuprim", str(error), color="red")

@@ -51,11 +51,12 @@ class PageServer:
     def __init__(self, settings: ViewerSettings, title: str) -> None:
         """Raises :class:`ConfigError` where host or port are not to be had, :class:`BackendUnavailable` without viser."""
         viser = require_viser()
-        gate = Gate()
+        self._refused_to: Callable[[int, str], None] = lambda client, reason: None
+        gate = Gate(settings.host)
         # A page that is closed while something is sent to it is nothing that anybody must be told.
         warnings.filterwarnings("ignore", message=r"Queued a \w+ on a closed connection")
         port = _free_port(settings.host, settings.port)
-        with contextlib.redirect_stdout(io.StringIO()), gate.before_viser():
+        with contextlib.redirect_stdout(io.StringIO()), gate.before_viser(self._refusal, self._refused):
             self.viser = viser.ViserServer(host=settings.host, port=port, label=title, verbose=False)
         if not (gate.stands and self.viser.get_port() == port and self._tunnels_off()):
             self.close()
@@ -81,10 +82,25 @@ class PageServer:
             return False
         return True
 
-    def on_visit(self, come: Callable[[Any], None], gone: Callable[[Any], None]) -> None:
-        """Be told of every page that is opened and closed, as a ``viser.ClientHandle``."""
+    def on_visit(self, come: Callable[[Any], None], gone: Callable[[Any], None], refused: Callable[[int, str], None]) -> None:
+        """Be told of every page that is opened and closed, as a ``viser.ClientHandle``, and why a message was refused, with a page's number."""
+        self._refused_to = refused
         self.viser.on_client_connect(come)
         self.viser.on_client_disconnect(gone)
+
+    def _refusal(self, message: Any) -> str | None:
+        from neuprim.runs.live.incoming import refusal
+
+        return refusal(message, self._control)
+
+    def _control(self, uuid: str) -> Any:
+        guis = (client.gui for client in self.viser.get_clients().values())
+        return next((gui._gui_input_handle_from_uuid[uuid] for gui in guis if uuid in gui._gui_input_handle_from_uuid), None)
+
+    def _refused(self, connection: Any, reason: str) -> None:
+        for number, own in self.viser._websock_server._live_connections.items():
+            if own is connection:
+                self._refused_to(number, reason)
 
     def close(self) -> None:
         """Let everybody go, and the port."""

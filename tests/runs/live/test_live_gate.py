@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -100,7 +101,7 @@ def test_without_its_gate_a_server_does_not_stay(monkeypatch: pytest.MonkeyPatch
     """Another version of viser may start otherwise; then there is no viewer rather than an open one."""
 
     @contextmanager
-    def nothing(self: Gate) -> Iterator[None]:
+    def nothing(self: Gate, *args: Any) -> Iterator[None]:
         yield
 
     monkeypatch.setattr(Gate, "before_viser", nothing)
@@ -126,6 +127,30 @@ def test_ports_and_hosts_that_are_not_to_be_had(page: PageServer) -> None:
         PageServer(ViewerSettings(port=port), "another")
     with pytest.raises(ConfigError, match=r"host\.invalid"):
         PageServer(ViewerSettings("host.invalid", 0), "another")
+
+
+@pytest.mark.parametrize(
+    ("listens", "good", "bad"),
+    [
+        (
+            "127.0.0.1",
+            ["localhost", "LOCALHOST:80", "127.0.0.1:9", "[::1]:9"],
+            ["evil.example", "localhost.evil.example:9", "10.0.0.3", "127.0.0.2"],
+        ),
+        ("10.0.0.3", ["10.0.0.3:8080", "localhost:8080"], ["10.0.0.4:8080", "evil.example:8080", "10.0.0.3.evil.example"]),
+        ("fe80::1", ["[fe80::1]:8080"], ["[fe80::2]:8080", "evil.example"]),
+        ("render.lan", ["render.lan:8080", "Render.LAN"], ["lan:8080", "10.0.0.3"]),
+        ("0.0.0.0", ["10.0.0.3:8080", "[fe80::1]", "localhost", socket.gethostname()], ["evil.example:8080", "localhost."]),
+        ("::", ["10.0.0.3:8080", "[::1]:8"], ["evil.example:8080"]),
+    ],
+)
+def test_a_server_answers_to_its_own_names_alone(listens: str, good: list[str], bad: list[str]) -> None:
+    """A name that its owner bends to this machine would make his page one of the same origin, token or not."""
+    gate = Gate(listens)
+    for host in [*good, *bad]:
+        found = gate.refusal(f"/?token={gate.token}", Headers({"Host": host, "Origin": f"http://{host}"}))
+        assert (found is None) is (host in good), (host, found)
+        assert found is None or found.startswith("this server's name is localhost or 127.0.0.1 or [::1]")
 
 
 @pytest.mark.parametrize(

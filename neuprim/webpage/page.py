@@ -18,6 +18,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, orbit
 from neuprim.core.cameras.world import World
+from neuprim.core.conditions import FRAMES
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.edge import EDGES
 from neuprim.core.model.fields import ConditionSpec, Field
@@ -26,7 +27,7 @@ from neuprim.core.settings import RenderSettings
 from neuprim.webpage.constants import shader_constants
 from neuprim.webpage.numbers import pack_model
 
-__all__ = ["Condition", "PageView", "WebPage", "camera_numbers", "web_page"]
+__all__ = ["Condition", "PageView", "WebPage", "camera_numbers", "fullest", "web_page"]
 
 _SHARED = ("lib.js", "codec.js", "sort.js", "prepare.js", "shadow.js", "worker.js")
 """Scripts that the worker runs, too."""
@@ -113,8 +114,7 @@ def web_page(
     """
     scripts = {kind: _script(kind, field) for kind, field in (("density", model.density), ("colour", model.colour))}
     packed = pack_model(model, level)
-    given = {one.spec.name: one.value for one in conditions}
-    middle, radius, top = _extent(packed.model, given)
+    middle, radius, top = _extent(packed.model, fullest(packed.model, conditions))
     header = {
         "name": name,
         "count": model.count,
@@ -166,6 +166,16 @@ def _script(kind: str, field: Field) -> str:
 
 
 # ---------------------------------------------------------------- what the page knows of the scene
+
+
+def fullest(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Tensor]:
+    """The conditions where a viewer begins; if no primitive is active there, those among them along one range where most are."""
+    start = {one.spec.name: one.value for one in conditions}
+    if model.places(start)[1].count:
+        return start
+    ranges = [one.spec for one in conditions if one.spec.shape == () and one.spec.range[1] - one.spec.range[0] <= _WIDE]
+    others = [start | {spec.name: start[spec.name].new_tensor(x)} for spec in ranges for x in torch.linspace(*spec.range, FRAMES).tolist()]
+    return max(others, key=lambda found: model.places(found)[1].count, default=start)
 
 
 @torch.no_grad()

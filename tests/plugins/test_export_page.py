@@ -17,8 +17,11 @@ from neuprim.report import Viewer, write_report
 from neuprim.report.page import LIMIT
 from neuprim.runs.export import export_run
 from neuprim.runs.open import open_run
+from neuprim.tasks.dynamic.colour import TimeHarmonics
+from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.webpage.scene import held_out
 from tests.core import tiny
+from tests.page_models import random_model
 from tests.plugins import marked
 from tests.short_runs import fit, words
 
@@ -60,6 +63,27 @@ def test_a_page_begins_where_something_is_to_be_seen(tmp_path: Path) -> None:
         for i, view in enumerate(map(dataset.test.view, range(len(dataset.test))))
     }
     assert len(views) == 4 and max(picked[view.name] for view in views) == pytest.approx(picked[views[0].name], rel=0.2)
+
+
+@pytest.mark.parametrize("start", [0.1, 0.9])
+@pytest.mark.parametrize("active", ["late", "never", "no primitive"])
+def test_a_page_of_what_is_not_active(active: str, start: float, tmp_path: Path) -> None:
+    """Nothing is active at time 0.1; the page looks at where something is later, if anything ever is."""
+    model = random_model(TimeDensity(2, "window", edge=2), TimeHarmonics(0, powers=1, waves=0), count=0 if active == "no primitive" else 40)
+    model.params["means"] += 7.0
+    model.params["log_window"].fill_(math.log(0.05))
+    model.params["window_center"].fill_(9.0 if active == "never" else 0.9)
+    run = marked.write_run(tmp_path / "run", model, ["task=dynamic", "scene=vdb", f"scene.vdb={tmp_path / 'gone'}"], color_space="linear")
+    report = export_run(run, "html", tmp_path / "p.html", [f"time={start}"])
+    header = header_of((tmp_path / "p.html").read_text(encoding="utf-8"))
+    assert header["conditions"][0]["value"] == pytest.approx(start) and header["count"] == model.count
+    if active == "late":
+        assert header["center"] == pytest.approx([7.0] * 3, abs=1.0) and 1.0 < header["radius"] < 5.0
+        assert 30 < report.errors["psnr"] < math.inf
+    else:
+        assert report.errors["psnr"] == math.inf
+        with pytest.raises(ConfigError, match="no primitive absorbs anything under these conditions"):
+            export_run(run, "gaussian-ply", tmp_path / "g.ply", [f"time={start}"])
 
 
 def test_levels_lose_what_they_say(trained: Path, tmp_path: Path) -> None:

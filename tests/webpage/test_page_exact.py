@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from neuprim.tasks.dynamic.density import TimeDensity
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.relight.harmonics import LightHarmonics
 from neuprim.tasks.static.fields import SphericalHarmonics
+from neuprim.webpage import PageView
 from tests.browsers import Tab, open_tab
 from tests.page_models import LIGHT, SETTINGS, camera_at, page_of, random_model
 
@@ -85,6 +87,25 @@ def test_dynamic_models(time: str, colour: TimeHarmonics, chromium: Any, tmp_pat
         for moment in (0.0, 0.37, 1.0):
             assert error(tab, model, camera_at(EYES[0]), {"time": torch.tensor(moment, dtype=torch.float64)}) < ERROR
         assert tab.faults == []
+
+
+@pytest.mark.parametrize("count", [0, 60])
+def test_a_start_at_which_nothing_is_active(count: int, chromium: Any, tmp_path: Path) -> None:
+    """The page is empty there, and right at other times; empty throughout without primitives."""
+    model = random_model(TimeDensity(3, "window+motion", edge=2, gain=True), TimeHarmonics(1, powers=2, waves=0), count=count)
+    model.params["log_window"].fill_(math.log(0.05))
+    model.params["window_center"].fill_(0.8)
+    for level, views in ((0, []), (1, [PageView("first", camera_at(EYES[0]), {"time": torch.tensor(0.1)})])):
+        held = page_of(model, tmp_path / "p.html", {"time": torch.tensor(0.1)}, level=level, views=views).model
+        with open_tab(chromium, tmp_path / "p.html") as tab:
+            assert f"0 of {count} primitives" in tab.page.inner_text("#info")
+            for moment in (0.1, 0.8, 0.0):
+                found = tab.numbers(camera_at(EYES[0]), {"time": torch.tensor(moment, dtype=torch.float64)})
+                if moment == 0.8 and count:
+                    assert error(tab, held, camera_at(EYES[0]), {"time": torch.tensor(moment, dtype=torch.float64)}) < ERROR
+                else:
+                    assert (found[..., :3] == 0).all() and (found[..., 3] == 1).all()
+            assert tab.faults == [] and tab.page.inner_text("#fault") == ""
 
 
 @pytest.mark.parametrize("time", ["phase", "window+motion"])

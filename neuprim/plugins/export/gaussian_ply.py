@@ -56,11 +56,11 @@ def _write(job: ExportJob) -> ExportReport:
     (conditions,) = job.frames()
     channels, rgb = job.run.channels, rgb_of(job.run)
     job.progress("fitting Gaussians", 0.0)
-    colours = harmonics_of(job.run, conditions).picked(rgb)
-    images, seen = _images(job, which, conditions, rgb)
     fits = {name: fit_gaussians(job.run, conditions, name) for name in SIZES if size in ("auto", name)}
     if not all(len(g.means) for g in fits.values()):
         raise ConfigError(f"{job.run.directory}: no primitive absorbs anything under these conditions; nothing to export")
+    colours = harmonics_of(job.run, conditions).picked(rgb)
+    images, seen = _images(job, which, conditions, rgb)
     scores = {name: _psnrs(job, fit, colours, images, rgb, name) for name, fit in fits.items()}
     size = max(scores, key=lambda name: float(np.mean(scores[name])))
     gaussians, errors = fits[size], {"psnr": float(np.mean(scores[size])), "psnr_worst": float(np.min(scores[size]))}

@@ -28,7 +28,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
 from neuprim.plugins.export.appearance import comparison_views, rgb_of
-from neuprim.webpage.page import PageView
+from neuprim.webpage.page import Condition, PageView, fullest
 from neuprim.webpage.scene import Draw, held_out, scene_page, start_of
 
 __all__ = ["EXPORTER"]
@@ -68,7 +68,8 @@ def _write(job: ExportJob) -> ExportReport:
         world=run.world,
     )
     job.progress("measuring", 0.7)
-    errors = {} if level == 0 else {"psnr": _error(job, page.model, views, start)}
+    moment = fullest(run.model, [Condition(spec, start[spec.name]) for spec in run.task.conditions])
+    errors = {} if level == 0 else {"psnr": _error(job, page.model, views, moment)}
     write_text(job.out, page.text)
     notes.append(f"{len(page.text.encode()) / 1e6:.2f} MB, {page.numbers / 1e6:.2f} MB of them the model's numbers before base64")
     if run.settings.sort != "center" or run.settings.samples > 1:
@@ -97,10 +98,12 @@ def _draw(run: TrainedModel) -> Draw:
     return draw
 
 
-def _error(job: ExportJob, held: Primitives, views: Sequence[PageView], start: Mapping[str, Tensor]) -> float:
+def _error(job: ExportJob, held: Primitives, views: Sequence[PageView], moment: Mapping[str, Tensor]) -> float:
     """dB over some views of the page, or over an orbit where it has none."""
+    if not views and not job.run.model.places(moment)[1].count:
+        return math.inf  # nothing is active anywhere: both are the background
     draw, shown = _draw(job.run), [(view.camera, view.conditions) for view in views[:_MEASURED]]
-    shown = shown or [(view.camera, start) for view in comparison_views(job, "orbit", start)[0]]
+    shown = shown or [(view.camera, moment) for view in comparison_views(job, "orbit", moment)[0]]
     wrong = [(draw(job.run.model, *view) - draw(held, *view)).double().square().mean() for view in shown]
     mean = float(torch.stack(wrong).mean())
     return -10.0 * math.log10(mean) if mean else math.inf

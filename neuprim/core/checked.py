@@ -347,11 +347,11 @@ def _plain(value: Any, kind: Any, notes: tuple[Any, ...], where: str) -> Any:
         if isinstance(value, Mapping):
             return _entries(value, args, where)
         raise ConfigError(f"{where}={shown(value)}: expected entries, each as {where}.KEY=VALUE")
-    elif origin is tuple:
-        items = args[:1] * len(value) if isinstance(value, list | tuple) and args[-1] is ... else args
+    elif origin in (tuple, list):
+        items = args[:1] * len(value) if isinstance(value, list | tuple) and (origin is list or args[-1] is ...) else args
         if isinstance(value, list | tuple) and len(items) == len(value):
             try:
-                return tuple(converted(v, item, where) for v, item in zip(value, items, strict=True))
+                return origin(converted(v, item, where) for v, item in zip(value, items, strict=True))
             except _Unfit:  # said of the whole list, below
                 pass
     elif (made := _scalar(value, kind)) is not None:

@@ -223,6 +223,6 @@ def _read(file: Path) -> dict[str, Any] | None:
 def _outcome(file: Path, data: Any) -> Outcome:
     try:
         return Outcome.from_dict(data)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         what = f"{type(error).__name__}: {error}"
         raise DataError(f"{file}: not the record of a trial ({what}); delete its folder to train anew") from error

@@ -56,7 +56,10 @@ def read_model(folder: Path) -> Any:
     if kind == ".bin":
         check_binary_model(folder, _parameter_count)
     try:
-        return pycolmap.Reconstruction(str(folder))
+        model = pycolmap.Reconstruction(str(folder))
+        for image in model.images.values():
+            _ = image.name  # UnicodeDecodeError where it is no UTF-8
+        return model
     except Exception as error:  # pycolmap raises many types for inconsistent models
         raise DataError(f"{folder}: not a readable COLMAP model ({type(error).__name__}: {error})") from None
 

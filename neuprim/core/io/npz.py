@@ -6,6 +6,7 @@ import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ def read_arrays(path: Path, wanted: Mapping[str, Wanted]) -> dict[str, np.ndarra
         with zipfile.ZipFile(path) as archive:
             entries = {entry.filename: entry for entry in archive.infolist()}
             return {name: _array(archive, entries.get(f"{name}.npy"), name, *asked, size) for name, asked in wanted.items()}
-    except (OSError, ValueError, KeyError, EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError, SyntaxError, TokenError, zipfile.BadZipFile) as error:
         raise DataError(f"{path}: damaged ({' '.join(str(error).split()) or type(error).__name__})") from error
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import shlex
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
+from neuprim.core.checked import converted, hints_of
 from neuprim.runs.design.variants import Variant
 from neuprim.runs.tradeoff.record import Measured
 
@@ -75,21 +76,9 @@ class Model(Measured):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        found = super().from_dict(data)
-        for name, kind in _OWN.items():
-            setattr(found, name, kind(data[name]))
-        found.turned = tuple(str(word) for word in data["turned"])
-        found.steps_in_turns, found.seeds = (tuple(float(x) for x in data[name]) for name in ("steps_in_turns", "seeds"))
-        return found
+        hints = hints_of(cls)
+        return replace(super().from_dict(data), **{name: converted(data[name], hints[name], f"points.{name}") for name in (*_OWN, *_LISTS)})
 
 
-_OWN: dict[str, Any] = {
-    "length": float,
-    "primitives": int,
-    "parameters_per_primitive": int,
-    "steps": int,
-    "seconds": float,
-    "centre_ms": float,
-    "run_dir": str,
-}
+_OWN = ("length", "primitives", "parameters_per_primitive", "steps", "seconds", "centre_ms", "run_dir")
 _LISTS = ("turned", "steps_in_turns", "seeds")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config.overrides import parse
+from neuprim.core.checked import checked, converted
 from neuprim.core.errors import ConfigError, DataError, cut
 from neuprim.core.io.files import read_json, write_json
 
@@ -94,8 +95,8 @@ def read_sweep(folder: Path) -> SweepRecord | None:
     try:
         if data["format"] != FORMAT:
             raise DataError(f"{file}: format {data['format']!r}; this neuprim reads {FORMAT}; {_INSTEAD}")
-        return SweepRecord(_texts(data["words"]), tuple(_row(run) for run in data["runs"]))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        return SweepRecord(converted(data["words"], tuple[str, ...], "words"), tuple(_row(run) for run in data["runs"]))
+    except (KeyError, TypeError, ValueError, AttributeError, ConfigError) as error:
         raise DataError(f"{file}: not {_WHAT} ({type(error).__name__}: {error}); {_INSTEAD}") from error
 
 
@@ -120,14 +121,7 @@ def begun_words(words: Sequence[str]) -> list[str]:
 
 
 def _row(run: Mapping[str, Any]) -> Row:
-    name = str(run["name"])
-    if Path(name).name != name or name in ("", ".", ".."):
-        raise ValueError(f"name {name!r} is no folder's")
-    swept = {str(key): str(value) for key, value in run["swept"].items()}
-    return Row(name, _texts(run["words"]), swept, str(run["state"]), str(run["line"]), float(run["seconds"]), int(run["attempts"]))
-
-
-def _texts(words: Sequence[Any]) -> tuple[str, ...]:
-    if isinstance(words, str) or not all(isinstance(word, str) for word in words):
-        raise ValueError("words must be a list of texts")
-    return tuple(words)
+    row = checked(Row, run, "runs")
+    if Path(row.name).name != row.name or row.name in ("", ".", ".."):
+        raise ValueError(f"name {row.name!r} is no folder's")
+    return row

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from neuprim.core.errors import DataError
+from neuprim.core.checked import checked
+from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.files import read_json, write_json
 
 __all__ = ["FILE", "Attempt", "Purpose", "Record", "Setting", "Turn", "read_record"]
@@ -153,7 +154,7 @@ def read_record(folder: Path) -> Record | None:
         if data["format"] != FORMAT:
             raise DataError(f"{file}: format {data['format']!r}; this neuprim reads {FORMAT}; delete it to search anew")
         return _record(data)
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError, ConfigError) as error:
         what = f"{type(error).__name__}: {error}"
         raise DataError(f"{file}: not the record of a target run ({what}); delete it to search anew") from error
 
@@ -161,12 +162,10 @@ def read_record(folder: Path) -> Record | None:
 def _record(data: Mapping[str, Any]) -> Record:
     data = {"before": 0, **data}  # records of the first versions did not say
     own = {f.name: data[f.name] for f in dataclasses.fields(Record)}
-    own["attempts"] = [Attempt(**entry) for entry in data["attempts"]]
-    own["turns"] = [Turn(**entry) for entry in data["turns"]]
-    made = Record(**own)
+    made = checked(Record, own)
     for attempt in made.attempts:
-        if not (attempt.primitives > 0 and attempt.steps > 0 and isinstance(attempt.words, dict)):
-            raise ValueError("attempts: expected positive numbers of primitives and steps")
+        if not (attempt.primitives > 0 and attempt.steps > 0 and Path(attempt.folder).name == attempt.folder):
+            raise ValueError("attempts: expected positive numbers of primitives and steps, and settings that name a folder")
         if attempt.outcome is not None:
             [float(attempt.outcome[name]) for name in ("psnr", "ssim", "primitives", "bytes", "ms_per_frame")]
     return made

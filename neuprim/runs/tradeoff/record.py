@@ -7,12 +7,13 @@ import io
 import shlex
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
-from neuprim.core.errors import DataError
+from neuprim.core.checked import Range, checked, converted
+from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.files import read_json, write_json, write_text
 from neuprim.core.metrics import from_json, to_json
 from neuprim.runs.tradeoff.knobs import LeftOut
@@ -25,6 +26,8 @@ COLUMNS = ("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians")
 """Of the 3DGS compression survey; SSIM and LPIPS by the rule of 3DGS's tools."""
 
 _MORE = ("time ratio", "ms per frame", "frames/s", "PSNR against exact", "peak bytes", "speed front", "size front")
+
+_Positive = Annotated[float, Range(above=0)]
 
 _AS_IT_IS = "as the run draws"
 
@@ -53,8 +56,8 @@ class Measured:
     quality: dict[str, float]
     bytes: int
     peak_bytes: int | None = None
-    ms: list[float] = field(default_factory=list)
-    ratios: list[float] = field(default_factory=list)
+    ms: list[_Positive] = field(default_factory=list)
+    ratios: list[_Positive] = field(default_factory=list)
     rounds: int | None = None
 
     @property
@@ -101,7 +104,7 @@ class Measured:
         names = [name.removesuffix("_infinite") for name in data["quality"]]
         quality = {name: value for name in names if (value := from_json(data["quality"], name)) is not None}
         own = {name: data[name] for name in ("bytes", "peak_bytes", "ms", "ratios", "rounds")}
-        return cls(str(data["knob"]), tuple(data["words"]), quality, **own)
+        return replace(checked(cls, {"knob": data["knob"], "words": data["words"], "quality": {}, **own}, "points"), quality=quality)
 
 
 @dataclass
@@ -174,12 +177,14 @@ def read_record(path: Path, kind: type[Measured] = Measured) -> Record | None:
         if data["format"] != FORMAT:
             raise DataError(f"{path}: format {data['format']!r}; this neuprim reads {FORMAT}; delete it to measure anew")
         points = [kind.from_dict(entry) for entry in data["points"]]
-        out = [LeftOut(entry["knob"], tuple(entry["words"]), entry["reason"]) for entry in data["left_out"]]
-        front = data["front"]
+        out = [checked(LeftOut, entry, "left_out") for entry in data["left_out"]]
+        speed, size = (converted(data["front"][name], list[int], f"front.{name}") for name in ("speed", "size"))
+        if not points or not all(0 <= number < len(points) for number in (*speed, *size)):
+            raise ValueError(f"front: expected numbers of the {len(points)} points")
         known = ("format", "same", "points", "left_out", "front", "marching")
         facts = {key: value for key, value in data.items() if key not in known}
-        return Record(dict(data["same"]), facts, points, out, list(front["speed"]), list(front["size"]), dict(data["marching"]))
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        return Record(dict(data["same"]), facts, points, out, speed, size, dict(data["marching"]))
+    except (KeyError, TypeError, AttributeError, ValueError, ConfigError) as error:
         what = f"{type(error).__name__}: {error}"
         raise DataError(f"{path}: not a record of `neuprim tradeoff` ({what}); delete it to measure anew") from error
 

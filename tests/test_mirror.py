@@ -7,7 +7,7 @@ from pathlib import Path
 import neuprim
 
 TESTS, PACKAGE = Path(__file__).parent, Path(neuprim.__file__).parent
-OTHERS = {"docs", "numerics"}
+OTHERS = {"docs", "fuzz", "numerics"}
 """Folders of tests without one of the package: the documentation, and what all renderers must agree on."""
 
 

@@ -115,25 +115,6 @@ def test_truncated_anywhere(saved: Path) -> None:
     checkpoint.load_model(saved, TASK)
 
 
-def test_bits_flipped_in_the_header(saved: Path) -> None:
-    """Every flip either is refused by name or leaves a valid file (a letter of a free text): never another kind of failure."""
-    whole = bytearray(saved.read_bytes())
-    length = struct.unpack("<Q", whole[:8])[0]
-    outcomes = []
-    for i in (*range(8), *range(8, 8 + length, 3)):
-        for bit in (i % 8,) if i >= 8 else range(8):
-            damaged = bytearray(whole)
-            damaged[i] ^= 1 << bit
-            saved.write_bytes(damaged)
-            try:
-                checkpoint.load_model(saved, TASK)
-                outcomes.append(True)
-            except CheckpointError as error:
-                assert str(saved) in str(error)
-                outcomes.append(False)
-    assert outcomes.count(False) > 0.7 * len(outcomes)
-
-
 def test_a_header_that_claims_terabytes(saved: Path) -> None:
     whole = saved.read_bytes()
     for length in (2**40, 2**63, 2**64 - 1):

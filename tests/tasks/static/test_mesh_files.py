@@ -10,7 +10,6 @@ import struct
 import tracemalloc
 import warnings
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,8 @@ from neuprim.core import notices
 from neuprim.core.errors import DataError
 from neuprim.core.notices import NeuprimWarning
 from neuprim.tasks.static.mesh import files, parts, textures
-from neuprim.tasks.static.mesh import generate as generator
 from neuprim.tasks.static.mesh.generate import MeshSettings, generate
-from tests.models import cube, gltf, quarters, textured, write_glb, write_gltf, write_obj, write_ply
+from tests.models import cube, gltf, quarters, write_glb, write_gltf, write_obj, write_ply
 
 SMALL: dict[str, Any] = {"size": 16, "train_views": 1, "test_views": 1, "supersampling": 1}
 
@@ -412,52 +410,3 @@ def test_a_glb_that_is_cut_off(tmp_path: Path) -> None:
         assert "damaged glTF" in refusal(tmp_path / "a.glb")
     (tmp_path / "a.glb").write_bytes(b"glTX" + whole[4:])
     assert "starts with b'glTX'" in refusal(tmp_path / "a.glb")
-
-
-# Whatever else -------------------------------------------------------------------------------------------------------------------------
-
-
-def _glb(path: Path) -> Path:
-    ball = trimesh.creation.icosphere(1)
-    ball.visual.vertex_colors = np.full((len(ball.vertices), 4), 99, np.uint8)
-    return write_glb(path, (textured(), np.eye(4)), (ball, np.eye(4)))
-
-
-def _ascii(path: Path) -> Path:
-    mesh = trimesh.Trimesh(*cube()[:2], process=False)
-    data = trimesh.exchange.ply.export_ply(mesh, encoding="ascii") if path.suffix == ".ply" else mesh.export(file_type="stl_ascii").encode()
-    path.write_bytes(data)
-    return path
-
-
-WRITERS: dict[str, Callable[[Path], Path]] = {
-    "a.glb": _glb,
-    "a.obj": write_obj,
-    "a.gltf": write_gltf,
-    "a.ply": lambda path: write_ply(path, *cube()[:2], np.full((24, 3), 9, np.uint8)),
-    "a.text.ply": _ascii,
-    "a.stl": _ascii,
-}
-
-
-@pytest.mark.parametrize("name", WRITERS)
-@pytest.mark.parametrize("seed", range(3))
-def test_damage_of_any_kind_is_an_error_of_the_file_or_harmless(tmp_path: Path, name: str, seed: int) -> None:
-    path = WRITERS[name](tmp_path / name)
-    whole, generated = path.read_bytes(), random.Random(seed)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for _ in range(25):
-            data = bytearray(whole)
-            for _ in range(generated.choice((1, 3, 20))):
-                at = generated.randrange(len(data))
-                if generated.random() < 0.2:
-                    del data[at : at + generated.randrange(1, 40)]
-                else:
-                    data[at] = generated.choice((0, 255, 45, 57, 10, generated.randrange(256)))
-            path.write_bytes(bytes(data))
-            try:
-                model = generator._READERS[path.suffix](files.Folder(path, True))
-                generator.Surface(model, parts.read_parts(model), model.upward, 0.01).intersect([[3.0, 0.1, 0.2]], [[-1.0, 0, 0]])
-            except DataError as error:
-                assert "a." in str(error) and "\n" not in str(error)

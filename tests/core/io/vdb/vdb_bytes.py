@@ -132,47 +132,6 @@ def read_all(path: Path) -> int:
     return len(header.grids)
 
 
-def spoil(raw: bytes, rng: np.random.Generator) -> bytes:
-    """A copy with something wrong: flipped bits, extreme numbers, cut, shifted or repeated bytes; mostly near the front."""
-    data = bytearray(raw)
-    reach = len(data) if rng.random() < 0.5 else min(len(data), 1500)
-    for _ in range(int(rng.integers(1, 4))):
-        at = int(rng.integers(reach))
-        how = int(rng.integers(6))
-        if how == 0:
-            data[at % len(data)] ^= 1 << int(rng.integers(8))
-        elif how == 1:
-            extreme = [0, 1, -1, 2**31 - 1, -(2**31), 2**63 - 1, -(2**63), 2**40, len(raw), len(raw) + 1][int(rng.integers(10))]
-            size = 4 if rng.random() < 0.5 else 8
-            data[at : at + size] = (extreme % 2 ** (8 * size)).to_bytes(size, "little")
-        elif how == 2:
-            del data[max(at, 1) :]
-        elif how == 3:
-            data[at : at + 16] = rng.bytes(16)
-        elif how == 4:
-            del data[at : at + int(rng.integers(1, 9))]
-        else:
-            data[at:at] = data[at : at + int(rng.integers(1, 9))]
-        reach = min(reach, len(data))
-        if reach < 2:
-            break
-    return bytes(data)
-
-
-def survives(path: Path, sources: list[bytes], count: int, seed: int) -> int:
-    """Reads ``count`` spoiled copies; nothing but the package's own errors may come out, each naming the file. How many failed."""
-    rng = np.random.default_rng(seed)
-    refused = 0
-    for number in range(count):
-        path.write_bytes(spoil(sources[number % len(sources)], rng))
-        try:
-            read_all(path)
-        except NeuprimError as error:
-            refused += 1
-            assert path.name in str(error), (number, error)
-    return refused
-
-
 def real_folder(name: str) -> Path:
     """A folder of real files, where the developer has it."""
     root = Path(os.environ.get("NEUPRIM_TEST_DATA") or Path(__file__).parents[5] / "shared" / "data")

@@ -1,0 +1,487 @@
+"""Every format that neuprim reads: a small valid example of it, how it is read, and how its structure is spoiled."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from neuprim.core.data import Dataset
+from neuprim.core.errors import DataError
+from neuprim.core.task import SceneContext
+from tests.fuzz import mutations as m
+from tests.fuzz.mutations import Mutation
+
+__all__ = ["FORMATS", "Format"]
+
+Files = Mapping[str, Mutation]
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format.
+
+    Attributes:
+        make: writes a valid example into an empty folder.
+        read: reads the folder's files, and uses what it reads.
+        files: those that are spoiled, with the mutations of their structure.
+        slow: whether one reading takes a tenth of a second or more.
+    """
+
+    make: Callable[[Path], Any]
+    read: Callable[[Path], Any]
+    files: Files
+    slow: bool = False
+
+
+# ---------------------------------------------------------------- scenes
+
+
+def _shown(dataset: Dataset) -> None:
+    for views in (dataset.train, dataset.test):
+        for i in range(len(views)):
+            views.view(i), views.pixels(i)
+
+
+def _loaded(load: Callable[..., Dataset], **settings: Any) -> Callable[[Path], None]:
+    return lambda folder: _shown(load({"path": str(folder), **settings}, SceneContext(seed=0, cache_dir=folder / "cache")))
+
+
+def _posed(folder: Path, split: str, count: int, suffix: str = ".png", head: Mapping[str, Any] = {}, **more: Any) -> None:
+    """A transforms file of so many views of a square, with their images; ``more`` goes into every frame."""
+    from tests.tasks.conftest import Scenes
+
+    (folder / "images").mkdir(exist_ok=True)
+    pixels = np.zeros((12, 16, 4), np.uint8)
+    pixels[3:9, 4:12] = (200, 100, 50, 255)
+    frames = []
+    for i, pose in enumerate(Scenes.ring(count)):
+        Image.fromarray(pixels).save(folder / f"images/{split}{i}.png")
+        frames.append({"file_path": f"./images/{split}{i}{suffix}", "transform_matrix": pose.tolist(), **more})
+    name = f"transforms_{split}.json" if split else "transforms.json"
+    (folder / name).write_text(json.dumps({"camera_angle_x": 0.9, **head, "frames": frames}))
+
+
+def _blender(folder: Path) -> None:
+    _posed(folder, "train", 3, "")
+    _posed(folder, "test", 1, "")
+
+
+def _nerfstudio(folder: Path) -> None:
+    lens = {
+        "w": 16,
+        "h": 12,
+        "fl_x": 15.0,
+        "fl_y": 16.0,
+        "cx": 8.0,
+        "cy": 6.0,
+        "camera_model": "OPENCV",
+        "k1": 0.01,
+        "k2": 0.0,
+        "p1": 0.0,
+        "p2": 0.0,
+    }
+    _posed(folder, "", 9, head=lens | {"ply_file_path": "points.ply"}, mask_path="mask.png")
+    Image.fromarray(np.full((12, 16), 255, np.uint8)).save(folder / "mask.png")
+    _points(folder)
+
+
+def _multiview(folder: Path) -> None:
+    _posed(folder, "train", 4, "", time=0.5)
+    _posed(folder, "test", 1, "", time=0.25, rotation=0.1)
+
+
+def _olat(folder: Path) -> None:
+    _posed(folder, "train", 3, "", pl_pos=[1.0, 2.0, 4.0], pl_intensity=[1.0, 1.0, 1.0])
+    _posed(folder, "test", 1, "", pl_pos=[1.0, 2.0, 4.0])
+
+
+def _colmap(text: bool) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        import pycolmap
+
+        from tests.tasks.conftest import Scenes
+
+        model, lens = (
+            pycolmap.Reconstruction(),
+            pycolmap.Camera(model="OPENCV", width=16, height=12, params=[15, 16, 8, 6, 0.1, 0, 0, 0], camera_id=1),
+        )
+        model.add_camera_with_trivial_rig(lens)
+        for i, pose in enumerate(Scenes.ring(9)):
+            view = np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
+            rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(view[:3, :3]), view[:3, 3])
+            model.add_image_with_trivial_frame(pycolmap.Image(name=f"{i}.png", camera_id=1, image_id=9 - i), rigid)
+            (folder / "images").mkdir(exist_ok=True)
+            Image.fromarray(np.full((12, 16, 3), 20 * i, np.uint8)).save(folder / f"images/{i}.png")
+        for point in np.eye(3):
+            model.add_point3D(point, pycolmap.Track(), np.array([9, 99, 200], np.uint8))
+        (folder / "sparse/0").mkdir(parents=True)
+        (model.write_text if text else model.write_binary)(str(folder / "sparse/0"))
+
+    return make
+
+
+_PARTS = ("cameras", "images", "points3D", "rigs", "frames")
+
+
+# ---------------------------------------------------------------- points, models of other programs
+
+
+def _ply(path: Path, names: str, rows: np.ndarray, text: bool = False) -> None:
+    head = f"ply\nformat {'ascii' if text else 'binary_little_endian'} 1.0\nelement vertex {len(rows)}\n"
+    head += "".join(f"property float {name}\n" for name in names.split()) + "end_header\n"
+    body = "\n".join(" ".join(map(str, row)) for row in rows.tolist()).encode() if text else rows.astype("<f4").tobytes()
+    path.write_bytes(head.encode() + body)
+
+
+def _points(folder: Path) -> None:
+    _ply(folder / "points.ply", "x y z red green blue", np.eye(6) + 0.5)
+    _ply(folder / "text.ply", "x y z red green blue", np.eye(6) + 0.5, text=True)
+
+
+def _gaussians(folder: Path) -> None:
+    names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+    _ply(folder / "points.ply", names, np.random.default_rng(0).normal(size=(5, 14)))
+
+
+def _read_points(folder: Path) -> None:
+    from neuprim.core.data.points_file import read_points
+
+    for name in ("points.ply", "text.ply"):
+        if (folder / name).exists():
+            read_points(folder / name, 3, "srgb")
+
+
+_EXPORTED = {"text.ply": "ply", "a.stl": "stl", "text.stl": "stl_ascii"}
+_OPTIONS = {"text.ply": {"encoding": "ascii"}}
+
+
+def _mesh(name: str) -> tuple[Callable[[Path], Any], Callable[[Path], None]]:
+    def make(folder: Path) -> None:
+        import trimesh
+
+        from tests import models
+
+        path = folder / name
+        vertices, faces, _ = models.cube()
+        if name == "a.ply":
+            models.write_ply(path, vertices, faces, np.full((24, 3), 99, np.uint8))
+        elif path.suffix in (".ply", ".stl"):
+            data = trimesh.Trimesh(vertices, faces, process=False).export(file_type=_EXPORTED[name], **_OPTIONS.get(name, {}))
+            path.write_bytes(data.encode() if isinstance(data, str) else data)
+        else:
+            {".glb": models.write_glb, ".gltf": models.write_gltf, ".obj": models.write_obj}[path.suffix](path)
+
+    def read(folder: Path) -> None:
+        from neuprim.tasks.static.mesh.generate import MeshSettings, generate
+
+        generate(MeshSettings(path=folder / name, size=8, train_views=1, test_views=1, supersampling=1), folder / "cache")
+
+    return make, read
+
+
+# ---------------------------------------------------------------- images and volumes
+
+
+def _images(*suffixes: str) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        pixels = np.arange(12 * 16 * 4).reshape(12, 16, 4).astype(np.uint8)
+        for suffix in suffixes:
+            image = Image.fromarray(pixels if suffix in ("png", "webp") else pixels[..., :3])
+            image.save(folder / f"a.{suffix}")
+
+    return make
+
+
+def _exr(folder: Path) -> None:
+    from neuprim.core.io.images import write_exr
+
+    write_exr(folder / "a.exr", torch.rand(6, 12, 4))
+
+
+def _read_images(folder: Path) -> None:
+    from neuprim.core.io.images import image_info, read_image
+
+    for path in sorted(folder.glob("a.*")):
+        image_info(path)
+        read_image(path)
+
+
+def _read_mask(folder: Path) -> None:
+    from neuprim.core.io.images import read_mask
+
+    read_mask(folder / "a.png")
+
+
+def _read_environment(folder: Path) -> None:
+    from neuprim.core.environment import read_environment
+
+    read_environment(folder / "a.exr")
+
+
+def _vdb(folder: Path) -> None:
+    from neuprim.core.io.vdb import Grid, write_vdb
+
+    values = np.random.default_rng(0).random((12, 10, 9)).astype(np.float32)
+    for compression in ("none", "zip", "blosc"):
+        grids = [Grid.from_dense("density", values), Grid.from_dense("heat", values[:3])]
+        write_vdb(folder / f"{compression}.vdb", grids, compression=compression)
+
+
+def _read_vdb(folder: Path) -> None:
+    from tests.core.io.vdb.vdb_bytes import read_all
+
+    for path in sorted(folder.glob("*.vdb")):
+        read_all(path)
+
+
+def _voxels(folder: Path) -> None:
+    from neuprim.tasks.dynamic.volume.voxels import Voxels
+
+    Voxels(np.array([1, 5]), np.ones((2, 4), np.float32), (2, 3, 4), np.eye(4)).write(folder / "a.npz")
+
+
+def _read_voxels(folder: Path) -> None:
+    from neuprim.tasks.dynamic.volume.voxels import Voxels
+
+    Voxels.read(folder / "a.npz").at(np.zeros((1, 3), np.int64))
+
+
+# ---------------------------------------------------------------- cameras
+
+
+def _cameras(folder: Path) -> None:
+    pose = [[1.0, 0.0, 0.0, 0.5], [0.0, 0.0, -1.0, -4.0], [0.0, 1.0, 0.0, 0.25], [0.0, 0.0, 0.0, 1.0]]
+    frames = [
+        {"transform_matrix": pose},
+        {"transform_matrix": pose, "fl_x": 10, "fl_y": 11.5, "cx": 3, "cy": 7, "w": 20, "h": 30, "time": 0.5},
+    ]
+    (folder / "c.json").write_text(json.dumps({"w": 64, "h": 48, "camera_angle_x": math.pi / 2, "fps": 24, "frames": frames}))
+
+
+def _usd(folder: Path) -> None:
+    from tests.core.cameras.test_usd_cameras import MOVING, usd
+
+    usd(folder / "c.usda", MOVING, 'upAxis = "Z"\n    startTimeCode = 1\n    endTimeCode = 3')
+
+
+def _usdc(folder: Path) -> None:
+    from pxr import Sdf
+
+    _usd(folder)
+    Sdf.Layer.FindOrOpen(str(folder / "c.usda")).Export(str(folder / "c.usdc"))
+
+
+def _read_cameras(name: str) -> Callable[[Path], Any]:
+    from neuprim.core.cameras.file import read_camera_file
+
+    return lambda folder: read_camera_file(folder / name, (32, 24))
+
+
+# ---------------------------------------------------------------- runs
+
+
+def _run(folder: Path) -> None:
+    from tests.plugins import marked
+
+    marked.static_run(folder / "run")
+
+
+def _compressed(folder: Path) -> None:
+    from neuprim.core import checkpoint
+    from neuprim.core.compressed import LEVELS
+    from tests.compressing import example, without_pieces
+
+    for name, model in (("whole", example("static", 20)[1]), ("pruned", without_pieces(example("static", 20)[1]))):
+        checkpoint.save_compressed(folder / f"{name}.neuprim", model, "static", {"note": "naïve"}, LEVELS[3], "task: static\n")
+
+
+def _read_compressed(folder: Path) -> None:
+    from neuprim.core import checkpoint
+    from neuprim.tasks.static import TASK
+
+    for path in sorted(folder.glob("*.neuprim")):
+        checkpoint.load_model(path, TASK)
+
+
+def _read_run(folder: Path) -> None:
+    from neuprim.report.record import per_view, read_run
+    from neuprim.runs.open import open_run, read_metrics
+
+    run, record = open_run(folder / "run"), read_run(folder / "run")
+    repr((run.settings, run.header.get("background"), record.shown, per_view(record)))
+    if (folder / "run/metrics.json").exists():
+        read_metrics(folder / "run")
+
+
+def _records(folder: Path) -> None:
+    """What runs, sweeps, chunks, searches and launches keep."""
+    from neuprim.runs.chunks.record import ChunkRecord
+    from neuprim.runs.chunks.record import Row as Chunk
+    from neuprim.runs.launch.status import Status, write_status
+    from neuprim.runs.sweep.record import Row, SweepRecord
+    from neuprim.runs.target.record import Record as TargetRecord
+    from neuprim.runs.target.record import Turn
+    from neuprim.runs.tradeoff.knobs import LeftOut
+    from neuprim.runs.tradeoff.record import Measured, Record
+    from neuprim.runs.trials import Outcome
+    from tests.runs.target_records import attempt
+
+    _run(folder)
+    view = {"name": "a", "psnr": 20.0, "ssim": 0.9}
+    numbers = {"psnr": 20.0, "ssim": 0.9, "views": 1, "per_view": [view], "lpips": None, "train_seconds": 1.5}
+    (folder / "run/metrics.json").write_text(json.dumps(numbers))
+    lines = [{"step": i, "loss": 0.1, "primitives": 40, "seconds": 1.0 * i, "eval_psnr": 20.0} for i in (1, 2, 3)]
+    (folder / "run/metrics.jsonl").write_text("\n".join(map(json.dumps, lines)) + "\n")
+    (folder / "run/renders").mkdir()
+    (folder / "run/renders/worst_0.png").touch()
+    region = [{"file": "worst_0.png", "name": "a", "psnr": 10.0, "x": 1, "y": 2, "side": 3}]
+    (folder / "run/renders/worst.json").write_text(json.dumps(region))
+    SweepRecord(("a=1,2",), (Row("0", ("a=1",), {"a": "1"}), Row("1", ("a=2",), {"a": "2"}, "failed", "why", 2.5, 1))).write(folder)
+    ChunkRecord((Chunk("chunk_0", 20, 30, None), Chunk("chunk_1", 20, 30, 1.5)), 100).write(folder)
+    turned = [Turn("model.neurons", 4, 2, {"psnr": 0.1}, 0.8, True)]
+    TargetRecord({"psnr": 30.0}, {}, length=200, attempts=[attempt(100, 50, 30.0)], turns=turned).write(folder / "target")
+    points = [
+        Measured("reference", (), {"psnr": 30.0}, 100, None, [1.0, 1.1, 1.2], [1.0] * 3),
+        Measured("sort", ("renderer.sort=entry",), {"psnr": 29.0}, 100, 5, [0.5], [0.5]),
+    ]
+    (folder / "run/tradeoff").mkdir()
+    Record({"views": 1}, {}, points, [LeftOut("a", ("b=1",), "why")], [0, 1], [0]).write(folder / "run/tradeoff/tradeoff.json")
+    outcome = Outcome(30.0, 0.9, 40, 12, 1000, 50, 1.5, 10.0, ((0.5, 20.0),))
+    (folder / "trial.json").write_text(json.dumps({"format": 1, "asked": {}, "views": 3, "outcome": outcome.to_dict()}))
+    write_status(folder / "status.json", Status())
+
+
+def _read_records(folder: Path) -> None:
+    from neuprim.core.train.settings import TrainSettings
+    from neuprim.runs import curve, trials
+    from neuprim.runs.chunks.record import read_record as read_chunks
+    from neuprim.runs.launch.status import read_status
+    from neuprim.runs.live.levels import read_front
+    from neuprim.runs.sweep.record import read_sweep
+    from neuprim.runs.sweep.rows import sweep_rows, write_csv
+    from neuprim.runs.target.record import read_record as read_target
+    from neuprim.runs.tradeoff.record import read_record
+    from neuprim.runs.tradeoff.record import write_csv as write_points
+
+    _read_run(folder)
+    curve.read_curve(folder / "run/metrics.jsonl", TrainSettings())
+    if (sweep := read_sweep(folder)) is not None:
+        write_csv(folder / "out.csv", sweep_rows(folder, sweep))
+        sweep.write(folder / "again")
+    if (chunks := read_chunks(folder)) is not None:
+        chunks.write(folder / "again")
+    if (target := read_target(folder / "target")) is not None:
+        target.write(folder / "again"), target.words, target.done("size"), [one.count for one in target.attempts if one.outcome]
+    read_front(folder / "run")
+    if (points := read_record(folder / "run/tradeoff/tradeoff.json")) is not None:
+        write_points(folder / "out.csv", points, lambda i: 40)
+    trials.read_outcome(folder)
+    read_status(folder / "status.json")
+
+
+def _lpips(folder: Path) -> None:
+    from safetensors.torch import save_file
+
+    from tests.lpips_weights import weights
+
+    small = {key: value[:1].contiguous() for key, value in weights("alex").items()}
+    torch.save(small, folder / "weights.pth")
+    save_file(small, folder / "weights.safetensors")
+
+
+def _read_lpips(folder: Path) -> None:
+    from neuprim.core.metrics.lpips import Lpips
+
+    for name in ("weights.pth", "weights.safetensors"):
+        try:
+            Lpips.load(folder / name)
+        except DataError as error:
+            if not any(word in str(error) for word in ("shape", "missing", "convolutions")):
+                raise
+
+
+@cache
+def _fitted(folder: Path) -> Any:
+    """A training that goes on from the checkpoint in ``folder/out``."""
+    from neuprim.config import compose
+    from neuprim.runs.fit import start
+    from tests.core import tiny
+    from tests.short_runs import words
+
+    return start(compose(words(tiny.write_blender(folder / "two"), folder / "out", 5, "resume=true")))
+
+
+def _checkpoint(folder: Path) -> None:
+    from neuprim.runs.training import save
+
+    (folder / "out").mkdir()
+    save(_fitted(folder))
+
+
+def _read_checkpoint(folder: Path) -> None:
+    from neuprim.runs.events import silent
+    from neuprim.runs.training import _resume
+
+    _resume(_fitted(folder), silent)
+
+
+_DATASETS = "neuprim.tasks.static.datasets"
+
+
+def _lazy(module: str, **settings: Any) -> Callable[[Path], None]:
+    import importlib
+
+    return lambda folder: _loaded(importlib.import_module(module).load, **settings)(folder)
+
+
+_RECORDS: Files = {
+    **dict.fromkeys(("run/metrics.json", "run/renders/worst.json", "sweep.json", "chunks.json", "target/target.json"), m.json_of),
+    **dict.fromkeys(("run/tradeoff/tradeoff.json", "trial.json", "status.json"), m.json_of),
+    "run/metrics.jsonl": m.jsonl_of,
+}
+_SPLITS: Files = {"transforms_train.json": m.json_of, "transforms_test.json": m.json_of}
+
+FORMATS: dict[str, Format] = {
+    "blender": Format(_blender, _lazy(f"{_DATASETS}.blender"), _SPLITS),
+    "nerfstudio": Format(
+        _nerfstudio, _lazy(f"{_DATASETS}.nerfstudio"), {"transforms.json": m.json_of, "points.ply": m.text_of, "mask.png": m.png}
+    ),
+    "multiview": Format(_multiview, _lazy("neuprim.tasks.dynamic.multiview"), _SPLITS, slow=True),
+    "olat": Format(_olat, _lazy("neuprim.tasks.relight.olat"), _SPLITS),
+    "colmap": Format(_colmap(False), _lazy(f"{_DATASETS}.colmap"), {f"sparse/0/{part}.bin": m.lies(0, 400) for part in _PARTS}),
+    "colmap-text": Format(_colmap(True), _lazy(f"{_DATASETS}.colmap"), {f"sparse/0/{part}.txt": m.text_of for part in _PARTS}),
+    "points": Format(_points, _read_points, {"points.ply": m.text_of, "text.ply": m.text_of}),
+    "gaussians": Format(_gaussians, _read_points, {"points.ply": m.text_of}),
+    "mesh-ply": Format(*_mesh("a.ply"), {"a.ply": m.text_of}),
+    "mesh-stl": Format(*_mesh("a.stl"), {"a.stl": m.lies(0, 300)}),
+    "mesh-text-ply": Format(*_mesh("text.ply"), {"text.ply": m.text_of}),
+    "mesh-text-stl": Format(*_mesh("text.stl"), {"text.stl": m.text_of}),
+    "mesh-obj": Format(*_mesh("a.obj"), {"a.obj": m.text_of, "a.mtl": m.text_of, "skin.png": m.png}),
+    "gltf": Format(*_mesh("a.gltf"), {"a.gltf": m.json_of, "triangle.bin": m.lies(0, 44)}),
+    "glb": Format(*_mesh("a.glb"), {"a.glb": m.glb}),
+    "png": Format(_images("png"), _read_images, {"a.png": m.png}),
+    "jpeg": Format(_images("jpg"), _read_images, {"a.jpg": m.lies(0, 400)}),
+    "mask": Format(_images("png"), _read_mask, {"a.png": m.png}),
+    "exr": Format(_exr, _read_images, {"a.exr": m.lies(0, 420)}),
+    "environment": Format(_exr, _read_environment, {"a.exr": m.lies(0, 420)}),
+    "vdb": Format(_vdb, _read_vdb, {f"{name}.vdb": m.lies(0, 1500) for name in ("none", "zip", "blosc")}),
+    "voxels": Format(_voxels, _read_voxels, {"a.npz": m.npz}),
+    "cameras": Format(_cameras, _read_cameras("c.json"), {"c.json": m.json_of}),
+    "cameras-usd": Format(_usd, _read_cameras("c.usda"), {"c.usda": m.text_of}, slow=True),
+    "cameras-usdc": Format(_usdc, _read_cameras("c.usdc"), {"c.usdc": m.lies(0, 400)}, slow=True),
+    "config": Format(_run, _read_run, {"run/config.yaml": m.yaml_of}),
+    "model": Format(_run, _read_run, {"run/model.safetensors": m.safetensors}),
+    "checkpoint": Format(_checkpoint, _read_checkpoint, {"out/checkpoint.safetensors": m.safetensors}),
+    "lpips": Format(_lpips, _read_lpips, {"weights.pth": m.npz, "weights.safetensors": m.safetensors}),
+    "records": Format(_records, _read_records, _RECORDS),
+    "compressed": Format(_compressed, _read_compressed, {"whole.neuprim": m.compressed, "pruned.neuprim": m.compressed}),
+}

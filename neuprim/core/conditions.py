@@ -128,9 +128,11 @@ def _in_frames(spec: ConditionSpec, text: str, count: int) -> str | None:
 
 def _read(spec: ConditionSpec, text: str, warn: Warn) -> list[Tensor]:
     parts = [part.strip() for part in text.split(",")] if not spec.shape else [text]
-    values = [value for part in parts for value in _values(spec, part)]
-    if len(values) > _MOST:
-        raise ConfigError(f"{flag(spec.name)} {text[:40]}...: {len(values)} values; expected at most {_MOST}")
+    values: list[Tensor] = []
+    for part in parts:
+        values += _values(spec, part)
+        if len(values) > _MOST:  # before the next part takes more memory
+            raise ConfigError(f"{flag(spec.name)} {text[:40]}...: {len(values)} values and more; expected at most {_MOST}")
     _check_range(spec, text, values, warn)
     return values
 

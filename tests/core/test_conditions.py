@@ -116,7 +116,7 @@ def test_other_shapes_are_the_tasks_altogether() -> None:
         ("0:1:100001", "expected FIRST:LAST or FIRST:LAST:COUNT"),
         ("0:1:2.5", "--wavelength-shift 0:1:2.5: expected a number"),
         ("", "--wavelength-shift : expected a number"),
-        ("0:1:60000,0:1:60000", "120000 values; expected at most 100000"),
+        ("0:1:60000,0:1:60000", "120000 values and more; expected at most 100000"),
     ],
 )
 def test_what_cannot_be_read(text: str, expected: str) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.channels import Channels
 from neuprim.core.data import View
+from neuprim.core.errors import ConfigError
 from neuprim.core.io.images import to_uint8
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
@@ -22,6 +23,9 @@ from neuprim.runs.operating import OperatingPoint
 __all__ = ["ALPHA", "COLOUR", "DEPTH", "Look", "Picture", "draw_look", "quantities"]
 
 COLOUR, ALPHA, DEPTH = "colour", "alpha", "depth"
+
+_RAYS = 2**26
+"""Of a picture, which the renderer draws at once in 2 GB."""
 
 _SOLID = 0.05
 """Alpha below which a pixel has no depth worth showing."""
@@ -72,6 +76,9 @@ def draw_look(model: Primitives, look: Look, point: OperatingPoint, background: 
     start = time.perf_counter()
     view = point.seen(View("", look.camera, look.conditions))
     settings = replace(point.settings, depth=look.shows == DEPTH)
+    width, height = view.camera.width, view.camera.height
+    if width * height * settings.samples**2 > _RAYS:
+        raise ConfigError(f"{width} x {height} pixels with renderer.samples={settings.samples} take more than {_RAYS:,} rays; lower either")
     with torch.no_grad():
         output = render(model, view.camera, view.conditions, settings, background)
     caption = ""

@@ -69,6 +69,12 @@ def test_lower_resolution_is_sent_as_it_was_drawn(model: Primitives) -> None:
     assert draw_look(model, look_at(), OperatingPoint(SETTINGS, resolution=0.25), WHITE, RGB).image.shape == (8, 10, 3)
 
 
+def test_a_picture_of_too_many_rays_is_refused(model: Primitives) -> None:
+    look = replace(look_at(), camera=look_at().camera.resized(2048, 1536))
+    with pytest.raises(ConfigError, match=r"2048 x 1536 pixels with renderer.samples=16 take more than 67,108,864 rays"):
+        draw_look(model, look, OperatingPoint(replace(SETTINGS, samples=16)), WHITE, RGB)
+
+
 def test_levels_without_a_front_are_resolutions(model: Primitives) -> None:
     levels = Levels.of(model, SETTINGS, Front())
     assert [level.point.resolution for level in levels.all] == [1.0, 0.5, 0.25, 0.125, 0.0625]

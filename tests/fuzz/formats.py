@@ -267,10 +267,32 @@ def _cameras(folder: Path) -> None:
     (folder / "c.json").write_text(json.dumps({"w": 64, "h": 48, "camera_angle_x": math.pi / 2, "fps": 24, "frames": frames}))
 
 
-def _usd(folder: Path) -> None:
-    from tests.core.cameras.test_usd_cameras import MOVING, usd
+_STAGE = """#usda 1.0
+(
+    upAxis = "Z"
+    startTimeCode = 1
+    endTimeCode = 3
+)
 
-    usd(folder / "c.usda", MOVING, 'upAxis = "Z"\n    startTimeCode = 1\n    endTimeCode = 3')
+def Xform "World"
+{
+    def Camera "Cam"
+    {
+        float focalLength.timeSamples = { 1: 35, 3: 45 }
+        float horizontalAperture = 36
+        float verticalAperture = 27
+        matrix4d xformOp:transform.timeSamples = {
+            1: ( (1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, -4, 0, 1) ),
+            3: ( (1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (2, -4, 0, 1) )
+        }
+        uniform token[] xformOpOrder = ["xformOp:transform"]
+    }
+}
+"""
+
+
+def _usd(folder: Path) -> None:
+    (folder / "c.usda").write_text(_STAGE)
 
 
 def _usdc(folder: Path) -> None:

@@ -67,7 +67,7 @@ def _posed(folder: Path, split: str, count: int, suffix: str = ".png", head: Map
         Image.fromarray(pixels).save(folder / f"images/{split}{i}.png")
         frames.append({"file_path": f"./images/{split}{i}{suffix}", "transform_matrix": pose.tolist(), **more})
     name = f"transforms_{split}.json" if split else "transforms.json"
-    (folder / name).write_text(json.dumps({"camera_angle_x": 0.9, **head, "frames": frames}))
+    (folder / name).write_text(json.dumps({**(head or {"camera_angle_x": 0.9}), "frames": frames}))
 
 
 def _blender(folder: Path) -> None:

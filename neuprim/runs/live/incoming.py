@@ -6,7 +6,10 @@ takes it. Every message of every page passes :class:`CheckedConnection`; viser i
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import math
+import operator
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
@@ -16,7 +19,7 @@ from websockets.asyncio.server import ServerConnection
 
 from neuprim.core.checked import Range
 
-__all__ = ["LARGEST", "CheckedConnection", "refusal", "value_refusal"]
+__all__ = ["LARGEST", "CheckedConnection", "known", "refusal", "value_refusal"]
 
 LARGEST = 2**16
 """Bytes of a message; a page sends some hundred."""
@@ -80,14 +83,21 @@ class GuiUpdateMessage(_Message):
     updates: _Updates
 
 
-_DECODER = msgspec.msgpack.Decoder(
-    ViewerCameraMessage
-    | ScenePointerMessage
-    | TransformControlsUpdateMessage
-    | TransformControlsDragStartMessage
-    | TransformControlsDragEndMessage
-    | GuiUpdateMessage
+_KINDS = (
+    ViewerCameraMessage,
+    ScenePointerMessage,
+    TransformControlsUpdateMessage,
+    TransformControlsDragStartMessage,
+    TransformControlsDragEndMessage,
+    GuiUpdateMessage,
 )
+_DECODER = msgspec.msgpack.Decoder(functools.reduce(operator.or_, _KINDS))  # type: ignore[arg-type]
+
+
+def known(messages: Any) -> bool:
+    """Whether the module of viser's messages has these kinds with these fields; another version of viser may not."""
+    kinds = ((kind, getattr(messages, kind.__name__, None)) for kind in _KINDS)
+    return all(own is not None and {f.name for f in dataclasses.fields(own)} == set(kind.__struct_fields__) for kind, own in kinds)
 
 
 class CheckedConnection(ServerConnection):

@@ -58,7 +58,7 @@ class PageServer:
         port = _free_port(settings.host, settings.port)
         with contextlib.redirect_stdout(io.StringIO()), gate.before_viser(self._refusal, self._refused):
             self.viser = viser.ViserServer(host=settings.host, port=port, label=title, verbose=False)
-        if not (gate.stands and self.viser.get_port() == port and self._tunnels_off()):
+        if not (gate.stands and self.viser.get_port() == port and self._tunnels_off() and self._messages_known()):
             self.close()
             raise BackendUnavailable(
                 f"viser {viser.__version__} did not start behind the check of its visitors, or not on port {port}; "
@@ -81,6 +81,13 @@ class PageServer:
         except (ImportError, AttributeError, AssertionError):  # another viser than those that are known
             return False
         return True
+
+    def _messages_known(self) -> bool:
+        from viser import _messages
+
+        from neuprim.runs.live.incoming import known
+
+        return known(_messages)
 
     def on_visit(self, come: Callable[[Any], None], gone: Callable[[Any], None], refused: Callable[[int, str], None]) -> None:
         """Be told of every page that is opened and closed, as a ``viser.ClientHandle``, and why a message was refused, with a page's number."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import http.client
+import importlib
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +21,7 @@ from websockets.exceptions import InvalidStatus
 from neuprim.config.viewer import ViewerSettings
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.runs.live.gate import Gate
+from neuprim.runs.live.incoming import known
 from neuprim.runs.live.server import PageServer, is_loopback
 from tests.viewer_client import fetch, visit
 
@@ -107,6 +110,16 @@ def test_without_its_gate_a_server_does_not_stay(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(Gate, "before_viser", nothing)
     with pytest.raises(BackendUnavailable, match="did not start behind the check"):
         PageServer(ViewerSettings(port=0), "a run")
+
+
+def test_pages_of_another_viser_are_not_served(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A message with one more field would be refused each time it comes; that is said at once."""
+    messages = importlib.import_module("viser._messages")
+    longer = dataclasses.make_dataclass("ViewerCameraMessage", [("wxyz", tuple), ("zoom", float)])
+    monkeypatch.setattr(messages, "ViewerCameraMessage", longer)
+    assert not known(messages)
+    monkeypatch.undo()
+    assert known(messages)
 
 
 def test_viser_is_left_as_it_was(page: PageServer) -> None:

@@ -94,8 +94,8 @@ def nearest(name: str, choices: Iterable[str], limit: int = 3, prefix: str = "")
     return "; valid: " + ", ".join(prefix + o for o in options) if options else ""
 
 
-_LONGEST = 4000
-"""Characters of a line: a message with several paths of any length fits, a megabyte of a damaged file does not."""
+_HEAD, _TAIL = 1200, 300
+"""Characters of a line's beginning, with file and key, and of its end, with what was expected; a damaged file's value between them is cut."""
 
 _FULL_CARD = (
     "the card's memory is full; expected a smaller image or grid, fewer primitives, or CUDA_VISIBLE_DEVICES= in the environment, "
@@ -106,7 +106,8 @@ _FULL_CARD = (
 def one_line(error: BaseException) -> str | None:
     """What is said of an error that a user can act on, in one line; None of a bug, which keeps its traceback."""
     if isinstance(error, NeuprimError):
-        return cut(" ".join(str(error).split()), _LONGEST)
+        text = " ".join(str(error).split())
+        return text if len(text) <= _HEAD + _TAIL else f"{text[:_HEAD]} ... {text[-_TAIL:]}"
     if isinstance(error, OSError) and error.errno in DISK:
         return f"{error.filename or 'writing'}: {error.strerror}"
     torch = sys.modules.get("torch")  # what was not imported raised nothing

@@ -129,7 +129,12 @@ def _entry(folder: Path, one: Any) -> RegionFile | None:
         return None
     name, psnr = one.get("file"), one.get("psnr")
     numbers = [one.get(key) for key in ("x", "y", "side")]
-    if not isinstance(name, str) or Path(name).name != name or not name.startswith("worst_") or name not in {f.name for f in folder.iterdir()}:
+    if (
+        not isinstance(name, str)
+        or Path(name).name != name
+        or not name.startswith("worst_")
+        or name not in {f.name for f in folder.iterdir()}
+    ):
         return None
     value = finite(psnr)
     if value is None or not all(isinstance(n, int) for n in numbers):

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import TracebackType
 
 from neuprim.core.io.files import write_text
-from neuprim.core.io.plain import load_json
+from neuprim.core.io.plain import finite, load_json
 from neuprim.core.metrics import psnr
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.settings import TrainSettings
@@ -49,11 +49,11 @@ def open_curve(path: Path, step: int) -> Curve:
     """metrics.jsonl, cut back to what the checkpoint knows."""
     kept = []
     if step and path.exists():
-        for text in path.read_text(encoding="utf-8").splitlines():
+        for text in path.read_text(encoding="utf-8", errors="replace").splitlines():
             try:
                 if load_json(text, infinite=True)["step"] <= step:
                     kept.append(text)
-            except (ValueError, KeyError, TypeError):
+            except (ValueError, KeyError, TypeError, RecursionError):
                 continue  # a line that a kill cut short
     write_text(path, "".join(f"{text}\n" for text in kept))
     return Curve(path)
@@ -62,15 +62,15 @@ def open_curve(path: Path, step: int) -> Curve:
 def read_curve(path: Path, settings: TrainSettings) -> tuple[tuple[float, float], ...]:
     """(used fraction of the budget, PSNR of the held-out views behind the curve, dB) of every evaluation in metrics.jsonl; none of a file that is not there."""
     found = []
-    for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+    for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else ():
         try:
             line = load_json(text, infinite=True)
-            value, step, seconds = line.get("eval_psnr"), line["step"], line["seconds"]
-        except (ValueError, KeyError, TypeError, AttributeError):
+            value, step, seconds = (finite(line.get(name)) for name in ("eval_psnr", "step", "seconds"))
+        except (ValueError, AttributeError, RecursionError):
             continue  # a line that a kill cut short
-        if value is not None:
+        if value is not None and step is not None and seconds is not None:
             used = [part / whole for part, whole in ((step, settings.iterations), (seconds, settings.max_seconds)) if whole]
-            found.append((min(max(used, default=1.0), 1.0), float(value)))
+            found.append((min(max(used, default=1.0), 1.0), value))
     return tuple(found)
 
 

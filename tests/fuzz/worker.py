@@ -29,7 +29,7 @@ LIMIT = 4 * 2**30
 SECONDS = 20
 """Of processor time for one reading."""
 
-LONGEST = 700
+LONGEST = 1600
 """Characters of a message, without its folder's name."""
 
 KINDS = ("bytes", "structure")

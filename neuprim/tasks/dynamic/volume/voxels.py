@@ -97,7 +97,11 @@ class Voxels:
         found = read_arrays(path, _ARRAYS)
         index, values, matrix = found["index"], found["values"], found["scene_from_index"]
         x, y, z = (int(n) for n in found["shape"])
-        inside = min(x, y, z) >= 0 and (not len(index) or (index[0] >= 0 and index[-1] < x * y * z and bool((np.diff(index) > 0).all())))
+        inside = (
+            min(x, y, z) >= 0
+            and x * y * z < 2**62
+            and (not len(index) or (index[0] >= 0 and index[-1] < x * y * z and bool((np.diff(index) > 0).all())))
+        )
         if len(index) != len(values) or not inside or not np.isfinite(values).all() or not np.isfinite(matrix).all():
             raise DataError(
                 f"{path}: damaged ({len(index)} voxels of a grid of {x}x{y}x{z}; expected ascending places in it, and finite values)"

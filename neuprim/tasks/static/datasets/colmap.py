@@ -64,7 +64,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     frames = _read_frames(model, folder / asked.images, reconstruction, asked.skip_missing)
     train, test = every_nth(frames, asked.test_every)
     prefix = "" if asked.images == "images" else asked.images
-    points = _read_points(reconstruction)
+    points = _read_points(reconstruction, model)
     return posed_images(str(model), folder.resolve().name, train, test, asked, context, points=points, prefix=prefix, home=folder)
 
 
@@ -123,7 +123,7 @@ class _Lens(Distortion):
         return np.asarray(lens.img_from_cam(rays), dtype=np.float64) * self.scale
 
 
-def _read_points(reconstruction: Any) -> PointCloud | None:
+def _read_points(reconstruction: Any, model: Path) -> PointCloud | None:
     """The model's points, in order of their numbers; None where it has none."""
     points = [p for _, p in sorted(reconstruction.points3D.items())]
     if not points:
@@ -132,5 +132,5 @@ def _read_points(reconstruction: Any) -> PointCloud | None:
     colors = np.array([p.color for p in points], dtype=np.float64) / 255.0
     keep = np.isfinite(means).all(axis=1)
     if not keep.all():
-        raise DataError(f"points3D: {int((~keep).sum())} of {len(points)} points are not finite; expected finite coordinates")
+        raise DataError(f"{model}: points3D: {int((~keep).sum())} of {len(points)} points are not finite; expected finite coordinates")
     return PointCloud(torch.from_numpy(means), torch.from_numpy(colors).float())

@@ -56,8 +56,8 @@ def moving_points(views: ViewSet, count: int, generator: torch.Generator) -> Poi
     check_count(count)
     times = torch.stack([views.view(i).conditions["time"] for i in range(len(views))]).float()
     if not axes_meet([views.view(i).camera for i in range(len(views))]):
-        points, owner = ray_points(views, count, generator, _MATTER)
-        return distinct(PointCloud(points.means, points.colors, {"time": times[owner]}))
+        rays, owner = ray_points(views, count, generator, _MATTER)
+        return distinct(PointCloud(rays.means, rays.colors, {"time": times[owner]}))
     if has_silhouettes(views):
         points = _hull_points(views, times, count, generator)
         if points is not None:

@@ -46,6 +46,7 @@ __all__ = ["COLD", "StepReport", "Trainer"]
 COLD = 0.02
 """What a cool-down leaves of a rate."""
 
+
 class Trainer:
     """Fits a model to the training views of a data set.
 

@@ -110,7 +110,11 @@ class LightNetwork(ColourField):
         factor = strength.expand(means.shape[0], -1)
         if self.falloff:
             factor = factor / to_light.square().sum(-1, keepdim=True).clamp_min(least_square(geometry))
-        phase = (params["net_view"] * view[:, None]).sum(-1) + (params["net_light"] * unit(to_light, size)[:, None]).sum(-1) + params["net_phase"]
+        phase = (
+            (params["net_view"] * view[:, None]).sum(-1)
+            + (params["net_light"] * unit(to_light, size)[:, None]).sum(-1)
+            + params["net_phase"]
+        )
         if self.form == "additive":
             base, out = params["c_dc"], params["net_out"]
         else:

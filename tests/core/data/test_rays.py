@@ -28,7 +28,10 @@ def room(half: float) -> Callable[[Camera], Pixels]:
 
     def draw(camera: Camera) -> Pixels:
         y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-        d = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], -1).double() @ camera.viewmat[:3, :3]
+        d = (
+            torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], -1).double()
+            @ camera.viewmat[:3, :3]
+        )
         t = ((half * d.sign() - camera.position) / d).amin(-1)
         p = (camera.position + t[..., None] * d) / half
         return Pixels((0.5 + 0.45 * torch.sin(p @ torch.tensor([[7.0, 2, 1], [1, 8, 3], [2, 1, 9]]).double())).float())
@@ -65,7 +68,9 @@ def turned(count: int, radius: float, noise: float = 0.0) -> list[Camera]:
 
 
 def array(count: int, step: float) -> list[Camera]:
-    return [camera(step * torch.tensor([float(i), j, 0]), torch.tensor([0.0, 0, 0]) + UP.roll(2)) for i in range(count) for j in range(count)]
+    return [
+        camera(step * torch.tensor([float(i), j, 0]), torch.tensor([0.0, 0, 0]) + UP.roll(2)) for i in range(count) for j in range(count)
+    ]
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
@@ -100,7 +105,9 @@ def test_one_line_of_cameras_and_one_camera() -> None:
     for cameras in (line, line[:1], line[:2], [line[0]] * 5):
         points = initial_points(Taken(cameras, room(4.0)), None, 100, rng())
         assert len(points.means) > 90 and torch.isfinite(points.means).all()
-        assert int(views_that_see(Taken(cameras, room(4.0)), points.means).min()) >= min(2, len({tuple(c.position.tolist()) for c in cameras}))
+        assert int(views_that_see(Taken(cameras, room(4.0)), points.means).min()) >= min(
+            2, len({tuple(c.position.tolist()) for c in cameras})
+        )
 
 
 def test_only_opaque_pixels_begin() -> None:
@@ -117,7 +124,10 @@ def test_only_opaque_pixels_begin() -> None:
 
 
 def test_cameras_without_a_common_place_ask_for_points() -> None:
-    back_to_back = [camera(torch.tensor([0.5, 0, 0]), torch.tensor([1.0, 0, 0])), camera(torch.tensor([-0.5, 0, 0]), torch.tensor([-1.0, 0, 0]))]
+    back_to_back = [
+        camera(torch.tensor([0.5, 0, 0]), torch.tensor([1.0, 0, 0])),
+        camera(torch.tensor([-0.5, 0, 0]), torch.tensor([-1.0, 0, 0])),
+    ]
     with pytest.raises(DataError, match=r"model\.init\.points=FILE\.ply, or with ply_file_path"):
         initial_points(Taken(back_to_back, room(3.0)), None, 50, rng())
 
@@ -125,4 +135,9 @@ def test_cameras_without_a_common_place_ask_for_points() -> None:
 def test_which_axes_meet() -> None:
     around = [camera(4 * d / d.norm(), -d) for d in torch.randn((12, 3), generator=rng(), dtype=torch.float64)]
     assert axes_meet(around)
-    assert not axes_meet(array(4, 0.3)) and not axes_meet(turned(12, 0.7)) and not axes_meet(turned(12, 0.0, 1e-7)) and not axes_meet(around[:1])
+    assert (
+        not axes_meet(array(4, 0.3))
+        and not axes_meet(turned(12, 0.7))
+        and not axes_meet(turned(12, 0.0, 1e-7))
+        and not axes_meet(around[:1])
+    )

@@ -423,7 +423,9 @@ def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(plain: Dataset
 
 def test_points_that_no_camera_sees_are_refused(plain: Dataset) -> None:
     away = PointCloud(torch.full((4, 3), 100.0) + torch.rand(4, 3), torch.full((4, 3), 0.5))
-    with pytest.raises(DataError, match=r"none of 4 starting points is in the image of a training camera; .*model\.init\.points.*ply_file_path"):
+    with pytest.raises(
+        DataError, match=r"none of 4 starting points is in the image of a training camera; .*model\.init\.points.*ply_file_path"
+    ):
         tiny.trainer(replace(plain, start=lambda views, count, generator: away))
 
 

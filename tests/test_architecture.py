@@ -62,7 +62,7 @@ CORE: dict[str, set[str]] = {
     "notices": set(),
     "io": {"errors"},
     "checked": {"errors"},
-    "settings": {"checked"},
+    "settings": {"checked", "errors"},
     "metrics": {"errors"},
     "cameras": {"errors", "io"},
     "compute": {"io", "notices"},

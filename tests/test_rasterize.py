@@ -234,7 +234,7 @@ BAD: dict[str, tuple[Any, type[NeuprimError], str]] = {
     "backgrounds nan": (put("backgrounds", torch.full((3,), NAN)), NonFiniteError, r"backgrounds is not finite"),
     "setting": (put("alpha_mim", 0.1), ConfigError, r"unknown setting 'alpha_mim'; did you mean 'alpha_min'"),
     "setting value": (put("near", -1.0), ConfigError, r"near=-1\.0: expected a positive distance"),
-    "setting type": (put("near", "close"), ConfigError, r"near=close: expected a finite number above 0$"),
+    "setting type": (put("near", "close"), ConfigError, r"near=close: expected a finite number above 0, or auto$"),
 }  # fmt: skip
 
 

@@ -33,7 +33,7 @@ class RunSettings:
 
     model: ModelSettings = field(default_factory=ModelSettings)
     train: TrainSettings = field(default_factory=TrainSettings)
-    renderer: RenderSettings = field(default_factory=RenderSettings)
+    renderer: RenderSettings = field(default_factory=lambda: RenderSettings(near="auto"))
     metrics: MetricsSettings = field(default_factory=MetricsSettings)
     output_dir: str | None = None
     seed: Annotated[int, Range(0, 2**63 - 1, says="a whole number from 0 to 2^63 - 1")] = 0

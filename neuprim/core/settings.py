@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from neuprim.core.checked import Range, text, verify
+from neuprim.core.errors import ConfigError
 
 __all__ = ["DeviceChoice", "MetricsSettings", "RenderSettings", "SortOrder"]
 
@@ -31,7 +32,9 @@ class RenderSettings:
         alpha_max: opacity clamp of one primitive; at most 0.9999, because the backward pass divides by 1 - alpha.
         alpha_min: a ray-primitive pair fainter than this is skipped.
         transmittance_min: a ray stops after the primitive that takes its transmittance below this.
-        near: camera-z of the near plane, scene units; chords are cut there. Ray distance for a ``RayCamera``, which has no z plane.
+        near: camera-z of the near plane, scene units; chords are cut there. Ray distance for a ``RayCamera``, which has no z plane. "auto",
+            the default of a run: 1/400 of the median depth at which training cameras see the starting points, and at most a tenth of the
+            least; decided when training begins, and recorded. Without a training it follows from the primitives and each camera.
         depth_floor: lower bound on D = 1 - |x_m|^2 in the backward pass only: gradients grow as D^-1/2 at a silhouette, where float32
             knows D to about 3e-7. At 1e-4 they keep three digits, and one chord in ten thousand is affected.
         depth: whether to accumulate the depth image.
@@ -45,13 +48,24 @@ class RenderSettings:
     alpha_max: Annotated[float, Range(above=0, at_most=0.9999)] = 0.99
     alpha_min: Annotated[float, Range(at_least=0, below=1)] = 1.0 / 255.0
     transmittance_min: Annotated[float, Range(at_least=0, below=1)] = 1e-4
-    near: Annotated[float, Range(above=0, says="a positive distance")] = 0.01
+    near: Annotated[float, Range(above=0, says="a positive distance")] | Literal["auto"] = 0.01
     depth_floor: Annotated[float, Range(above=0, below=1)] = 1e-4
     depth: bool = False
     threads: Annotated[int, Range(at_least=0, says="0 (all cores) or a positive count")] = 0
 
     def __post_init__(self) -> None:
         verify(self, "renderer")
+
+    @property
+    def near_plane(self) -> float:
+        """``near`` as a number.
+
+        Raises:
+            ConfigError: it is "auto" where nothing has decided it.
+        """
+        if self.near == "auto":
+            raise ConfigError("renderer.near=auto: nothing has decided it here; expected a positive distance")
+        return self.near
 
 
 @dataclass(frozen=True)

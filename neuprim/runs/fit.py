@@ -139,15 +139,22 @@ def start(
     if hold_out:
         dataset = held_out(dataset, hold_out)
     if make is not None:
-        return Fitted(config, task, dataset, channels, make(config, task, dataset, loss), lpips)
+        trainer = make(config, task, dataset, loss)
+        return Fitted(_as_drawn(config, trainer), task, dataset, channels, trainer, lpips)
     events(Preparing("starting points"))
     trainer = make_trainer(config, task, dataset, loss)
+    config = _as_drawn(config, trainer)
     asked, found = config.model.primitives, trainer.model.count
     if found < _first(config):
         grows = config.train.population.strategy == "relocate"
         rest = "the rest is born where the error is largest" if grows else "there will be no more of them"
         events(Note(f"{dataset.name} offers {found:,} starting points for model.primitives={asked:,}: {rest}"))
     return Fitted(config, task, dataset, channels, trainer, lpips, "train, held out" if hold_out else "test")
+
+
+def _as_drawn(config: RunConfig, trainer: Trainer) -> RunConfig:
+    """The configuration with the near plane that its trainer decided, so that every later command uses the same."""
+    return replace(config, renderer=replace(config.renderer, near=trainer.renderer.near))
 
 
 def steps(trainer: Trainer, events: Events = silent) -> Iterator[tuple[StepReport, float | None]]:

@@ -21,6 +21,7 @@ from neuprim.core.io.images import srgb_to_linear
 from neuprim.core.layers import LIGHTS, LayerFrame, LayerSpec, chosen_layers
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.render.near import decided
 from neuprim.core.render.output import mean_depth
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import layer_of
@@ -134,7 +135,7 @@ class Layers:
             drawn(frame.drawn.alpha)
         alpha = frame.drawn.alpha.cpu()
         planes, summaries = self._planes(found, present, alpha, view)
-        write_layers(path, planes, {**self._attributes(view), **summaries})
+        write_layers(path, planes, {**self._attributes(model, view), **summaries})
 
     def _drawn(self, spec: LayerSpec, frame: LayerFrame) -> Tensor | None:
         """(H, W, C) on the processor; float64 where several lights add up."""
@@ -176,11 +177,12 @@ class Layers:
             return linear_light(image, space, alpha)
         return linear_light(image + (1.0 - alpha)[..., None] * self.background.to(image), space)
 
-    def _attributes(self, view: View) -> dict[str, Any]:
+    def _attributes(self, model: Primitives, view: View) -> dict[str, Any]:
         """What the file says about itself: camera, conditions, where it comes from and what its numbers are."""
         linear = self.channels.color_space == "linear"
+        near = decided(self.point.settings, model.params["means"], [view.camera]).near_plane
         found = {
-            **exr_attributes(self.world.world_camera(view.camera), self.point.settings.near / self.world.scale),
+            **exr_attributes(self.world.world_camera(view.camera), near / self.world.scale),
             "software": f"neuprim {__version__}",
             "neuprim:run": self.run_dir.resolve().name,
             "neuprim:task": self.task.name,

@@ -26,11 +26,13 @@ from neuprim.core.channels import Channels, channels_of
 from neuprim.core.compute import device
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.check import check_dataset, check_pixels
+from neuprim.core.data.rays import NOT_SEEN
 from neuprim.core.io import images
 from neuprim.core.metrics import means, psnr, psnr_gain, ssim, ssim_3dgs, to_json
 from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.notices import warn_once
 from neuprim.core.render import RenderSettings, choose, render
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.judging import clips_of, diagnosed, judged, mask_of
@@ -49,6 +51,7 @@ class ViewMetrics:
     Attributes:
         psnr, ssim: in the data set's colour space.
         seconds: of the forward pass alone.
+        empty: the model is not in the view; the image is the background alone.
         more: further numbers by name: ``psnr_srgb``, ``ssim_srgb`` of linear images, or ``psnr_display``, ``ssim_display`` of what the
             task's own display shows; ``psnr_gain`` of opaque photographs; ``ssim_3dgs``, ``lpips``; ``psnr_mask`` and ``mse_mask`` inside the task's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without
             anything on it; what the task's :attr:`~neuprim.core.task.TaskSpec.judge` adds.
@@ -59,6 +62,7 @@ class ViewMetrics:
     ssim: float
     seconds: float
     more: dict[str, float] = field(default_factory=dict)
+    empty: bool = False
 
 
 def draw(model: Primitives, view: View, settings: RenderSettings, background: Tensor) -> Tensor:
@@ -118,6 +122,7 @@ def measure(
         start = time.perf_counter()
         rendered = draw(model, view, settings, background) if paint is None else paint(model, view, background)
         seconds = time.perf_counter() - start
+        empty = bool((rendered == background).all())
         if pixels.mask is not None:
             rendered = torch.where(pixels.mask[..., None], rendered, truth)
         counted = mask_of(task, dataset, i)
@@ -125,9 +130,14 @@ def measure(
         if pixels.alpha is None:
             more["psnr_gain"] = psnr_gain(rendered, truth, pixels.mask)
         more |= judged(task, dataset, i, rendered, truth)
-        result.append(ViewMetrics(view.name, psnr(rendered, truth, pixels.mask), ssim(rendered, truth), seconds, more))
+        result.append(ViewMetrics(view.name, psnr(rendered, truth, pixels.mask), ssim(rendered, truth), seconds, more, empty))
         if seen is not None:
             seen(i, view, rendered, truth)
+    if all(view.empty for view in result):
+        warn_once(
+            f"{dataset.name}: the model is in none of {len(result)} test views, which show the background alone; expected starting points where "
+            f"the cameras look: {NOT_SEEN}"
+        )
     return result
 
 
@@ -226,6 +236,7 @@ def summary(
         **to_json("psnr_worst", worst.psnr),
         "view_worst": worst.name,
         "per_view": [_entry(v) for v in views],
+        **({"views_empty": sum(v.empty for v in views)} if any(v.empty for v in views) else {}),
         **_per_frame(clips_of(task, dataset) if split == "test" else (), views),
         "primitives": model.count,
         "parameters": model.count * model.parameters_per_primitive,

@@ -131,6 +131,8 @@ def read_point(words: Sequence[str], usual: RenderSettings, model: Primitives) -
             ]
             raise ConfigError(f"{assignment.key}: nothing that a finished run is drawn by{nearest(assignment.key, known)}")
     settings = checked(RenderSettings, values, "renderer")
+    if settings.near == "auto":
+        settings = dataclasses.replace(settings, near=usual.near)  # what the run's training decided
     backends.check_name(settings.backend)
     backends.check_pair(settings)
     return OperatingPoint(settings, resolution, dict(sorted(reduced.items())), dict(sorted(stored.items())))

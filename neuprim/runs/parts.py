@@ -35,7 +35,8 @@ def in_parts(config: RunConfig, ranks: Alone) -> Alone:
     refuse_parts(config.train, ranks.size)
     from neuprim.core.train.ranks.shards import shards_of
 
-    return shards_of(ranks, config.renderer.near)
+    near = config.renderer.near
+    return shards_of(ranks, 0.0 if near == "auto" else near)  # decided later, and with less culled images are the same
 
 
 def write_parts(

@@ -23,6 +23,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.edge import EDGES
 from neuprim.core.model.fields import ConditionSpec, Field
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.render.near import decided
 from neuprim.core.settings import RenderSettings
 from neuprim.webpage.constants import shader_constants
 from neuprim.webpage.numbers import pack_model
@@ -115,6 +116,7 @@ def web_page(
     scripts = {kind: _script(kind, field) for kind, field in (("density", model.density), ("colour", model.colour))}
     packed = pack_model(model, level)
     middle, radius, top = _extent(packed.model, fullest(packed.model, conditions))
+    home = views[0].camera if views else _home(middle, radius, up)
     header = {
         "name": name,
         "count": model.count,
@@ -124,7 +126,7 @@ def web_page(
         "background": [float(background[c]) for c in rgb],
         "linear": linear,
         "renderer": {key: getattr(settings, key) for key in ("alpha_min", "alpha_max")},
-        "near": settings.near,
+        "near": decided(settings, packed.model.params["means"], [home]).near_plane,
         "constants": [shader_constants(edge) for edge in EDGES],
         "up": [float(x) for x in up],
         "center": middle,
@@ -134,7 +136,7 @@ def web_page(
         "views": [_view(view) for view in views],
         "still": bool(still),
         **({} if world is None or world.identity else {"world": world.to_json()}),
-        "home": camera_numbers(views[0].camera if views else _home(middle, radius, up)),
+        "home": camera_numbers(home),
     }
     assets = resources.files(__package__).joinpath("assets")
     texts = {path: assets.joinpath(path).read_text(encoding="utf-8") for path in ("page.html", "page.css", *_SHARED, *_MAIN, *_SHADERS)}

@@ -23,6 +23,7 @@ from neuprim.core import checkpoint
 from neuprim.core.channels import Channels
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NonFiniteError
+from neuprim.core.notices import NeuprimWarning
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.runs.curve import curve_psnr
 from neuprim.runs.draw import render_run
@@ -152,6 +153,22 @@ def test_masked_pixels_do_not_count_on_the_curve() -> None:
     trainer = tiny.trainer(dataset, 3)
     views = measure(trainer.model, TASK, dataset, trainer.renderer, Channels())
     assert curve_psnr(trainer) == pytest.approx(sum(v.psnr for v in views) / len(views), abs=1e-9)
+
+
+def test_a_model_that_no_view_shows_says_so() -> None:
+    dataset = tiny.two_primitives()
+    trainer = tiny.trainer(dataset, 3)
+    assert not any(v.empty for v in measure(trainer.model, TASK, dataset, trainer.renderer, Channels()))
+    trainer.model.params["means"] = trainer.model.params["means"].detach() + 1000.0
+    with pytest.warns(NeuprimWarning, match=r"two: the model is in none of 2 test views.*ply_file_path"):
+        views = measure(trainer.model, TASK, dataset, trainer.renderer, Channels())
+    assert all(v.empty for v in views)
+
+
+def test_the_near_plane_of_a_run_is_recorded_once(scene: Path, tmp_path: Path) -> None:
+    near = RunConfig.from_yaml(fit(words(scene, tmp_path / "run", 3))).renderer.near
+    assert isinstance(near, float) and 0 < near < 0.1
+    assert RunConfig.from_yaml(fit(words(scene, tmp_path / "own", 3, "renderer.near=0.125"))).renderer.near == 0.125
 
 
 def test_a_perfect_view_leaves_the_curve_a_number(monkeypatch: pytest.MonkeyPatch) -> None:

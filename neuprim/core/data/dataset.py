@@ -15,7 +15,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from neuprim.core.cameras import Camera, orbit
+from neuprim.core.cameras import Camera, look_at, orbit
 from neuprim.core.cameras.world import World
 from neuprim.core.compute import device as hardware
 from neuprim.core.errors import ConfigError
@@ -157,7 +157,8 @@ class Dataset:
         name: shown in reports.
         train, test: the splits.
         start: where primitives start, see :data:`StartingPoints`.
-        extent: scene extent in scene units (see :func:`camera_extent`), the unit of position rates and size limits.
+        extent: scene extent in scene units (see :func:`camera_extent`), the unit of position rates and size limits unless matter is a hundred times
+            as far.
         background: (C,) the colour that evaluation composites over.
         channels: colour channels C.
         color_space: "srgb" (display-referred values as stored in PNG) or "linear".
@@ -219,7 +220,7 @@ class Dataset:
         return PointCloud(means, torch.full((count, self.channels), 0.5))
 
     def orbit(self, frames: int) -> list[View]:
-        """Views circling the scene at the training cameras' mean distance and elevation.
+        """Views circling the scene at the training cameras' mean distance and elevation; outward where these do not look at its centre.
 
         Conditions that are one number go from their least to their greatest value over the training views; others stay as in the first.
         """
@@ -227,8 +228,16 @@ class Dataset:
         offsets = torch.stack([c.position for c in cameras]) - self.center.double()
         radius = offsets.norm(dim=-1).mean().item()
         up = self.up.double() / self.up.double().norm()
-        sine = ((offsets @ up) / offsets.norm(dim=-1).clamp_min(1e-12)).mean().clamp(-0.9, 0.9)
-        views = orbit(cameras[0], self.center, self.up, radius, torch.asin(sine).item(), frames)
+        units = offsets / offsets.norm(dim=-1, keepdim=True).clamp_min(1e-30)
+        forward = torch.stack([c.viewmat[2, :3] for c in cameras]).double()
+        outward = bool((units * forward).sum(-1).mean() > -0.5)
+        sine = ((forward if outward else units) @ up).mean().clamp(-0.9, 0.9)
+        if outward:
+            directions = [c.position for c in orbit(cameras[0], torch.zeros(3), self.up, 1.0, torch.asin(sine).item(), frames)]
+            eyes = [self.center.double() + radius * d for d in directions]
+            views = [replace(cameras[0], viewmat=look_at(e, e + d, up)) for e, d in zip(eyes, directions, strict=True)]
+        else:
+            views = orbit(cameras[0], self.center, self.up, radius, torch.asin(sine).item(), frames)
         between = self._scalar_conditions()
         held = {name: value for name, value in self.train.view(0).conditions.items() if name not in between}
         return [

@@ -10,7 +10,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.data import camera_extent
 
-__all__ = ["focus_point"]
+__all__ = ["axes_meet", "focus_point"]
 
 
 def focus_point(cameras: Sequence[Camera]) -> Tensor:
@@ -26,3 +26,19 @@ def focus_point(cameras: Sequence[Camera]) -> Tensor:
     target = positions.mean(0) + forward.mean(0) * camera_extent(cameras)
     right = (planes @ positions[:, :, None]).sum(0)[:, 0] + pull * target
     return torch.linalg.solve(planes.sum(0) + pull * eye, right)
+
+
+def axes_meet(cameras: Sequence[Camera]) -> bool:
+    """Whether the optical axes determine a point in front of the cameras.
+
+    They do if they pass it closer than half the spread of the camera centres, and nine cameras of ten look towards it. Parallel axes,
+    cameras that look outward from their centre, and cameras that share one centre do not.
+    """
+    positions = torch.stack([c.position.detach().double() for c in cameras])
+    forward = torch.stack([c.viewmat[2, :3].detach().double() for c in cameras])
+    offsets = focus_point(cameras) - positions
+    depths = (offsets * forward).sum(-1)
+    miss = (offsets - depths[:, None] * forward).square().sum(-1).mean()
+    spread = (positions - positions.mean(0)).square().sum(-1).mean()
+    turned = 1.0 - torch.linalg.eigvalsh(forward.T @ forward / len(cameras))[-1]  # 0 where all axes are parallel
+    return bool((miss < 0.25 * spread) & (turned > 1e-3) & ((depths > 0).double().mean() >= 0.9))

@@ -153,7 +153,7 @@ def _test_points(points: Any, poses: Any, lenses: Any, offsets: Any, tables: Any
         for j in range(len(poses)):
             pose = poses[j]
             z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
-            if z <= 1e-6:
+            if z <= 0.0:
                 continue
             fx, fy, cx, cy, width, height = lenses[j]
             u = fx * (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]) / z + cx

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import PointCloud, ViewSet
-from neuprim.core.data.focus import focus_point
+from neuprim.core.data.focus import axes_meet, focus_point
 from neuprim.core.data.hull import hull_surface
+from neuprim.core.data.rays import ray_points, views_that_see
 from neuprim.core.errors import ConfigError
 
 __all__ = [
@@ -27,12 +28,16 @@ _FPS_WORK = 5e8
 """Distances that exact farthest-point sampling may evaluate (about 1.5 s on one core); above, a grid thins the points."""
 _COLOR_VIEWS = 100
 _CHUNK = 20_000
+_ROUNDS = 8
+"""Times that a box is filled, for points that cameras see."""
 
 
 def initial_points(views: ViewSet, points: PointCloud | None, count: int, generator: torch.Generator) -> PointCloud:
     """At most ``count`` distinct starting points of a static scene, in scene units and the images' colour space.
 
-    Given points win; else data with alpha uses the surface of its visual hull, and data without a box in front of the cameras.
+    Given points win. Cameras that do not look at one point begin along their rays, see :func:`~neuprim.core.data.rays.ray_points`. Else
+    data with alpha uses the surface of its visual hull, and data without a box about that point. Inferred points that fewer than two
+    cameras see do not count.
 
     Raises:
         ConfigError: ``count`` is not positive.
@@ -41,6 +46,8 @@ def initial_points(views: ViewSet, points: PointCloud | None, count: int, genera
     check_count(count)
     if points is not None:
         return subset(points, count, generator)
+    if not axes_meet([views.view(i).camera for i in range(len(views))]):
+        return distinct(ray_points(views, count, generator)[0])
     if has_silhouettes(views):
         return hull_points(views, count, generator)
     return box_points(views, count, generator)
@@ -92,17 +99,25 @@ def hull_points(views: ViewSet, count: int, generator: torch.Generator, resoluti
 
 
 def box_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
-    """``count`` points, uniform in a cube about the point the cameras look at, coloured by the pixels they project to.
+    """``count`` points at most, uniform in a cube about the point the cameras look at, coloured by the pixels they project to.
 
-    The cube's half side is half the median distance of the cameras to that point.
+    The cube's half side is half the median distance of the cameras to that point. Points that fewer than two cameras see (one, where there
+    is one) do not count.
     """
     cameras = [views.view(i).camera for i in range(len(views))]
     center = focus_point(cameras)
     half = 0.5 * torch.stack([c.position for c in cameras]).sub(center).norm(dim=-1).median()
     if half <= 0:
         half = torch.tensor(1.0, dtype=torch.float64)
-    means = (center + (2.0 * torch.rand((count, 3), generator=generator).double() - 1.0) * half).float()
-    return distinct(PointCloud(means, median_colors(views, means)))
+    found = torch.zeros(0, 3)
+    for _ in range(_ROUNDS):
+        means = (center + (2.0 * torch.rand((count, 3), generator=generator).double() - 1.0) * half).float()
+        found = torch.cat([found, means[views_that_see(views, means) >= min(2, len(views))]])[:count]
+        if len(found) == count:
+            break
+    if not len(found):
+        return distinct(ray_points(views, count, generator)[0])
+    return distinct(PointCloud(found, median_colors(views, found)))
 
 
 def distinct(points: PointCloud) -> PointCloud:
@@ -146,7 +161,7 @@ def farthest_points(points: Tensor, count: int, generator: torch.Generator) -> T
 def _thinned(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
     shuffled = torch.randperm(len(points), generator=generator).numpy()
     low = points.min(0).values
-    unit = ((points - low) / (points - low).max().clamp_min(1e-12)).double().numpy()[shuffled]
+    unit = ((points - low) / (points - low).max().clamp_min(1e-30)).double().numpy()[shuffled]
     few, many = 1, 1024  # cells per side; `few` always gives at most `count` cells
     first = np.zeros(1, dtype=np.int64)
     while many - few > 1:

@@ -17,6 +17,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render.backends import Backend, available, choose, find
+from neuprim.core.render.near import decided
 from neuprim.core.render.output import RenderOutput, RenderStats, Tally
 from neuprim.core.render.refusals import refuse_non_finite
 from neuprim.core.render.samples import render_samples
@@ -56,7 +57,7 @@ def render(
         camera: the view; rgb is (camera.height, camera.width, C). A :class:`RayCamera` (any central projection) is drawn
             by the reference backend alone.
         conditions: e.g. ``{"time": tensor(0.5)}``.
-        settings: every speed/accuracy knob.
+        settings: every speed/accuracy knob; None: the defaults, with ``near="auto"``.
         background: (C,) colour behind everything; None is black.
 
     Raises:
@@ -65,7 +66,7 @@ def render(
         BackendUnavailable: the backend asked for cannot draw this model or this camera, or cannot run here.
         ConfigError: there is no backend of the name asked for.
     """
-    settings = settings or RenderSettings()
+    settings = settings or RenderSettings(near="auto")
     with limited(settings.threads) if settings.threads else nullcontext():  # fields are lowered by as many threads as pixels
         lowered = model.lower(camera, conditions or {}, settings)
         lowered.check_seen(camera.viewmat, background)
@@ -80,6 +81,7 @@ def render_lowered(lowered: Lowered, camera: AnyCamera, settings: RenderSettings
 
 def _drawn(lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None) -> RenderOutput:
     """Of what is checked."""
+    settings = decided(settings, lowered.geometry.means, [camera])
     backend = choose(lowered, settings, camera)
     if not backend.checks:
         refuse_non_finite(lowered)

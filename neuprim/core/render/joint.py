@@ -28,6 +28,7 @@ from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import render_lowered
+from neuprim.core.render.near import decided
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.render.reference.backend import pixel_directions
 from neuprim.core.render.reference.projection import screen_boxes
@@ -114,7 +115,7 @@ def joint_volume(
     def draw(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
         return _draw(lowered, camera, background, settings, steps, keep)
 
-    settings = settings or RenderSettings()
+    settings = decided(settings or RenderSettings(near="auto"), lowered.geometry.means, [camera])
     if settings.samples > 1:
         return render_samples(draw, lowered, camera, background, settings)
     return draw(lowered, camera, background, settings)
@@ -124,7 +125,7 @@ def _draw(lowered: Lowered, camera: Camera, background: Tensor | None, settings:
     colour, g = lowered.colour, lowered.geometry
     channels = colour.channels
     directions = pixel_directions(camera)
-    boxes = screen_boxes(g, camera, settings.near)
+    boxes = screen_boxes(g, camera, settings.near_plane)
     whiten = (quaternion_to_matrix(g.quats.double()) / g.log_scales.double().exp()[:, None, :]).transpose(1, 2)  # scene -> unit sphere
     image = torch.zeros(camera.height, camera.width, channels + 2, dtype=torch.float64)
     stats = RenderStats("joint", g.count)
@@ -166,7 +167,7 @@ def _march(
     tm = -(v * p).sum(-1) / a
     x = p + tm[..., None] * v
     half = ((1 - (x * x).sum(-1)).clamp_min(0) / a).sqrt()
-    start, end = torch.maximum(tm - half, (settings.near / d[:, 2])[:, None]), tm + half
+    start, end = torch.maximum(tm - half, (settings.near_plane / d[:, 2])[:, None]), tm + half
     ray, row = ((half > 0) & (end > start)).nonzero(as_tuple=True)
     prim, t0, t1 = rows[row], start[ray, row], end[ray, row]
     chords = Pairs.of(g, prim, origin, world[ray], t0, t1)

@@ -11,11 +11,13 @@ from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.check import check_points
 from neuprim.core.data.initial import subset
 from neuprim.core.data.points_file import read_points
+from neuprim.core.data.rays import NOT_SEEN, views_that_see
 from neuprim.core.data.surroundings import surrounding_points
 from neuprim.core.errors import ConfigError, DataError, nearest
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
+from neuprim.core.render.near import scene_extent
 from neuprim.core.train.settings import ModelSettings
 
 __all__ = ["initial_model"]
@@ -52,12 +54,15 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
     check_points(cloud, settings.primitives, dataset)
     if len(cloud.means) == 0:
         raise DataError(f"{dataset.name}: no starting points found; expected points or images with visible content")
+    if not bool((views_that_see(dataset.train, cloud.means) > 0).any()):
+        raise DataError(f"{dataset.name}: none of {len(cloud.means)} starting points is in the image of a training camera; {NOT_SEEN}")
+    extent = scene_extent(dataset.extent, cloud.means, [dataset.train.view(i).camera for i in range(len(dataset.train))])
     if len(cloud.means) == 1:
-        scales = torch.full((1,), 0.1 * dataset.extent)
+        scales = torch.full((1,), 0.1 * extent)
     else:
         neighbours = min(3, len(cloud.means) - 1)
         distance = torch.from_numpy(cKDTree(cloud.means.numpy()).query(cloud.means.numpy(), k=neighbours + 1)[0][:, 1:])
-        scales = distance.square().mean(dim=1).sqrt().clamp_min(1e-6 * dataset.extent).float()
+        scales = distance.square().mean(dim=1).sqrt().clamp_min(1e-6 * extent).float()
     context = InitContext(cloud.means.float(), scales, cloud.colors.float(), generator, settings.init, cloud.conditions, steps=cloud.steps)
     factor = context.number("scale", 1.0, 0)
     context.scales, context.quats, context.alphas = scales * factor, cloud.quats, cloud.alphas
@@ -68,7 +73,7 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
         axes = cloud.deviations * support[:, None]
         context.alphas = None if cloud.alphas is None else opacities
     if axes is not None:
-        context.axes = axes.clamp_min(1e-6 * dataset.extent) * factor
+        context.axes = axes.clamp_min(1e-6 * extent) * factor
     return Primitives.initialise(density, colour, context)
 
 

@@ -24,6 +24,7 @@ from neuprim.core.data.check import check_pixels
 from neuprim.core.errors import ConfigError, DataError, DeviceMemoryError, NonFiniteError, RankError, nearest
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
+from neuprim.core.render.near import decided, scene_extent
 from neuprim.core.render.place import device_of
 from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.ahead import Ahead
@@ -54,6 +55,7 @@ class Trainer:
 
     Attributes:
         device: where the training's tensors are.
+        extent: the unit of position rates and size limits, see :func:`~neuprim.core.render.near.scene_extent`.
         step, elapsed: steps done and seconds of training they took (held-out evaluations and file writes not counted).
         stored: parameters -> what will be kept of them, with the gradients of the parameters: images are drawn of that. None: of themselves.
         zeros: parameter -> (N, ...) bool of the numbers that stay zero; empty for none.
@@ -75,7 +77,9 @@ class Trainer:
         if settings.supervision != "images" and dataset.points is None:
             raise ConfigError(f"train.supervision={settings.supervision}: {dataset.name} has no voxels to learn from; expected images")
         self.model, self.dataset, self.loss = model, dataset, loss
-        self.settings, self.renderer = settings, replace(renderer, depth=False)
+        cameras = [dataset.train.view(i).camera for i in range(len(dataset.train))]
+        self.settings, self.renderer = settings, replace(decided(renderer, model.params["means"], cameras), depth=False)
+        self.extent = scene_extent(dataset.extent, model.params["means"], cameras)
         first = dataset.train.view(0)
         self.device = device_of(model, self.renderer, first.camera, first.conditions)
         model.params = model.to(self.device).params
@@ -155,7 +159,7 @@ class Trainer:
             factor *= max((1 - self.progress) / s.cooldown, COLD)
         if self.step < s.warmup_steps:
             factor *= (self.step + 1) / s.warmup_steps
-        unit = {"absolute": 1.0, "extent": self.dataset.extent}
+        unit = {"absolute": 1.0, "extent": self.extent}
         units = {spec.name: unit[s.rate_units.get(spec.name, spec.lr_unit)] for spec in self.model.specs}
         return {spec.name: s.rates.get(spec.name, spec.lr) * units[spec.name] * factor for spec in self.model.specs}
 
@@ -236,7 +240,7 @@ class Trainer:
         self.step += 1
         change = None
         if self.population.due(self.step, progress):
-            change = self.ranks.intervene(self.population, model, self.optimizer, self.dataset.extent)
+            change = self.ranks.intervene(self.population, model, self.optimizer, self.extent)
             if change is not None:
                 self._apply(change)
         self.elapsed = self.ranks.spent(self.elapsed, start)

@@ -79,7 +79,7 @@ class ConditionControls:
         if spec.shape != (3,) or "scene units" not in spec.unit:
             return None
         value = self._value(spec)
-        size = 0.15 * max(float(value.norm()), 1e-3)
+        size = 0.15 * (float(value.norm()) or 1.0)
         client = self.session.client
         client.scene.add_icosphere(f"/{spec.name}/ball", 0.15 * size, color=(255, 220, 90))
         handle = client.scene.add_transform_controls(

@@ -14,6 +14,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
+from neuprim.core.render.near import decided
 from neuprim.plugins.inspect.field import absorbed
 from neuprim.runs.live.frame import Look
 
@@ -91,7 +92,7 @@ def strongest(model: Primitives, look: Look, direction: np.ndarray, settings: Re
         d = torch.as_tensor(np.asarray(direction, np.float64))
         d = d / d.norm()
         forward = look.camera.viewmat[2, :3].double()
-        near = settings.near / max(float(forward @ d), 1e-9)
+        near = decided(settings, g.means, [look.camera]).near_plane / max(float(forward @ d), 1e-9)
         offset = origin - g.means.double()
         axes = g.scales.double()
         p, v = ((g.rotations.double().transpose(1, 2) @ x[..., None])[..., 0] / axes for x in (offset, d.expand_as(offset)))

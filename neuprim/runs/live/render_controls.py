@@ -34,7 +34,7 @@ class RenderControls:
             self._inputs: dict[str, Any] = {"sort": gui.add_dropdown("sort", list(get_args(SortOrder)), initial_value=settings.sort)}
             for name in _NUMBERS:
                 value = getattr(settings, name)
-                self._inputs[name] = gui.add_number(name, value, step=1 if isinstance(value, int) else 1e-6)
+                self._inputs[name] = gui.add_number(name, value, step=1 if isinstance(value, int) else min(1e-6, 1e-3 * value or 1e-6))
             self._words = (
                 gui.add_text("operating point", "", hint="as `neuprim render` takes it: resolution=0.5 density.neurons=1")
                 if words

@@ -87,9 +87,8 @@ class Session:
     def stand(self, pose: Pose) -> None:
         """Move the page's camera; a drag turns it around what of the scene's middle lies straight ahead."""
         forward = pose.rotation.as_matrix()[:, 2]
-        ahead = max(
-            float(forward @ (self.subject.center - pose.position)), 1e-2 * float(np.linalg.norm(self.subject.center - pose.position)), 1e-6
-        )
+        away = self.subject.center - pose.position
+        ahead = max(float(forward @ away), 1e-2 * float(np.linalg.norm(away))) or 1.0
         camera = self.client.camera
         with self.client.atomic():
             camera.position = pose.position

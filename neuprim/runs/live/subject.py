@@ -133,7 +133,7 @@ class Subject:
         with torch.no_grad():
             means = self.model().living(conditions).geometry.means.double().cpu()
         middle = torch.from_numpy(np.asarray(self.center, np.float64))
-        radius = max(float((means - middle).norm(dim=1).quantile(0.9)), 1e-6) if len(means) else 1.0
+        radius = (float((means - middle).norm(dim=1).quantile(0.9)) if len(means) else 0.0) or 1.0
         focal = 180 / math.tan(_FOV / 2)
         template = Camera(torch.eye(4, dtype=torch.float64), focal, focal, 320.0, 180.0, 640, 360)
         (camera,) = orbit(template, middle, torch.tensor(self.up, dtype=torch.float64), 3.5 * radius, 0.4, 1)

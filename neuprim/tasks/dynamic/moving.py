@@ -19,8 +19,10 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import PointCloud, ViewSet
+from neuprim.core.data.focus import axes_meet
 from neuprim.core.data.hull import EmptyHull, hull_surface
 from neuprim.core.data.initial import box_points, check_count, distinct, farthest_points, has_silhouettes, median_colors
+from neuprim.core.data.rays import ray_points
 from neuprim.core.data.views import SomeViews
 
 __all__ = ["moving_points"]
@@ -39,7 +41,7 @@ _MATTER = 0.1
 def moving_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
     """At most ``count`` distinct starting points of a moving scene, in scene units and the images' colour space.
 
-    With alpha they are spread evenly over the surfaces of all moments' hulls, each with the "time" and the colour of a moment
+    Where the cameras do not look at one point they begin along rays, see :func:`~neuprim.core.data.rays.ray_points`. With alpha they are spread evenly over the surfaces of all moments' hulls, each with the "time" and the colour of a moment
     in which it was found (one of them at random); moments without matter give none. Without alpha, or where every image has
     its own time and all hulls are empty because things move too fast, they fill a box in front of the cameras, with times of
     random views.
@@ -53,6 +55,9 @@ def moving_points(views: ViewSet, count: int, generator: torch.Generator) -> Poi
     """
     check_count(count)
     times = torch.stack([views.view(i).conditions["time"] for i in range(len(views))]).float()
+    if not axes_meet([views.view(i).camera for i in range(len(views))]):
+        rays, owner = ray_points(views, count, generator, _MATTER)
+        return distinct(PointCloud(rays.means, rays.colors, {"time": times[owner]}))
     if has_silhouettes(views):
         points = _hull_points(views, times, count, generator)
         if points is not None:

@@ -15,7 +15,7 @@
 
   function illuminate(i, centre, light) {
     for (let a = 0; a < 3; a++) towards[a] = light[a] - centre[a];
-    share[i] = 1 / typical / (falloff ? Math.max(lib.dot(towards, towards), 1e-12) : 1);
+    share[i] = 1 / typical / (falloff ? Math.max(lib.dot(towards, towards), 1e-20) : 1);
     lib.unit(towards);
     for (let h = 0, o = 3 * hidden * i; h < hidden; h++, o += 3) {
       lit[i * hidden + h] = net_phase[i * hidden + h] + net_light[o] * towards[0] + net_light[o + 1] * towards[1] + net_light[o + 2] * towards[2];

@@ -28,7 +28,7 @@ from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.scripts import script_beside
 from neuprim.core.settings import RenderSettings
-from neuprim.tasks.relight.directions import unit
+from neuprim.tasks.relight.directions import least_square, unit
 from neuprim.tasks.relight.fewer import fewer_units
 from neuprim.tasks.relight.visibility import light_visibility
 
@@ -103,13 +103,18 @@ class LightNetwork(ColourField):
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> RayNet:
         means = geometry.means
-        view = unit(means - device.beside(camera.position, means))
+        size = geometry.length_scale.detach()[:, None]
+        view = unit(means - device.beside(camera.position, means), size)
         to_light = device.beside(conditions["light"], means) - means
         strength = device.beside(conditions["light_intensity"], means).expand(self.channels) / self.typical
         factor = strength.expand(means.shape[0], -1)
         if self.falloff:
-            factor = factor / to_light.square().sum(-1, keepdim=True).clamp_min(1e-12)
-        phase = (params["net_view"] * view[:, None]).sum(-1) + (params["net_light"] * unit(to_light)[:, None]).sum(-1) + params["net_phase"]
+            factor = factor / to_light.square().sum(-1, keepdim=True).clamp_min(least_square(geometry))
+        phase = (
+            (params["net_view"] * view[:, None]).sum(-1)
+            + (params["net_light"] * unit(to_light, size)[:, None]).sum(-1)
+            + params["net_phase"]
+        )
         if self.form == "additive":
             base, out = params["c_dc"], params["net_out"]
         else:

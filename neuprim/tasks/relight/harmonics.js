@@ -26,7 +26,7 @@
   function at({ light, light_intensity }) {
     function look(i, centre, out) {
       for (let a = 0; a < 3; a++) towards[a] = light[a] - centre[a];
-      const squared = Math.max(lib.dot(towards, towards), 1e-12);
+      const squared = Math.max(lib.dot(towards, towards), 1e-20);
       lib.unit(towards);
       harmonics(towards[0], towards[1], towards[2]);
       for (let c = 0; c < channels; c++) {

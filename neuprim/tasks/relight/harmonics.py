@@ -16,7 +16,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.pieces import Piece
 from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.model.scripts import script_beside
-from neuprim.tasks.relight.directions import unit
+from neuprim.tasks.relight.directions import least_square, unit
 
 __all__ = ["LightHarmonics", "real_harmonics"]
 
@@ -63,9 +63,9 @@ class LightHarmonics(ColourField):
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         color = params["c_dc"]
         to_light = device.beside(conditions["light"], color) - geometry.means
-        squared = to_light.square().sum(-1, keepdim=True).clamp_min(1e-12)
+        squared = to_light.square().sum(-1, keepdim=True).clamp_min(least_square(geometry))
         if self.degree:
-            bands = real_harmonics(unit(to_light), self.degree)[:, 1:]
+            bands = real_harmonics(unit(to_light, geometry.length_scale.detach()[:, None]), self.degree)[:, 1:]
             color = color + (bands[:, :, None] * params["light_sh"]).sum(1)
         strength = device.beside(conditions["light_intensity"], color) / self.typical / (squared if self.falloff else 1.0)
         return Constant(color.clamp_min(0.0) * strength)

@@ -87,7 +87,7 @@ def orbit(dataset: Dataset, frames: int) -> list[View]:
     training = [dataset.train.view(i).conditions for i in range(len(dataset.train))]
     up, center = (x.double() / n for x, n in ((dataset.up, dataset.up.double().norm()), (dataset.center, 1.0)))
     offsets = torch.stack([c["light"] for c in training]).double() - center
-    radius, sine = offsets.norm(dim=-1).mean(), ((offsets @ up) / offsets.norm(dim=-1).clamp_min(1e-12)).mean()
+    radius, sine = offsets.norm(dim=-1).mean(), ((offsets @ up) / offsets.norm(dim=-1).clamp_min(1e-30)).mean()
     helper = torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())]
     side = torch.linalg.cross(up, helper)
     side = side / side.norm()

@@ -79,7 +79,7 @@ def typical_light(dataset: Dataset, falloff: bool) -> float:
     values = []
     for i in range(len(dataset.train)):
         conditions = dataset.train.view(i).conditions
-        squared = (conditions["light"].double() - dataset.center.double()).square().sum().clamp_min(1e-12)
+        squared = (conditions["light"].double() - dataset.center.double()).square().sum().clamp_min(1e-30)
         values.append(conditions["light_intensity"].double().mean() / (squared if falloff else 1.0))
     found = float(torch.stack(values).median())
     return found if 0 < found < math.inf else 1.0

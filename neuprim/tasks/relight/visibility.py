@@ -72,7 +72,7 @@ def light_visibility(
         focal = 0.5 * SIZE / math.tan(half)
         up = torch.tensor([0.0, 0.0, 1.0] if abs(float(light[2] - center[2])) < 0.9 * distance else [0.0, 1.0, 0.0], dtype=torch.float64)
         camera = Camera(look_at(light, center, up), focal, focal, SIZE / 2, SIZE / 2, SIZE, SIZE)
-        near = max(1e-4 * radius, distance - 1.5 * radius, 1e-6)
+        near = max(1e-4 * radius, distance - 1.5 * radius)
         own = replace(settings, depth=True, near=near, samples=1)
         depths = means @ device.beside(camera.viewmat[2, :3], means) + camera.viewmat[2, 3]
         low, high = torch.stack([depths.min(), depths.max()]).tolist()

@@ -41,7 +41,7 @@ def arriving_light(start, stop, points, view, near, focal, alphas, depths, bias,
                         weight = (down if di else 1.0 - down) * (right if dj else 1.0 - right) * own
                         alpha += weight
                         nearness += weight / max(np.float64(depths[k, i + di, j + dj]), near)
-            behind = z - alpha / max(nearness, 1e-12)
+            behind = z - alpha / max(nearness, 1e-30)
             s = min(max(0.5 + 0.5 * (behind - bias) / softness, 0.0), 1.0)
             arrives *= 1.0 - alpha * s * s * (3.0 - 2.0 * s)
         found[p] = arrives

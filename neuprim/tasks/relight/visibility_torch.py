@@ -30,7 +30,7 @@ def arriving(
         weight = (down if di else 1.0 - down) * (right if dj else 1.0 - right) * inside * opacities[:, pixel].double()
         alpha += weight
         nearness += weight / distances[:, pixel].double().clamp_min(near)
-    behind = z - alpha / nearness.clamp_min(1e-12)
+    behind = z - alpha / nearness.clamp_min(1e-30)
     s = (0.5 + 0.5 * (behind - bias) / softness).clamp(0.0, 1.0)
     found = (1.0 - alpha * s * s * (3.0 - 2.0 * s)).prod(0)
     return torch.where(ahead, found, 1.0).float()

@@ -50,7 +50,7 @@ def _kernel() -> Any:
                                 weight = wp.where(corner // 2 == 1, down, one - down) * wp.where(corner % 2 == 1, right, one - right) * own
                                 alpha += weight
                                 nearness += weight / wp.max(d(depths[k, row, column]), near)
-                    behind = z - alpha / wp.max(nearness, d(1e-12))
+                    behind = z - alpha / wp.max(nearness, d(1e-30))
                     s = wp.min(wp.max(half + half * (behind - bias) / softness, d(0.0)), one)
                     arrives *= one - alpha * s * s * (d(3.0) - d(2.0) * s)
         found[p] = f(arrives)

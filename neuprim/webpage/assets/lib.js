@@ -8,9 +8,9 @@ const lib = {
     into[2] = a[0] * b[1] - a[1] * b[0];
   },
 
-  // To length 1, in place. Vectors shorter than 1e-6 keep their share of it, so that zero stays zero.
+  // To length 1, in place. Vectors shorter than 1e-10 keep their share of it, so that zero stays zero.
   unit(v) {
-    const top = Math.max(Math.abs(v[0]), Math.abs(v[1]), Math.abs(v[2]), 1e-6);
+    const top = Math.max(Math.abs(v[0]), Math.abs(v[1]), Math.abs(v[2]), 1e-10);
     const x = v[0] / top, y = v[1] / top, z = v[2] / top, length = Math.max(Math.sqrt(x * x + y * y + z * z), 1) * top; // Math.hypot is slow
     for (let a = 0; a < 3; a++) v[a] /= length;
     return v;

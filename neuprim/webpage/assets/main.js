@@ -24,7 +24,7 @@ function leave() {
 
 function view() {
   const far = look.now.distance, plane = far * +element("plane").value;
-  const range = [Math.max(far - page.radius, 1e-6), far + page.radius];
+  const range = [Math.max(far - page.radius, 1e-6 * page.radius), far + page.radius];
   return { mode: element("mode").value, plane, range, top: page.top, background: BACKGROUNDS[element("background").value] };
 }
 

@@ -35,7 +35,7 @@ function lightCamera(scene, scales, living, light, { size, layers }) {
     furthest = Math.max(furthest, d);
   }
   const edges = Array.from({ length: layers - 1 }, (_, k) => nearest + ((furthest - nearest) * (k + 1)) / layers);
-  const near = Math.max(1e-4 * radius, distance - 1.5 * radius, 1e-6);
+  const near = Math.max(1e-4 * radius, distance - 1.5 * radius);
   return { R, t, fx: focal, fy: focal, cx: size / 2, cy: size / 2, width: size, height: size, near, edges, diameter: 2 * radius };
 }
 
@@ -59,7 +59,7 @@ function arrivingAt(px, py, pz, camera, maps, bias, softness) {
       alpha += weight;
       nearness += weight / Math.max(map[o] / opacity, near);
     }
-    const behind = z - alpha / Math.max(nearness, 1e-12);
+    const behind = z - alpha / Math.max(nearness, 1e-30);
     const s = Math.min(Math.max(0.5 + (0.5 * (behind - bias * diameter)) / (softness * diameter), 0), 1);
     found *= 1 - alpha * s * s * (3 - 2 * s);
   }

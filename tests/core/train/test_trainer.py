@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neuprim.core import checkpoint
 from neuprim.core.compute import threads
-from neuprim.core.data import Dataset
+from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, DeviceMemoryError, NonFiniteError
 from neuprim.core.metrics import psnr
 from neuprim.core.model.primitives import Primitives
@@ -419,3 +419,17 @@ def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(plain: Dataset
     with pytest.raises(CheckpointError, match=r"some file\.safetensors"):
         new.load_state(tensors, header, "some file.safetensors")
     same(new, untouched)
+
+
+def test_points_that_no_camera_sees_are_refused(plain: Dataset) -> None:
+    away = PointCloud(torch.full((4, 3), 100.0) + torch.rand(4, 3), torch.full((4, 3), 0.5))
+    with pytest.raises(
+        DataError, match=r"none of 4 starting points is in the image of a training camera; .*model\.init\.points.*ply_file_path"
+    ):
+        tiny.trainer(replace(plain, start=lambda views, count, generator: away))
+
+
+def test_cameras_without_extent_move_by_the_depth(plain: Dataset) -> None:
+    still = tiny.trainer(replace(plain, extent=1e-9))
+    assert still.extent > 0.1 and still.rates()["means"] == pytest.approx(7e-4 * still.extent, rel=0.1)
+    assert tiny.trainer(plain).extent == plain.extent

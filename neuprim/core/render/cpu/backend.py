@@ -126,7 +126,7 @@ def _prepare(
     size = np.array([camera.width, camera.height], np.int64)
     parallel_for(
         prepare, count, _PRIMITIVES_PER_CHUNK, settings.threads, *(tensors[n] for n in _NAMES),
-        R, t, cam, size, settings.near, omega0 / _TURN, edge, depth_that_counts(settings.alpha_min), rows, spans, kinds, order, boxes, depth, status, in_float64,
+        R, t, cam, size, settings.near_plane, omega0 / _TURN, edge, depth_that_counts(settings.alpha_min), rows, spans, kinds, order, boxes, depth, status, in_float64,
     )  # fmt: skip
     if bool((status == NON_FINITE).any()):
         raise _non_finite(tensors, int(np.flatnonzero(status == NON_FINITE)[0]))
@@ -139,7 +139,7 @@ def _prepare(
     wide = np.empty((len(which), rows.shape[1]))
     parallel_for(
         prepare_wide, len(which), _PRIMITIVES_PER_CHUNK, settings.threads, which, *(tensors[n] for n in _NAMES),
-        R, t, cam, settings.near, omega0 / _TURN, order, wide,
+        R, t, cam, settings.near_plane, omega0 / _TURN, order, wide,
     )  # fmt: skip
     net = None
     if net_narrow is not None:
@@ -277,7 +277,7 @@ class _Rasterize(torch.autograd.Function):
         g_view = np.zeros((count if want_view else 1, 3, 4), np.float64)
         parallel_for(
             prepare_backward, count, _PRIMITIVES_PER_CHUNK, s.threads, t["means"], t["log_scales"], t["quats"], t["W1"],
-            frame.R, frame.t, frame.intrinsics, s.near, frame.omega0 / _TURN, frame.rows, frame.order, grads, touched,
+            frame.R, frame.t, frame.intrinsics, s.near_plane, frame.omega0 / _TURN, frame.rows, frame.order, grads, touched,
             *out, g_b2, g_view, want_view,
         )  # fmt: skip
         base = L.G_NEURONS + L.PER_NEURON * frame.neurons

@@ -70,7 +70,7 @@ class _Rasterize(torch.autograd.Function):
                 colors,
                 camera,
                 viewmat,
-                settings.near,
+                settings.near_plane,
                 omega0 / (2 * math.pi),
                 edge,
                 depth_that_counts(settings.alpha_min),
@@ -171,7 +171,7 @@ def render_parts(lowered: Lowered, parts: Tensor, count: int, camera: Camera, se
     try:
         images = (parts.int().contiguous(), count)
         frame = prepared(
-            tensors, blank, camera, camera.viewmat, own.near, turns, density.edge, depth_that_counts(own.alpha_min), None, images
+            tensors, blank, camera, camera.viewmat, own.near_plane, turns, density.edge, depth_that_counts(own.alpha_min), None, images
         )
     except NotFinite as error:
         raise _blame(tensors, error.row) from None

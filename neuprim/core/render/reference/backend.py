@@ -84,7 +84,7 @@ def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, setti
     """Render a lowered model; see :func:`neuprim.core.render.render` for shapes. Computes in float64, returns the model's dtype."""
     frame = _Prepared(lowered, camera)
     count = lowered.geometry.count
-    seen = frame_rays(camera, lowered.geometry, frame.center, settings.near)
+    seen = frame_rays(camera, lowered.geometry, frame.center, settings.near_plane)
     channels = lowered.colour.channels
     stats = RenderStats("reference", count)
     rows_of_blocks = []

@@ -1,0 +1,59 @@
+"""How far points lie from the cameras that see them, and the near plane and extent that follow: no length of a scene is known beforehand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.cameras.rays import AnyCamera
+from neuprim.core.settings import RenderSettings
+
+__all__ = ["decided", "scene_extent", "seen_depths"]
+
+_CAMERAS, _POINTS = 100, 100_000
+"""At most so many of either are looked at."""
+_SHARE, _CLEARANCE = 1.0 / 400.0, 0.1
+"""The near plane as a part of the typical and of the nearest depth."""
+_LEAST_EXTENT = 0.01
+_LEAST = 1e-6
+"""Of the typical depth: a point in a camera's centre does not put the plane there."""
+
+
+def seen_depths(means: Tensor, cameras: Sequence[AnyCamera]) -> tuple[float, float]:
+    """(nearest, median) depth at which cameras see the points (N, 3): camera-z, or ray distance for a ``RayCamera``.
+
+    Where no camera sees one, the distances of all points count.
+    """
+    means = means.detach().double().cpu()[:: max(len(means) // _POINTS, 1)]
+    cameras = [replace(c, viewmat=c.viewmat.detach().double().cpu()) for c in cameras[:: max(len(cameras) // _CAMERAS, 1)]]
+    found = []
+    for camera in cameras:
+        if isinstance(camera, Camera):
+            _, z = camera.project(means)
+            found.append(z[camera.sees(means)])
+    depths = torch.cat(found) if found else means[:0, 0]
+    if not len(depths):
+        depths = torch.cat([(means - camera.position).norm(dim=-1) for camera in cameras])
+    return depths.min().item(), depths.median().item()
+
+
+def scene_extent(extent: float, means: Tensor, cameras: Sequence[AnyCamera]) -> float:
+    """The data set's extent, or where that is below 1/100 of the median depth of points (N, 3), as on a tripod, that depth."""
+    _, depth = seen_depths(means, cameras)
+    return extent if extent >= _LEAST_EXTENT * depth else depth
+
+
+def decided(settings: RenderSettings, means: Tensor, cameras: Sequence[AnyCamera]) -> RenderSettings:
+    """The settings with a number for ``near=auto``, from points (N, 3) and the cameras that see them."""
+    if settings.near != "auto":
+        return settings
+    if not len(means):
+        return replace(settings, near=1.0)  # there is nothing to cut
+    nearest, typical = seen_depths(means, cameras)
+    near = max(min(_SHARE * typical, _CLEARANCE * nearest), _LEAST * typical)
+    return replace(settings, near=near if math.isfinite(near) and near > 0 else 1.0)

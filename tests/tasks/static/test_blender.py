@@ -15,6 +15,7 @@ from PIL import Image
 from neuprim.core.data.views import ImageViews
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import write_exr
+from neuprim.core.notices import NeuprimWarning
 from neuprim.core.task import SceneContext
 from neuprim.tasks.static.datasets.blender import load
 
@@ -233,7 +234,7 @@ def set_frame(key: str, value: Any) -> Any:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda d: d.pop("camera_angle_x"), ["camera_angle_x is missing", "between 0 and pi"]),
+        (lambda d: d.pop("camera_angle_x"), ["frames[0]: no focal length", "camera_angle_x"]),
         (lambda d: d.__setitem__("camera_angle_x", "wide"), ['camera_angle_x is "wide"']),
         (lambda d: d.__setitem__("camera_angle_x", math.nan), ["camera_angle_x is NaN"]),
         (lambda d: d.__setitem__("camera_angle_x", True), ["camera_angle_x is true"]),
@@ -257,7 +258,7 @@ def set_frame(key: str, value: Any) -> Any:
 )
 def test_bad_fields(folder: Path, scenes: Any, context: Any, change: Any, words: list[str]) -> None:
     edit(folder / "transforms_train.json", change)
-    scenes.refused(load, {"path": folder}, context, "transforms_train.json", *words)
+    scenes.refused(load, {"path": folder, "strict": True}, context, "transforms_train.json", *words)
 
 
 def test_a_matrix_of_three_rows_is_complete(folder: Path, context: Any) -> None:
@@ -285,11 +286,11 @@ def test_damaged_images_are_found_while_loading(folder: Path, scenes: Any, conte
     bad = folder / "test" / "r_1.png"
     data = bad.read_bytes()
     bad.write_bytes(data[: len(data) // 2])
-    scenes.refused(load, {"path": folder}, context, str(bad), "truncated or corrupt")
-    Image.fromarray(np.zeros((H, W), np.uint8)).save(bad)
-    scenes.refused(load, {"path": folder}, context, str(bad), "8-bit grey PNG", "expected 8-bit RGB or RGBA")
+    scenes.refused(load, {"path": folder, "strict": True}, context, str(bad), "truncated or corrupt")
     Image.fromarray(np.zeros((H, W), np.uint16)).save(bad)
-    scenes.refused(load, {"path": folder}, context, str(bad), "16-bit grey PNG")
+    scenes.refused(load, {"path": folder, "strict": True}, context, str(bad), "16-bit grey PNG", "expected 8-bit RGB or RGBA")
+    with pytest.warns(NeuprimWarning, match="16-bit grey PNG.*; view r_1 is left out"):
+        assert len(load({"path": folder}, context).test) == 1
 
 
 def test_mixed_sizes_channels_and_kinds(folder: Path, scenes: Any, context: Any) -> None:

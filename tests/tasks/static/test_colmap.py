@@ -260,9 +260,9 @@ def test_damaged_and_grey_images(capture: Any, scenes: Any, context: Any) -> Non
     path = capture()
     file = path / "images" / "03.png"
     file.write_bytes(file.read_bytes()[:-40])
-    scenes.refused(load, {"path": path}, context, str(file), "truncated or corrupt")
-    Image.fromarray(np.zeros((H, W), np.uint8)).save(file)
-    scenes.refused(load, {"path": path}, context, str(file), "grey")
+    scenes.refused(load, {"path": path, "strict": True}, context, str(file), "truncated or corrupt")
+    Image.fromarray(np.zeros((H, W), np.uint16)).save(file)
+    scenes.refused(load, {"path": path, "strict": True}, context, str(file), "16-bit grey")
 
 
 def test_too_few_images(capture: Any, scenes: Any, context: Any) -> None:

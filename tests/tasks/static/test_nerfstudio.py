@@ -233,7 +233,7 @@ def frame(**fields: Any) -> Callable[[Any], None]:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda d: d.pop("fl_x"), ["fl_x is missing", "camera_angle_x"]),
+        (lambda d: d.pop("fl_x") and d.pop("fl_y"), ["no focal length", "fl_x", "camera_angle_x"]),
         (lambda d: d.update(fl_x=-3), ["fl_x is -3", "above 0"]),
         (lambda d: d.update(fl_y="x"), ['fl_y is "x"', "above 0"]),
         (lambda d: d.update(cx=math.nan), ["cx is NaN", "finite number"]),
@@ -263,7 +263,7 @@ def frame(**fields: Any) -> Callable[[Any], None]:
 def test_bad_fields(capture: Any, scenes: Any, context: Any, change: Callable[[Any], Any], words: list[str]) -> None:
     path = capture()
     edit(path, change)
-    scenes.refused(load, {"path": path}, context, str(path), *words)
+    scenes.refused(load, {"path": path, "strict": True}, context, str(path), *words)
 
 
 def test_missing_images_are_listed_or_skipped(capture: Any, scenes: Any, context: Any) -> None:
@@ -307,7 +307,7 @@ def test_damaged_image(capture: Any, scenes: Any, context: Any) -> None:
     path = capture()
     file = path / "images" / "03.png"
     file.write_bytes(file.read_bytes()[:-40])
-    scenes.refused(load, {"path": path}, context, str(file), "truncated or corrupt")
+    scenes.refused(load, {"path": path, "strict": True}, context, str(file), "truncated or corrupt")
 
 
 def test_a_whole_run_ends_in_a_report(capture: Any, scenes: Any, tmp_path: Path) -> None:

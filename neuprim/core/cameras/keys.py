@@ -40,7 +40,10 @@ _LENS = "a distortion that is not read; expected k1 to k4, p1, p2, or undistorte
 _MOVES = "a camera that moves during the exposure; expected one transform_matrix, with images without rolling shutter"
 _ALPHA = "what is transparent; expected PNG images with an alpha channel"
 _REFUSED = {
-    **dict.fromkeys("latlong equirectangular panorama ftheta ftheta_p0 ortho orthographic is_ortho ortho_scale fisheye".split(), _RAYS),
+    **dict.fromkeys(
+        "latlong equirectangular panorama ftheta ftheta_p0 ftheta_p1 ftheta_p2 ortho orthographic is_ortho ortho_scale fisheye".split(),
+        _RAYS,
+    ),
     **dict.fromkeys("k5 k6 s1 s2 s3 s4 sx1 sy1 b1 b2 skew sk_x sk_y".split(), _LENS),
     **dict.fromkeys(
         "distortion distortion_params distortion_coefficients dist_coeffs radial_distortion tangential_distortion".split(), _LENS

@@ -109,6 +109,29 @@ def test_other_splits_suffixes_and_field_of_view_per_frame(folder: Path, context
     assert data.test.view(1).camera.fx == pytest.approx(24 / math.tan(0.6))
 
 
+def test_focal_lengths_and_principal_point_of_the_file(folder: Path, scenes: Any, context: Any) -> None:
+    """As BlenderNeRF writes them for a camera with a shift."""
+    for split in ("train", "test"):
+        document = json.loads((folder / f"transforms_{split}.json").read_text())
+        for frame in document["frames"]:
+            x, y = scenes.direction(np.array(frame["transform_matrix"]), scenes.mark)
+            spot = scenes.blob(W, H, 40 * x + 28, 40 * y + 15)
+            scenes.save(folder / f"{frame['file_path']}.png", np.stack([spot, spot, spot, np.ones_like(spot)], axis=-1))
+        angle = 2 * math.atan(0.5 * W / 40)
+        document.update(camera_angle_x=angle, fl_x=40, fl_y=40, cx=28, cy=15, w=float(W), h=float(H), k1=0.0, aabb_scale=4)
+        scenes.write_json(folder / f"transforms_{split}.json", document)
+    data = load({"path": folder}, context)
+    assert max(scenes.off_by(s, i) for s in (data.train, data.test) for i in range(len(s))) < 0.02
+
+
+def test_without_test_images_a_hold_out_is_offered(folder: Path, scenes: Any, context: Any) -> None:
+    for file in (folder / "test").iterdir():
+        file.unlink()
+    scenes.refused(load, {"path": folder}, context, "2 files not found", "scene.hold_out=8")
+    (folder / "transforms_test.json").unlink()
+    scenes.refused(load, {"path": folder}, context, "transforms_test.json", "not found", "scene.hold_out=8")
+
+
 def test_exr_is_linear_premultiplied_and_kept_above_one(folder: Path, context: Any) -> None:
     for split, n in (("train", 6), ("test", 2)):
         for i in range(n):

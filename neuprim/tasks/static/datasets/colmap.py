@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cameras.colmap import PINHOLES, is_model, pinhole_of, pycolmap_package, read_model, viewmat_of
+from neuprim.core.cameras.colmap import PINHOLES, largest_model, pinhole_of, pycolmap_package, read_model, viewmat_of
 from neuprim.core.cameras.intrinsics import same_shape
 from neuprim.core.cameras.pinhole import check_viewmat
 from neuprim.core.checked import checked, text
@@ -67,7 +67,13 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """
     asked = checked(ColmapSettings, settings, "scene")
     folder = data_folder(asked.path)
-    model, reconstruction = _largest(folder) if asked.model == "auto" else (folder / asked.model, read_model(folder / asked.model))
+    model = folder / asked.model
+    if asked.model == "auto":
+        largest, line = largest_model(folder)
+        model = largest or folder / "sparse" / "0"
+        if line:
+            warn_once(f"{line} (scene.model takes another)")
+    reconstruction = read_model(model)
     frames = _read_frames(model, folder, reconstruction, asked)
     train, test = every_nth(frames, asked.test_every)
     prefix = "" if asked.images == "images" else asked.images
@@ -75,29 +81,9 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     return posed_images(str(model), folder.resolve().name, train, test, asked, context, points=points, prefix=prefix)
 
 
-def _posed(reconstruction: Any) -> list[Any]:
-    return sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
-
-
-def _largest(folder: Path) -> tuple[Path, Any]:
-    """The model with the most posed images of those in ``sparse``, and its folder. COLMAP writes one for each group that it cannot join."""
-    inside = sorted((p for p in (folder / "sparse").glob("*") if is_model(p) == p), key=lambda p: (len(p.name), p.name))
-    if not inside:
-        model = folder / "sparse" if is_model(folder / "sparse") == folder / "sparse" else folder / "sparse" / "0"
-        return model, read_model(model)
-    models = [(p, read_model(p)) for p in inside]
-    counts = [len(_posed(m)) for _, m in models]
-    best = counts.index(max(counts))
-    if len(models) > 1:
-        found = ", ".join(f"{p.name} with {n}" for p, n in zip(inside, counts, strict=True))
-        warn_once(
-            f"{folder / 'sparse'}: has models of different images: {found} posed images; takes {inside[best].name} (scene.model takes another)"
-        )
-    return models[best]
-
-
 def _read_frames(model: Path, folder: Path, reconstruction: Any, asked: ColmapSettings) -> list[ImageFrame]:
-    posed, place = _posed(reconstruction), folder / asked.images
+    posed = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
+    place = folder / asked.images
     if not posed:
         raise DataError(f"{model}: has no images with a pose; expected at least two")
     if not place.is_dir():

@@ -16,7 +16,7 @@ from neuprim.core.cameras.colmap_files import check_binary_model
 from neuprim.core.cameras.pinhole import Camera
 from neuprim.core.errors import BackendUnavailable, DataError
 
-__all__ = ["PINHOLES", "is_model", "pinhole_of", "posed_cameras", "pycolmap_package", "read_model", "viewmat_of"]
+__all__ = ["PINHOLES", "is_model", "largest_model", "pinhole_of", "posed_cameras", "pycolmap_package", "read_model", "viewmat_of"]
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 """COLMAP's camera models without distortion."""
@@ -57,11 +57,25 @@ def read_model(folder: Path) -> Any:
         check_binary_model(folder, _parameter_count)
     try:
         model = pycolmap.Reconstruction(str(folder))
+        if kind == ".txt":
+            _restore_names(model, folder / "images.txt")
         for image in model.images.values():
             _ = image.name  # UnicodeDecodeError where it is no UTF-8
         return model
     except Exception as error:  # pycolmap raises many types for inconsistent models
         raise DataError(f"{folder}: not a readable COLMAP model ({type(error).__name__}: {error})") from None
+
+
+def _restore_names(model: Any, path: Path) -> None:
+    """Give images the names that ``images.txt`` has: COLMAP's reader ends a name at its first blank."""
+    lines = iter(path.read_text(encoding="utf-8", errors="surrogateescape").split("\n"))
+    for line in lines:
+        fields = line.strip().split(maxsplit=9)
+        if not fields or fields[0].startswith("#"):
+            continue
+        if len(fields) == 10 and " " in fields[9]:
+            model.images[int(fields[0])].name = fields[9]
+        next(lines, None)  # the line of its points, which may be empty
 
 
 def _parameter_count(model: int) -> int:
@@ -95,13 +109,42 @@ def viewmat_of(image: Any) -> Tensor:
     return viewmat
 
 
+def largest_model(project: Path) -> tuple[Path | None, str]:
+    """The model with the most images of those in a project's ``sparse``, None for none, and a line for the user, which may be empty.
+
+    COLMAP writes one model for each group of images that it cannot join.
+    """
+    place = project / "sparse"
+    models = sorted((p for p in place.glob("*") if _kind(p) is not None), key=lambda p: (len(p.name), p.name))
+    if not models:
+        return (place if _kind(place) is not None else None), ""
+    counts = [_count_images(p) for p in models]
+    best = models[counts.index(max(counts))]
+    if len(models) == 1:
+        return best, ""
+    found = ", ".join(f"{p.name} with {n}" for p, n in zip(models, counts, strict=True))
+    return best, f"{place}: has models of different images: {found} posed images; takes {best.name}"
+
+
+def _count_images(model: Path) -> int:
+    """Images in a model, from its file alone; 0 where that is damaged or missing."""
+    try:
+        if (model / "images.bin").is_file():
+            with open(model / "images.bin", "rb") as file:
+                return int.from_bytes(file.read(8), "little")
+        with open(model / "images.txt", encoding="utf-8", errors="replace") as file:
+            return (sum(not line.startswith("#") for line in file) + 1) // 2
+    except OSError:
+        return 0
+
+
 # ---------------------------------------------------------------- cameras alone
 
 
 def is_model(path: Path) -> Path | None:
-    """The folder of the model that a path means: itself, one of its files, or a project with ``sparse/0``; None for anything else."""
+    """The folder of the model that a path means: itself, one of its files, or a project with ``sparse``; None for anything else."""
     if path.is_dir():
-        return next((folder for folder in (path, path / "sparse" / "0", path / "sparse") if _kind(folder) is not None), None)
+        return path if _kind(path) is not None else largest_model(path)[0]
     return path.parent if path.name in {f"{part}{kind}" for part in _PARTS for kind in (".txt", ".bin")} and _kind(path.parent) else None
 
 
@@ -127,6 +170,8 @@ def posed_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
         camera = Camera(viewmat_of(image), *pinhole_of(lens, where), int(lens.width), int(lens.height))
         found.append((str(PurePosixPath(image.name).with_suffix("")), camera.validate(where)))
     notes = [f"the lens distortion of {count} of {len(found)} cameras ({model}) is left out" for model, count in sorted(bent.items())]
+    if folder.parent.name == "sparse":
+        notes += [line for line in [largest_model(folder.parent.parent)[1].replace("takes", "the largest is")] if line]
     return found, notes
 
 

@@ -1,48 +1,260 @@
-"""Intrinsics and lenses as ``transforms.json`` files say them (instant-ngp, nerfstudio, NeRF-synthetic).
+"""Intrinsics and lenses as ``transforms.json`` files state them: one reader for every loader and for camera files.
 
-``fl_x fl_y cx cy`` in pixels, or ``camera_angle_x camera_angle_y`` in radians; ``camera_model``, ``k1 k2 k3 k4 p1 p2``.
+Focal lengths: ``fl_x fl_y`` in pixels, ``camera_angle_x camera_angle_y`` in radians, ``x_fov y_fov`` in degrees, or
+``camera_intrinsics`` [cx, cy, fx, fy]. Principal point: ``cx cy``. Size: ``w h``. Lens: ``camera_model``, ``is_fisheye``, ``k1 k2 k3 k4 p1 p2``.
+
+Rules:
+
+* Each group of keys comes whole from the frame, or else whole from the file.
+* Keys of one record that state the same number must agree within 1 %.
+* Lengths in pixels belong to the size that their own record states. They are scaled where the image is a resized copy of that size.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from torch import Tensor
 
 from neuprim.core.cameras.pinhole import Camera, opengl_to_viewmat
+from neuprim.core.errors import DataError
 from neuprim.core.io.records import Record
 
-__all__ = ["COEFFICIENTS", "MODELS", "camera_of", "is_fisheye"]
+__all__ = ["COEFFICIENTS", "FOCAL", "MIDDLE", "MODELS", "SIZE", "Target", "camera_of", "is_fisheye", "lens_of", "same_shape"]
 
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 """Camera models that are pinholes but for radial and tangential distortion."""
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", "camera_intrinsics")
+MIDDLE = ("cx", "cy")
+SIZE = ("w", "h")
+
+_TOLERANCE = 0.01
+Say = Callable[[str], None]
 
 
-def camera_of(record: Record, width: int, height: int, pose: Tensor | None = None) -> Camera:
-    """The pinhole of a record: a frame's fields over its file's.
+@dataclass(frozen=True)
+class Target:
+    """The pixels that a camera is for.
+
+    Attributes:
+        width, height: of the image, or of the picture to draw.
+        image: the image file; "" where there is none, and the size is the one to draw at.
+        hint: what a message about the size says at its end.
+    """
+
+    width: int
+    height: int
+    image: str = ""
+    hint: str = ""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.width, self.height
+
+
+@dataclass(frozen=True)
+class _Level:
+    """The fields of a frame, or of its file, and the size in pixels that lengths among them belong to."""
+
+    record: Record
+    size: tuple[int, int]
+
+    def has(self, group: tuple[str, ...]) -> bool:
+        return any(self.record.has(key) for key in group)
+
+    def scales(self, keys: str, target: Target) -> tuple[float, float]:
+        """Pixels of the target per pixel of this size, horizontally and vertically."""
+        if not same_shape(self.size, target.size):
+            found = f"{keys} belong to w, h {self.size[0]}x{self.size[1]}, and the image is {target.width}x{target.height}"
+            raise DataError(f"{self.record.where}: {found}; expected them in the frame, beside its own w, h{target.hint}")
+        return target.width / self.size[0], target.height / self.size[1]
+
+
+def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether one size is a resized copy of the other, to within the rounding of sides to whole pixels."""
+    scale = max(other[0] / size[0], other[1] / size[1])
+    return abs(size[0] * scale - other[0]) <= 1.0 and abs(size[1] * scale - other[1]) <= 1.0
+
+
+def _owner(group: tuple[str, ...], frame: Record, file: Record) -> Record:
+    """The record that a group of keys is taken from whole."""
+    return frame if any(frame.has(key) for key in group) else file
+
+
+def camera_of(frame: Record, file: Record, target: Target, viewmat: Tensor | None = None, say: Say = lambda text: None) -> Camera:
+    """The pinhole of a frame.
 
     Args:
-        width, height: of the image, pixels.
-        pose: (4, 4) camera to world, OpenGL axes; None for the field ``transform_matrix``.
+        file: the file's own fields, for what the frame leaves out.
+        viewmat: (4, 4) world to camera, OpenCV axes; None for the frame's ``transform_matrix``, camera to world with OpenGL axes.
+        say: takes lines for the user.
 
     Raises:
-        DataError: a field that is missing or wrong.
+        DataError: a field that is missing or wrong, or fields that contradict each other or the image.
     """
-    if record.has("fl_x"):
-        fx = record.number("fl_x", "a focal length in pixels above 0", 0.0)
-        fy = record.number_or("fl_y", fx, "a focal length in pixels above 0", 0.0)
-    elif record.has("camera_angle_x"):
-        fx = _focal(record, "camera_angle_x", width)
-        fy = _focal(record, "camera_angle_y", height) if record.has("camera_angle_y") else fx
-    else:
-        raise record.fail("fl_x", "a focal length in pixels (or camera_angle_x), in the frame or in the file")
-    cx, cy = record.number_or("cx", 0.5 * width), record.number_or("cy", 0.5 * height)
-    return Camera(opengl_to_viewmat(record.matrix("transform_matrix") if pose is None else pose), fx, fy, cx, cy, width, height)
+    of_file = _Level(file, _size(file, target.size))
+    of_frame = _Level(frame, _size(frame, of_file.size))
+    if target.image and of_frame.size != target.size:
+        stated, (width, height) = _owner(SIZE, frame, file).where, of_frame.size
+        if not same_shape(of_frame.size, target.size):
+            found = f"image is {target.width}x{target.height}; expected {width}x{height} (w, h in {stated}) or a reduction of it"
+            raise DataError(f"{target.image}: {found}{target.hint}")
+        say(f"{stated}: w, h are {width}x{height} and the image {target.width}x{target.height}; cameras are scaled to the images")
+    focal = of_frame if of_frame.has(FOCAL) else of_file
+    fx, fy = _focal(frame, focal, target, say)
+    cx, cy = _middle(of_frame, of_file, focal, target)
+    if focal is of_frame:
+        _check_one_lens(of_frame, of_file, target)
+    if viewmat is None:
+        viewmat = opengl_to_viewmat(frame.matrix("transform_matrix"))
+    return Camera(viewmat, fx, fy, cx, cy, target.width, target.height)
 
 
-def is_fisheye(record: Record, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) -> bool:
+def _size(record: Record, default: tuple[int, int]) -> tuple[int, int]:
+    """The size that a record states."""
+    return record.count("w") if record.has("w") else default[0], record.count("h") if record.has("h") else default[1]
+
+
+# ---------------------------------------------------------------- focal lengths
+
+
+def _focal(frame: Record, level: _Level, target: Target, say: Say) -> tuple[float, float]:
+    """fx, fy in pixels of the target."""
+    x, y = _stated(level, 0, target), _stated(level, 1, target)
+    if not x and not y:
+        keys = "camera_angle_x (radians), fl_x (pixels), camera_intrinsics or x_fov (degrees)"
+        raise DataError(f"{frame.where}: no focal length: expected {keys}, in the frame or in the file")
+    fx, fy = (next(iter(found.values()), 0.0) for found in (x, y))
+    fx, fy = fx or fy, fy or fx
+    where = level.record.where
+    if not {*x, *y} & {"fl_x", "fl_y", "camera_intrinsics"} and not _agree(fx, fy):
+        raise DataError(
+            f"{where}: {next(iter(x))} and {next(iter(y))} mean pixels that are not square, with focal lengths {fx:.5g} and {fy:.5g}; "
+            "expected square pixels, or fl_x and fl_y (Blender's angle_y is the sensor's, not the image's: leave it out)"
+        )
+    portrait = max(target.height / target.width, 1.0)
+    for found, other in ((x, y), (y, x)):
+        first, value = next(iter(found.items()), ("", 0.0))
+        for key in found:
+            if _agree(found[key], value):
+                continue
+            text = f"{where}: {first} means a focal length of {value:.5g} pixels, and {key} {found[key]:.5g}"
+            # BlenderNeRF writes the angles of Blender's sensor beside the right fl_x and fl_y: angle_x is that of the image's longer
+            # side, and angle_y has nothing to do with the image
+            explained = key == "camera_angle_x" and _agree(found[key] * portrait, value)
+            explained |= key == "camera_angle_y" and first == "fl_y" and _agree(fx, fy) and "camera_angle_x" in other
+            if not explained:
+                raise DataError(
+                    f"{text}; expected the same within {_TOLERANCE:.0%}: take out the wrong one, or give w, h of the images they are for"
+                )
+            say(f"{text}; {first} is taken")
+    return fx, fy
+
+
+def _stated(level: _Level, axis: int, target: Target) -> dict[str, float]:
+    """Every focal length along an axis that a record states, in pixels of the target, by its key; lengths in pixels first."""
+    record, name, side = level.record, "xy"[axis], target.size[axis]
+    found = {}
+    if record.has(key := f"fl_{name}"):
+        found[key] = record.number(key, "a focal length in pixels above 0", 0.0) * level.scales("fl_x, fl_y", target)[axis]
+    if record.has(key := "camera_intrinsics"):
+        found[key] = _intrinsics(record)[2 + axis] * level.scales(key, target)[axis]
+    for key, unit, expected in (
+        (f"camera_angle_{name}", 1.0, "field of view in radians, between 0 and pi"),
+        (f"{name}_fov", math.pi / 180.0, "field of view in degrees, between 0 and 180"),
+    ):
+        if record.has(key):
+            angle = record.number(key, f"the {('horizontal', 'vertical')[axis]} {expected}", 0.0, math.pi / unit)
+            found[key] = 0.5 * side / math.tan(0.5 * angle * unit)
+    return found
+
+
+def _intrinsics(record: Record) -> list[float]:
+    """[cx, cy, fx, fy] of ``camera_intrinsics``, pixels."""
+    values: list[float] = record.array("camera_intrinsics", (4,), "[cx, cy, fx, fy] in pixels").tolist()
+    if not (values[2] > 0 and values[3] > 0):
+        raise DataError(f"{record.where}: camera_intrinsics is {values}; expected [cx, cy, fx, fy], focal lengths above 0")
+    return values
+
+
+def _agree(a: float, b: float) -> bool:
+    return abs(a - b) <= _TOLERANCE * max(abs(a), abs(b))
+
+
+# ---------------------------------------------------------------- principal point
+
+
+def _middle(frame: _Level, file: _Level, focal: _Level, target: Target) -> tuple[float, float]:
+    """cx, cy in pixels of the target."""
+    array = focal.record.has("camera_intrinsics")
+    level = frame if frame.has(MIDDLE) else focal if array else file
+    array = array and level is focal
+    if not array and not level.has(MIDDLE):
+        return 0.5 * target.width, 0.5 * target.height
+    record, keys = level.record, "camera_intrinsics" if array else "cx, cy"
+    if level is frame and 0 < sum(record.has(key) for key in MIDDLE) < 2 and file.has(MIDDLE):
+        raise DataError(f"{record.where}: cx or cy is missing, and the file's belong to another camera; expected both in the frame")
+    scale = level.scales(keys, target)
+    plain = [record.number(key) if record.has(key) else 0.5 * side for key, side in zip(MIDDLE, level.size, strict=True)]
+    cx, cy = (value * s for value, s in zip(_intrinsics(record)[:2] if array else plain, scale, strict=True))
+    if (
+        array
+        and level.has(MIDDLE)
+        and any(abs(a - b * s) > _TOLERANCE * side for a, b, s, side in zip((cx, cy), plain, scale, target.size, strict=True))
+    ):
+        raise DataError(
+            f"{record.where}: cx, cy are {plain}, and camera_intrinsics begins with {_intrinsics(record)[:2]}; expected the same"
+        )
+    if target.image or not (frame.has(SIZE) or file.has(SIZE)):  # a picture of a stated size may look past its edge
+        _check_middle(record.where, keys, (cx, cy), frame.has(SIZE) or file.has(SIZE), target)
+    return cx, cy
+
+
+def _check_middle(where: str, keys: str, point: tuple[float, float], stated: bool, target: Target) -> None:
+    """Refuse a principal point that lies outside, or that is the middle of an image of another size."""
+    (cx, cy), image = point, f"{target.image or 'the picture'} ({target.width}x{target.height})"
+    kx, ky = 2.0 * cx / target.width, 2.0 * cy / target.height
+    if not stated and min(kx, ky) > 0.0 and abs(kx - 1.0) > 0.05 and abs(kx - ky) <= 2 * _TOLERANCE * kx:
+        size = f"{round(2 * cx)}x{round(2 * cy)}"
+        found = f"{keys} are {cx:g}, {cy:g}, the middle of an image of {size} and not of {image}"
+        raise DataError(f"{where}: {found}; expected w, h of the images that the lengths in pixels are for, e.g. {size.replace('x', ', ')}")
+    if not (0.0 < cx < target.width and 0.0 < cy < target.height):
+        order = "the order [cx, cy, fx, fy]" if keys == "camera_intrinsics" else "a point in the image"
+        raise DataError(f"{where}: {keys} put the principal point outside of {image}, at {cx:g}, {cy:g}; expected {order}")
+
+
+# ---------------------------------------------------------------- lenses
+
+
+def _check_one_lens(frame: _Level, file: _Level, target: Target) -> None:
+    """Refuse a frame with another focal length than its file, whose principal point or distortion it does not replace."""
+    if file.record.has("camera_intrinsics") or not file.has(FOCAL):
+        return
+    left = []
+    if not frame.has(MIDDLE) and not frame.record.has("camera_intrinsics"):
+        sides = zip(MIDDLE, file.size, strict=True)
+        left = [key for key, side in sides if abs(file.record.number_or(key, 0.5 * side) / side - 0.5) > _TOLERANCE]
+    if not frame.has(COEFFICIENTS):
+        left += [key for key in COEFFICIENTS if file.record.number_or(key, 0.0) != 0.0]
+    if not left:
+        return
+    own, others = ([*_stated(level, 0, target).values(), *_stated(level, 1, target).values()] for level in (frame, file))
+    if not _agree(own[0], others[0]):
+        found = f"has a focal length of its own, and {', '.join(left)} of the file belong to another one"
+        raise DataError(f"{frame.record.where}: {found}; expected {', '.join(left)} in the frame, too")
+
+
+def lens_of(frame: Record, file: Record) -> dict[str, float]:
+    """The coefficients of the lens distortion by name, 0 where none is stated."""
+    record = _owner(COEFFICIENTS, frame, file)
+    return {key: record.number_or(key, 0.0) for key in COEFFICIENTS}
+
+
+def is_fisheye(frame: Record, file: Record, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) -> bool:
     """Whether the lens is OpenCV's fisheye.
 
     Args:
@@ -51,13 +263,10 @@ def is_fisheye(record: Record, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) ->
     Raises:
         DataError: a camera model that is neither it nor one of :data:`MODELS`.
     """
+    record = _owner(("camera_model", "is_fisheye"), frame, file)
     model = record.text("camera_model") if record.has("camera_model") else "OPENCV"
     if model == "OPENCV_FISHEYE" or record.values.get("is_fisheye") is True:
         return True
     if model not in MODELS:
         raise record.fail("camera_model", "one of " + ", ".join((*MODELS, *others)))
     return False
-
-
-def _focal(record: Record, key: str, size: int) -> float:
-    return 0.5 * size / math.tan(0.5 * record.number(key, "a field of view in radians, between 0 and pi", 0.0, math.pi))

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from torch import Tensor
 
-from neuprim.core.cameras.intrinsics import COEFFICIENTS, MODELS, camera_of, is_fisheye
+from neuprim.core.cameras.intrinsics import MODELS, Target, camera_of, is_fisheye, lens_of
+from neuprim.core.cameras.keys import check_keys
 from neuprim.core.cameras.pinhole import Camera, opengl_to_viewmat
 from neuprim.core.cameras.views import LARGEST, MOST, RATES, CameraViews
 from neuprim.core.errors import DataError
@@ -16,22 +17,6 @@ from neuprim.core.io.records import Record, read_json
 __all__ = ["read_json_cameras"]
 
 _MAX_BYTES = 64 * 1024 * 1024
-
-_COMMON = (
-    "w",
-    "h",
-    "fl_x",
-    "fl_y",
-    "cx",
-    "cy",
-    "camera_angle_x",
-    "camera_angle_y",
-    "camera_model",
-    "is_fisheye",
-    *COEFFICIENTS,
-    "transform_matrix",
-)
-"""What a frame may leave to its file."""
 
 
 def read_json_cameras(path: Path, size: tuple[int, int] | None = None) -> CameraViews:
@@ -88,16 +73,22 @@ def _rate(document: Record, count: int) -> float | None:
 def _frames(document: Record, size: tuple[int, int] | None) -> CameraViews:
     """``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``; a frame may override every intrinsic."""
     records, found, bent = _checked(document, "frames"), [], 0
-    common = {key: document.values[key] for key in _COMMON if document.has(key)}  # not all of what a file may hold, for every frame
+    notes: dict[str, None] = {}
+    check_keys(document)
     for i, record in enumerate(records):
-        merged = Record({**common, **{k: v for k, v in record.values.items() if v is not None}}, record.where)
-        if is_fisheye(merged, ()):
-            raise DataError(f"{merged.where}: the camera is a fisheye (camera_model, is_fisheye); expected one of {', '.join(MODELS)}")
-        bent += any(merged.number_or(key, 0.0) != 0.0 for key in COEFFICIENTS)
-        width, height = _size(merged, ("w", "h"), size)
-        found.append((f"camera_{i:03d}", camera_of(merged, width, height).validate(record.where)))
-    notes = (f"the lens distortion of {bent} of {len(found)} cameras is left out",) if bent else ()
-    return CameraViews(tuple(found), _times(records, "time"), _rate(document, len(found)), notes)
+        check_keys(record)
+        if is_fisheye(record, document, ()):
+            raise DataError(f"{record.where}: the camera is a fisheye (camera_model, is_fisheye); expected one of {', '.join(MODELS)}")
+        bent += any(lens_of(record, document).values())
+        stated = Record({key: r.values[key] for r in (document, record) for key in ("w", "h") if r.has(key)}, record.where)
+        target = Target(*_size(stated, ("w", "h"), size))
+        own = record.has("transform_matrix") or not document.has("transform_matrix")
+        view = None if own else opengl_to_viewmat(document.matrix("transform_matrix"))
+        camera = camera_of(record, document, target, view, lambda text: notes.update({text: None}))
+        found.append((f"camera_{i:03d}", camera.validate(record.where)))
+    if bent:
+        notes[f"the lens distortion of {bent} of {len(found)} cameras is left out"] = None
+    return CameraViews(tuple(found), _times(records, "time"), _rate(document, len(found)), tuple(notes))
 
 
 # ---------------------------------------------------------------- nerfstudio's viewer

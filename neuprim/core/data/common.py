@@ -13,6 +13,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset, PointCloud, StartingPoints, camera_extent
+from neuprim.core.data.bad_views import BadViews
 from neuprim.core.data.context import SceneContext
 from neuprim.core.data.focus import focus_point
 from neuprim.core.data.initial import initial_points
@@ -20,19 +21,25 @@ from neuprim.core.data.place import world_around
 from neuprim.core.data.settings import FolderSettings
 from neuprim.core.data.views import ImageFrame, ImageViews
 from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.io.images import ImageInfo
 from neuprim.core.notices import warn_once
 
-__all__ = ["IMAGE_SUFFIXES", "every_nth", "find_image", "in_scene", "missing_files", "posed_images", "unique_names"]
+__all__ = ["IMAGE_SUFFIXES", "MissingFiles", "every_nth", "find_image", "in_scene", "missing_files", "posed_images", "turned", "unique_names"]
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG", ".EXR")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr", ".PNG", ".JPG", ".JPEG", ".WEBP", ".EXR")
 _LISTED = 10
 
 
+class MissingFiles(DataError):
+    """Files that a data set names are not there."""
+
+
 def find_image(folder: Path, text: str) -> Path | None:
-    """The image that ``text`` names below ``folder``: as written, else with the usual suffixes added; None if there is none."""
+    """The image that ``text`` names below ``folder``: as written, else with the usual suffixes added, else in another case; None if there is none."""
     text = str(folder / text.replace("\\", "/"))
     try:
-        return next((Path(text + s) for s in ("", *IMAGE_SUFFIXES) if Path(text + s).is_file()), None)
+        found = next((Path(text + s) for s in ("", *IMAGE_SUFFIXES) if Path(text + s).is_file()), None)
+        return found or _other_case(folder, Path(text))
     except OSError:  # a name longer than the file system can hold
         return None
 
@@ -47,10 +54,32 @@ def _say_outside(where: str, home: Path, paths: Iterable[Path]) -> None:
         warn_once(f"{where}: {len(outside)} of its images lie outside of {own}, the first {outside[0].resolve()}; they are read as it says")
 
 
-def missing_files(where: str, names: Sequence[str], hint: str = "") -> DataError:
+def _other_case(folder: Path, path: Path) -> Path | None:
+    """The only file whose path differs from ``path`` below ``folder`` in upper and lower case alone."""
+    if not path.is_relative_to(folder):
+        return None
+    for part in path.relative_to(folder).parts:
+        if part != ".." and folder.is_dir() and not (folder / part).exists():
+            alike = [p.name for p in folder.iterdir() if p.name.casefold() == part.casefold()]
+            part = alike[0] if len(alike) == 1 else part
+        folder = folder / part
+    return folder if folder.is_file() else None
+
+
+def turned(info: ImageInfo) -> str:
+    """The end of a message about an image's size: that EXIF says to turn it, if it does."""
+    if info.orientation < 5:
+        return ""
+    return (
+        f"; its EXIF orientation is {info.orientation}, so that other programs show it turned, and pixels are read as they are stored, "
+        "as COLMAP reads them: give w, h of the stored pixels, or turn the pixels themselves"
+    )
+
+
+def missing_files(where: str, names: Sequence[str], hint: str = "") -> MissingFiles:
     """One error for all absent files, the first ten by name."""
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return DataError(f"{where}: {len(names)} files not found: {', '.join(names[:_LISTED])}{more}{hint}")
+    return MissingFiles(f"{where}: {len(names)} files not found: {', '.join(names[:_LISTED])}{more}{hint}")
 
 
 def unique_names(paths: Iterable[str], where: str) -> list[str]:
@@ -115,12 +144,18 @@ def posed_images(
         home: the data set's folder, where it is not that of ``where``.
 
     Raises:
-        DataError: an empty split, an image without alpha beside one with, sRGB beside linear files, or damaged images.
+        DataError: an empty split, an image without alpha beside one with, sRGB beside linear files, most images damaged, or any with
+            ``settings.strict``.
         ConfigError: a random background for images without alpha, or a down-sampling factor larger than an image.
     """
     for split, frames in (("training", train), ("test", test)):
         if not frames:
-            raise DataError(f"{where}: the {split} split has no images; expected at least one")
+            hint = ""
+            if len(train) + len(test) == 1:
+                hint = "; there is one image, and two are the least: one to learn from, one to judge by"
+            elif split == "test" and hasattr(settings, "hold_out"):
+                hint = "; scene.hold_out=8 holds out every 8th training view instead"
+            raise DataError(f"{where}: the {split} split has no images; expected at least one{hint}")
     both = [*train, *test]
     for frame in both:
         if frame.info.linear != both[0].info.linear:
@@ -142,8 +177,15 @@ def posed_images(
     points = None if points is None else points.within(world)
     views = [ImageViews(frames, factor, to_linear=to_linear) for frames in (train, test)]
     if settings.preload:
+        at_rest = start is None  # of what moves, some moments show nothing
         for split, images in zip(("training", "test"), views, strict=True):
-            images.preload(lambda fraction, split=split: context.progress(f"reading {split} images", fraction))  # type: ignore[misc]
+            progress = lambda fraction, split=split: context.progress(f"reading {split} images", fraction)  # noqa: E731
+            bad = BadViews(f"{where} ({split})", settings.strict)
+            faults = images.preload(progress, empty=split == "test" or not at_rest)
+            for index, error in faults.items():
+                bad.add(images.view(index).name, error)
+            bad.settle(len(images))
+            images.drop(faults)
     divisor = exposure(views[0]) if callable(exposure) else exposure
     for images in views:
         images.scale = 1.0 / divisor
@@ -158,7 +200,7 @@ def posed_images(
         background=torch.full((3,), 0.0 if background == "black" else 1.0),
         random_background=background == "random",
         downsampling=", then ".join(t for t in (prefix, _reduction(both, views[0].view(0).camera, factor)) if t) or "none",
-        up=_mean_up([f.camera for f in train]) if up is None else up,
+        up=_mean_up(cameras) if up is None else up,
         center=focus_point(cameras).float(),
         exposure=divisor,
         world=world,

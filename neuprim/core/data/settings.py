@@ -32,12 +32,14 @@ class FolderSettings:
             evaluation white).
         downsample: whole factor, area filter on premultiplied values.
         preload: decode all images at once, so that damaged files are found before training.
+        strict: refuse a damaged view; otherwise it is left out with a warning.
     """
 
     path: Annotated[Path, text("the data set's folder")]
     background: Background = "auto"
     downsample: Annotated[int, Range(at_least=1)] = 1
     preload: bool = True
+    strict: bool = False
 
     def __post_init__(self) -> None:
         verify(self, "scene")

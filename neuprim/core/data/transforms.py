@@ -1,28 +1,65 @@
-"""The frames of ``transforms.json`` files (instant-ngp, nerfstudio, NeRF-synthetic): cameras, lenses, masks, and their splits.
+"""The frames of ``transforms.json`` files (instant-ngp, nerfstudio, BlenderNeRF, NeRF-synthetic, D-NeRF, NRHints, GS³): cameras, lenses, masks, splits.
 
-Intrinsics (``fl_x fl_y cx cy w h``, ``k1 k2 k3 k4 p1 p2``, ``camera_angle_x``, ``camera_model``) may stand in the file or in
-a frame, which wins. Poses are camera to world with OpenGL axes.
+Intrinsics and lenses are read by :mod:`neuprim.core.cameras.intrinsics`; :mod:`neuprim.core.cameras.keys` knows all other keys. Poses
+are camera to world with OpenGL axes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from neuprim.core.cameras import Camera
-from neuprim.core.cameras.intrinsics import camera_of, is_fisheye
-from neuprim.core.data.common import every_nth, find_image, missing_files, unique_names
+from torch import Tensor
+
+from neuprim.core.cameras import opengl_to_viewmat
+from neuprim.core.cameras.intrinsics import Target, camera_of, is_fisheye, lens_of
+from neuprim.core.cameras.keys import check_keys, unknown_keys
+from neuprim.core.cameras.pinhole import check_viewmat
+from neuprim.core.data.bad_views import BadViews
+from neuprim.core.data.common import MissingFiles, every_nth, find_image, missing_files, turned, unique_names
 from neuprim.core.data.distortion import Distortion, Fisheye, Radial
+from neuprim.core.data.masks import Mask, masks_beside
+from neuprim.core.data.settings import FolderSettings
 from neuprim.core.data.views import ImageFrame
-from neuprim.core.errors import DataError
-from neuprim.core.io.images import ImageInfo, image_info
+from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.io.images import image_info
 from neuprim.core.io.records import Record
+from neuprim.core.notices import warn_once
 
-__all__ = ["read_frames", "split_frames"]
+__all__ = ["Layout", "read_frames", "read_splits", "split_frames"]
+
+_POSES = ("transform_matrix", "R_opt", "T_opt")
 
 
-def read_frames(folder: Path, document: Record, records: list[Record], skip_missing: bool) -> tuple[list[Record], list[ImageFrame]]:
-    """The frames whose images exist, and their records, both in the order of ``records``; names are unique among them.
+def _viewmat(record: Record) -> Tensor:
+    return opengl_to_viewmat(record.matrix("transform_matrix"))
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a format has of its own.
+
+    Attributes:
+        keys: that its loader reads beside those of :data:`neuprim.core.cameras.keys.READ`.
+        name: the path of a frame's image, as the file has it.
+        image: a frame's image file in the data set's folder, or None.
+        viewmat: (4, 4) world to camera, OpenCV axes.
+        masks: whether a folder ``masks`` beside the images counts where the file names no mask.
+    """
+
+    keys: tuple[str, ...] = ()
+    name: Callable[[Record], str] = lambda record: record.text("file_path")
+    image: Callable[[Path, Record], Path | None] = lambda folder, record: find_image(folder, record.text("file_path"))
+    viewmat: Callable[[Record], Tensor] = _viewmat
+    masks: bool = False
+
+
+def read_frames(
+    folder: Path, document: Record, records: list[Record], settings: FolderSettings, layout: Layout, skip_missing: bool = False
+) -> tuple[list[Record], list[ImageFrame]]:
+    """The frames whose images exist and are good, and their records, both in the order of ``records``; names are unique among them.
 
     Args:
         folder: what paths of images and masks are relative to.
@@ -30,65 +67,131 @@ def read_frames(folder: Path, document: Record, records: list[Record], skip_miss
         skip_missing: leave frames without an image out, unless that leaves none.
 
     Raises:
-        DataError: missing or damaged images, missing masks, wrong or missing fields, impossible cameras, an unknown camera model.
+        DataError: missing images or masks, wrong or missing fields, keys that contradict each other or that nothing honours, an
+            unknown camera model, most views bad, or any with ``settings.strict``.
     """
-    files = [find_image(folder, r.text("file_path")) for r in records]
-    absent = [r.text("file_path") for r, f in zip(records, files, strict=True) if f is None]
+    for record in (document, *records):
+        check_keys(record)
+    names = [layout.name(r) for r in records]
+    files = [layout.image(folder, r) for r in records]
+    absent = [f"{n}{r.values.get('file_ext') or ''}" for n, r, f in zip(names, records, files, strict=True) if f is None]
     if absent and (not skip_missing or len(absent) == len(records)):
-        raise missing_files(document.where, absent, "" if skip_missing else "; scene.skip_missing=true leaves such frames out")
-    present = [(r, f) for r, f in zip(records, files, strict=True) if f is not None]
-    kept = [r for r, _ in present]
-    masks = [_mask_file(folder, r if r.has("mask_path") else document) for r in kept]
-    lost = [m for m in masks if isinstance(m, str)]
-    if lost:
-        raise missing_files(f"{document.where}: mask_path", lost)
-    names = unique_names([r.text("file_path") for r in kept], document.where)
-    frames = []
-    for (record, file), mask, name in zip(present, masks, names, strict=True):
-        assert not isinstance(mask, str)
-        info = image_info(file)
-        merged = Record({**document.values, **{k: v for k, v in record.values.items() if v is not None}}, record.where)
-        camera = _camera(merged, file, info)
-        distortion = _distortion(merged)
-        frames.append(ImageFrame(name, file, camera.validate(record.where), info, mask, distortion))
+        raise missing_files(document.where, absent, "" if skip_missing else _skip_hint(settings))
+    present = [(r, f, n) for r, f, n in zip(records, files, names, strict=True) if f is not None]
+    masks = _masks(folder, document, [(r, f) for r, f, _ in present], layout)
+    kept, frames, bad = [], [], BadViews(document.where, settings.strict)
+    for (record, file, _), mask, name in zip(present, masks, unique_names([n for *_, n in present], document.where), strict=True):
+        fisheye = is_fisheye(record, document)  # before anything else, as other keys mean nothing to a lens that is not known
+        if not _damaged(record):
+            layout.viewmat(record)  # a field that is missing or of another kind is no damage, and refused
+        info = bad.read(name, image_info, file)
+        viewmat = None if info is None else bad.read(name, _pose, record, layout)
+        if info is None or viewmat is None:
+            continue
+        target = Target(info.width, info.height, str(file), turned(info))
+        camera = camera_of(record, document, target, viewmat, warn_once).validate(record.where)
+        told = any(r.has("w") for r in (record, document)) and info.width != info.height  # the size says which way up pixels are
+        if info.orientation > 1 and not (told and info.orientation > 4):
+            warn_once(f"{file.parent}: images with an EXIF orientation are read as they are stored, as COLMAP reads them")
+        kept.append(record)
+        frames.append(ImageFrame(name, file, camera, info, mask, _distortion(record, document, fisheye)))
+    bad.settle(len(present))
+    unknown = unknown_keys(document, records, layout.keys)
+    if unknown:
+        warn_once(unknown)
     return kept, frames
 
 
-def _mask_file(folder: Path, record: Record) -> Path | str | None:
-    """The mask's file, its name where there is no such file, or None where no mask is named."""
-    if not record.has("mask_path"):
-        return None
-    name = record.text("mask_path")
-    return find_image(folder, name) or name
+def _skip_hint(settings: FolderSettings) -> str:
+    return "; scene.skip_missing=true leaves such frames out" if hasattr(settings, "skip_missing") else ""
 
 
-def _camera(record: Record, file: Path, info: ImageInfo) -> Camera:
-    width = record.count("w") if record.has("w") else info.width
-    height = record.count("h") if record.has("h") else info.height
-    if (width, height) != (info.width, info.height):
-        raise DataError(f"{file}: image is {info.width}x{info.height}; expected {width}x{height} (w, h in {record.where})")
-    return camera_of(record, width, height)
+def _pose(record: Record, layout: Layout) -> Tensor:
+    viewmat = layout.viewmat(record)
+    check_viewmat(viewmat, record.where)
+    return viewmat
 
 
-def _distortion(record: Record) -> Distortion | None:
+def _damaged(record: Record) -> bool:
+    """Whether a pose has numbers that are not finite, or only zeros."""
+    poses = [_numbers(record.values.get(key)) for key in _POSES]
+    return any(not all(map(math.isfinite, numbers)) for numbers in poses) or bool(poses[0] and not any(poses[0]))
+
+
+def _numbers(value: object) -> list[float]:
+    """All numbers in nested lists."""
+    if isinstance(value, list):
+        return [n for item in value for n in _numbers(item)]
+    if isinstance(value, int) and not isinstance(value, bool):
+        return [float(value)] if abs(value) < 2**1000 else [math.inf]
+    return [value] if isinstance(value, float) else []
+
+
+def _masks(folder: Path, document: Record, present: Sequence[tuple[Record, Path]], layout: Layout) -> list[Mask | None]:
+    """The mask of every frame: what ``mask_path`` names, in the frame or in the file, else what lies beside the images."""
+    if layout.masks and not any(r.has("mask_path") for r in (document, *(r for r, _ in present))):
+        return masks_beside(folder, [file for _, file in present])
+    masks, lost = [], []
+    for record, _ in present:
+        source = record if record.has("mask_path") else document
+        name = source.text("mask_path") if source.has("mask_path") else ""
+        file = find_image(folder, name) if name else None
+        lost += [name] if name and file is None else []
+        masks.append(None if file is None else Mask(file))
+    if lost:
+        raise missing_files(f"{document.where}: mask_path", lost)
+    return masks
+
+
+def _distortion(record: Record, document: Record, fisheye: bool) -> Distortion | None:
     """The lens; None where all of its coefficients are zero."""
-    fisheye = is_fisheye(record)
-    k = [record.number_or(f"k{i}", 0.0) for i in (1, 2, 3, 4)]
+    lens = lens_of(record, document)
+    k, p = [lens[f"k{i}"] for i in (1, 2, 3, 4)], [lens["p1"], lens["p2"]]
     if fisheye:
         return Fisheye(*k)
-    p = [record.number_or(f"p{i}", 0.0) for i in (1, 2)]
     return Radial(*k, *p) if any(k) or any(p) else None
+
+
+# ---------------------------------------------------------------- splits
+
+Read = Callable[[str], list[ImageFrame]]
+
+
+def read_splits(folder: Path, train: str, test: str, hold_out: int, read: Read) -> tuple[list[ImageFrame], list[ImageFrame]]:
+    """(training, test) of ``transforms_SPLIT.json`` files; with ``hold_out`` every so many training views are the test split.
+
+    Raises:
+        ConfigError: nothing to hold out.
+        DataError: as ``read``.
+    """
+    frames = read(train)
+    if hold_out:
+        if len(frames) < 2:
+            raise ConfigError(f"scene.hold_out is {hold_out}, but {folder} has only {len(frames)} training view; expected at least 2")
+        return every_nth(frames, hold_out)
+    path = folder / f"transforms_{test}.json"
+    hint = "; scene.hold_out=8 holds out every 8th training view instead"
+    if not path.is_file():
+        raise MissingFiles(f"{path}: file not found, so there are no views to judge by{hint}")
+    try:
+        return frames, read(test)
+    except MissingFiles as error:
+        raise MissingFiles(f"{error}{hint}") from None
 
 
 def split_frames(
     document: Record, records: Sequence[Record], frames: Sequence[ImageFrame], every: int
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
-    """(training, test) by ``train_filenames`` and ``test_filenames``, the absent one being the rest; else every n-th is a test view.
+    """(training, test) by ``train_filenames``, ``val_filenames`` and ``test_filenames``; without any every n-th is a test view.
+
+    The test views are those of ``test_filenames``, else of ``val_filenames``, else all that do not train. The training views are
+    those of ``train_filenames``, else all that no list names: views for validation never train.
 
     Raises:
-        DataError: a list names an image that no frame has, or both lists name one.
+        DataError: a list names an image that no frame has, or two that must be apart name the same.
     """
-    lists = {key: set(map(_plain, document.texts(key))) for key in ("train_filenames", "test_filenames") if document.has(key)}
+    keys = [key for key in ("train_filenames", "val_filenames", "test_filenames") if document.has(key)]
+    lists = {key: set(map(_plain, document.texts(key))) for key in keys}
     if not lists:
         return every_nth(frames, every)
     listed = {_plain(r.text("file_path")): f for r, f in zip(records, frames, strict=True)}
@@ -97,11 +200,13 @@ def split_frames(
         unknown = sorted(names - everything)
         if unknown:
             raise missing_files(f"{document.where}: {key} names images that no frame has", unknown)
-    if len(lists) == 2 and lists["train_filenames"] & lists["test_filenames"]:
-        shared = sorted(lists["train_filenames"] & lists["test_filenames"])
-        raise DataError(f"{document.where}: train_filenames and test_filenames share {len(shared)} images, e.g. {shared[0]}; expected none")
-    test_names = lists["test_filenames"] if "test_filenames" in lists else everything - lists["train_filenames"]
-    train_names = lists["train_filenames"] if "train_filenames" in lists else everything - test_names
+    held = [key for key in ("test_filenames", "val_filenames") if key in lists]
+    judged = next((key for key in held if lists[key]), held[0] if held else "")
+    train_names = lists["train_filenames"] if "train_filenames" in lists else everything.difference(*(lists[key] for key in held))
+    test_names = lists[judged] if judged else everything - train_names
+    shared = sorted(train_names & test_names)
+    if shared:
+        raise DataError(f"{document.where}: train_filenames and {judged} share {len(shared)} images, e.g. {shared[0]}; expected none")
     return [f for n, f in listed.items() if n in train_names], [f for n, f in listed.items() if n in test_names]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +16,7 @@ from neuprim.core.cameras import Camera
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.data import Pixels, View, ViewSet
 from neuprim.core.data.distortion import Distortion, resample, source_grid
+from neuprim.core.data.masks import Mask
 from neuprim.core.data.reduction import averaged, whole
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import ImageInfo, read_image, read_mask, srgb_to_linear
@@ -36,7 +37,7 @@ class ImageFrame:
         name: unique within its split.
         camera: the undistorted view at the file's own size.
         info: the file's header.
-        mask: image whose zero pixels do not count, or None.
+        mask: says which pixels do not count, or None.
         distortion: the lens that took the file, or None for a pinhole.
         conditions: what the frame depends on besides its camera (time, light, ...); empty for static scenes.
     """
@@ -45,7 +46,7 @@ class ImageFrame:
     path: Path
     camera: Camera
     info: ImageInfo
-    mask: Path | None = None
+    mask: Mask | None = None
     distortion: Distortion | None = None
     conditions: Conditions = field(default_factory=dict)
 
@@ -143,22 +144,34 @@ class ImageViews(ViewSet):
             rgb = rgb if stored.premultiplied else rgb * alpha[..., None]
         return Pixels((rgb * self.scale).contiguous(), alpha, stored.mask)
 
-    def preload(self, progress: Callable[[float], None] = lambda fraction: None) -> None:
-        """Decode every image now if all copies fit the cache; otherwise do nothing.
+    def preload(self, progress: Callable[[float], None] = lambda fraction: None, empty: bool = True) -> dict[int, DataError]:
+        """Decode every image now, and keep copies while there is room: the errors of the bad ones, by index.
 
-        Raises:
-            DataError: as :meth:`pixels`, for the first damaged file.
+        Args:
+            empty: whether an image may be transparent everywhere.
         """
-        if self._used + sum(self._bytes(f, c) for f, c in zip(self._frames, self._cameras, strict=True)) > self._cache_bytes:
-            return
+        faults = {}
         with ThreadPoolExecutor(4) as pool:
-            for done, _ in enumerate(pool.map(self._load, range(len(self)))):
-                progress((done + 1) / len(self))
+            for index, fault in enumerate(pool.map(self._fault, range(len(self)), [empty] * len(self))):
+                if fault is not None:
+                    faults[index] = fault
+                progress((index + 1) / len(self))
+        return faults
 
-    def _bytes(self, frame: ImageFrame, camera: Camera) -> int:
-        processed = frame.distortion is not None or self._factor > 1
-        values = frame.info.channels * (2 if frame.info.linear or (self._to_linear and processed) else 1)
-        return camera.width * camera.height * (values + (frame.mask is not None or frame.distortion is not None))
+    def _fault(self, index: int, empty: bool) -> DataError | None:
+        try:
+            data = self._load(index).data
+        except DataError as error:
+            return error
+        if empty or data.shape[-1] == 3 or bool(data[..., 3].any()):
+            return None
+        return DataError(f"{self.file(index)}: image is transparent everywhere; expected something to see")
+
+    def drop(self, indices: Container[int]) -> None:
+        """Leave views out for good; those after them move up."""
+        left = [i for i in range(len(self)) if i not in indices]
+        self._frames, self._cameras = [self._frames[i] for i in left], [self._cameras[i] for i in left]
+        self._stored = {new: self._stored[old] for new, old in enumerate(left) if old in self._stored}
 
     def _load(self, index: int) -> _Stored:
         found = self._stored.get(index)
@@ -177,7 +190,7 @@ class ImageViews(ViewSet):
         image = read_image(frame.path, size)
         if image.shape[-1] != frame.info.channels or (image.dtype != torch.uint8) != frame.info.linear:
             raise DataError(f"{frame.path}: file changed while it was in use; expected {frame.info.channels} channels")
-        mask = None if frame.mask is None else read_mask(frame.mask, size)
+        mask = None if frame.mask is None else read_mask(frame.mask.path, size) ^ frame.mask.inverted
         if frame.info.linear and image.shape[-1] == 4 and not bool(((image[..., 3] >= -1e-3) & (image[..., 3] <= 1.001)).all()):
             raise DataError(f"{frame.path}: alpha reaches {image[..., 3].float().abs().max().item():.4g}; expected 0..1")
         if frame.distortion is not None or self._factor > 1:

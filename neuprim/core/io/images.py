@@ -1,16 +1,15 @@
-"""Image files at the edge: PNG, JPEG and OpenEXR in; PNG, OpenEXR, WebP and GIF out; the sRGB transfer curve.
+"""Image files at the edge: PNG, JPEG, WebP and OpenEXR in; PNG, OpenEXR, WebP and GIF out; the sRGB transfer curve.
 
-PNG and JPEG hold display-referred sRGB values with *straight* alpha; OpenEXR holds linear light with *premultiplied* alpha.
-Nothing here converts between the two silently. Colour profiles and EXIF orientation are not applied, as in COLMAP and in
-the loaders of the data sets read here.
+PNG, JPEG and WebP hold display-referred sRGB values with *straight* alpha; OpenEXR holds linear light with *premultiplied* alpha.
+Nothing here converts between the two silently. What 8-bit RGB or RGBA holds without loss is read as such (grey, palettes); all else
+is refused by name. Colour profiles and EXIF orientation are not applied, as in COLMAP and in the loaders of the data sets read here.
 
 Every failure is a :class:`~neuprim.core.errors.DataError` that names the file, what was found and what was expected.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from torch import Tensor
 from neuprim.core.errors import DataError
 from neuprim.core.io.exr import check_finite, write_exr, write_layers
 from neuprim.core.io.files import writing
+from neuprim.core.io.pictures import MAX_PIXELS, check_pixels, decode, enough_memory, open_picture, orientation_of, rgb_mode
 
 __all__ = [
     "MAX_PIXELS",
@@ -44,14 +44,10 @@ __all__ = [
     "write_webp",
 ]
 
-MAX_PIXELS = 64 * 2**20
-"""Largest image read: 67,108,864 pixels (8192 x 8192). A header that claims more is refused before any pixel memory is taken."""
-
 _MAX_FLOATS = 16 * MAX_PIXELS
 """Most channel values in one OpenEXR file, as all of its channels are decoded together."""
 
 _EXR = b"\x76\x2f\x31\x01"
-_PNG_KINDS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
 
 
 @dataclass(frozen=True)
@@ -61,13 +57,15 @@ class ImageInfo:
     Attributes:
         width, height: pixels.
         channels: 3 (RGB) or 4 (RGBA), or as many as were asked for by name.
-        linear: True for OpenEXR (linear light, premultiplied alpha), False for PNG/JPEG (sRGB, straight alpha).
+        linear: True for OpenEXR (linear light, premultiplied alpha), False for PNG, JPEG and WebP (sRGB, straight alpha).
+        orientation: EXIF's, 1 to 8; pixels are read as they are stored whatever it says.
     """
 
     width: int
     height: int
     channels: int
     linear: bool
+    orientation: int = 1
 
 
 # ---------------------------------------------------------------- reading
@@ -77,15 +75,14 @@ def image_info(path: Path, channels: Sequence[str] | None = None) -> ImageInfo:
     """Size and channels of an image from its header alone; ``channels`` as of :func:`read_image`.
 
     Raises:
-        DataError: missing, empty, not PNG/JPEG/OpenEXR, not 8-bit RGB(A) or float RGB(A), without a channel that was asked for, or larger
-            than :data:`MAX_PIXELS`.
+        DataError: missing, empty, not PNG/JPEG/WebP/OpenEXR, nothing that 8-bit RGB(A) or float RGB(A) holds, without a channel that was
+            asked for, or larger than :data:`MAX_PIXELS`.
     """
     if _is_exr(path, channels is not None):
         names, width, height = _exr_layout(path, channels)
         return ImageInfo(width, height, len(names), True)
-    with _open_pillow(path) as image:
-        _check_rgb8(path, image)
-        return ImageInfo(image.width, image.height, len(image.getbands()), False)
+    with enough_memory(path), open_picture(path) as image:
+        return ImageInfo(image.width, image.height, len(rgb_mode(path, image)), False, orientation_of(image))
 
 
 def exr_channels(path: Path) -> tuple[str, ...]:
@@ -99,9 +96,10 @@ def exr_channels(path: Path) -> tuple[str, ...]:
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequence[str] | None = None) -> Tensor:
-    """(H, W, 3 or 4) pixels as stored: uint8 sRGB with straight alpha (PNG, JPEG), or linear premultiplied float (OpenEXR).
+    """(H, W, 3 or 4) pixels as stored: uint8 sRGB with straight alpha (PNG, JPEG, WebP), or linear premultiplied float (OpenEXR).
 
-    OpenEXR values come as float16 or float32, as in the file, and are never clamped.
+    Grey and palette images come as RGB, or RGBA where they have alpha. OpenEXR values come as float16 or float32, as in the file, and are
+    never clamped.
 
     Args:
         size: expected (width, height); any other is an error.
@@ -110,33 +108,29 @@ def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequen
     Raises:
         DataError: as :func:`image_info`; also for truncated or corrupt data, a wrong size, NaN or infinite values.
     """
-    if _is_exr(path, channels is not None):
-        names, width, height = _exr_layout(path, channels)
-        _check_size(path, width, height, size)
-        return _read_exr(path, names, width, height)
-    with _open_pillow(path) as image:
-        _check_rgb8(path, image)
-        _check_size(path, image.width, image.height, size)
-        return torch.from_numpy(_decode(path, image))
+    with enough_memory(path):
+        if _is_exr(path, channels is not None):
+            names, width, height = _exr_layout(path, channels)
+            _check_size(path, width, height, size)
+            return _read_exr(path, names, width, height)
+        with open_picture(path) as image:
+            mode = rgb_mode(path, image)
+            _check_size(path, image.width, image.height, size)
+            return torch.from_numpy(decode(path, image, mode))
 
 
 def read_mask(path: Path, size: tuple[int, int] | None = None) -> Tensor:
-    """(H, W) bool from a grey, RGB or palette-free 8-bit PNG/JPEG: True where any colour channel is not zero.
+    """(H, W) bool from an 8-bit PNG, JPEG or WebP: True where any colour channel is not zero.
 
     An alpha channel, if there is one, is ignored.
 
     Raises:
         DataError: as :func:`read_image`.
     """
-    with _open_pillow(path) as image:
-        if image.mode not in ("1", "L", "LA", "RGB", "RGBA") or _png_header(path)[0] == 16:
-            raise DataError(f"{path}: mask is {_describe(path, image)}; expected 8-bit grey or RGB")
+    with enough_memory(path), open_picture(path) as image:
+        rgb_mode(path, image)
         _check_size(path, image.width, image.height, size)
-        bands = len(image.getbands())
-        values = _decode(path, image)
-    if values.ndim == 3:
-        values = values[..., : 1 if bands == 2 else 3].max(axis=-1)
-    return torch.from_numpy(values.astype(bool))
+        return torch.from_numpy(decode(path, image, "RGB").any(axis=-1))
 
 
 def _check_size(path: Path, width: int, height: int, size: tuple[int, int] | None) -> None:
@@ -159,67 +153,6 @@ def _is_exr(path: Path, named: bool = False) -> bool:
     return head[:4] == _EXR
 
 
-@contextmanager
-def _open_pillow(path: Path) -> Iterator[Image.Image]:
-    """The opened, not yet decoded image; refuses foreign formats and sizes beyond MAX_PIXELS."""
-    try:
-        image = Image.open(path, formats=("PNG", "JPEG"))
-    except FileNotFoundError:
-        raise DataError(f"{path}: file not found; expected an image") from None
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
-        raise DataError(f"{path}: header claims more than {MAX_PIXELS} pixels; larger images are refused") from None
-    except Exception as error:  # Pillow's plugins raise many types for damaged headers
-        if isinstance(error, MemoryError):
-            raise
-        raise DataError(
-            f"{path}: not a readable PNG or JPEG image ({type(error).__name__}: {error}); expected PNG, JPEG or OpenEXR"
-        ) from None
-    with image:
-        _check_pixels(path, image.width, image.height)
-        yield image
-
-
-def _check_pixels(path: Path, width: int, height: int) -> None:
-    if width <= 0 or height <= 0:
-        raise DataError(f"{path}: header claims {width}x{height} pixels; expected a positive size")
-    if width * height > MAX_PIXELS:
-        raise DataError(f"{path}: header claims {width}x{height} pixels; at most {MAX_PIXELS} are accepted")
-
-
-def _png_header(path: Path) -> tuple[int, int]:
-    """(bit depth, colour type) of a PNG; (0, -1) for other files. Pillow opens 16-bit RGB as 8-bit without saying so."""
-    with open(path, "rb") as file:
-        head = file.read(26)
-    return (head[24], head[25]) if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 26 else (0, -1)
-
-
-def _describe(path: Path, image: Image.Image) -> str:
-    depth, kind = _png_header(path)
-    if kind >= 0:
-        return f"{depth}-bit {_PNG_KINDS.get(kind, 'unknown')} PNG"
-    return {"L": "8-bit grey JPEG", "CMYK": "CMYK JPEG"}.get(image.mode, f"{image.format} of mode {image.mode}")
-
-
-def _check_rgb8(path: Path, image: Image.Image) -> None:
-    depth, _ = _png_header(path)
-    if image.mode not in ("RGB", "RGBA") or depth not in (0, 8):
-        raise DataError(f"{path}: image is {_describe(path, image)}; expected 8-bit RGB or RGBA")
-    if image.mode == "RGB" and "transparency" in image.info:
-        raise DataError(f"{path}: image is RGB with a transparent colour key (tRNS); expected RGB or RGBA")
-
-
-def _decode(path: Path, image: Image.Image) -> np.ndarray:
-    try:
-        image.load()
-    except MemoryError:
-        raise
-    except Exception as error:  # Pillow's decoders raise OSError, SyntaxError, ValueError, struct.error, ...
-        raise DataError(
-            f"{path}: image data is truncated or corrupt ({error}); expected a complete {image.width}x{image.height} image"
-        ) from None
-    return np.array(image)
-
-
 def _exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
     """Channels by name, width and height."""
     try:
@@ -238,7 +171,7 @@ def _exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
             f"{path}: OpenEXR data window {low}..{high} is not its display window {full_low}..{full_high}; expected equal windows"
         )
     width, height = high[0] - low[0] + 1, high[1] - low[1] + 1
-    _check_pixels(path, width, height)
+    check_pixels(path, width, height)
     if width * height * len(channels) > _MAX_FLOATS:
         raise DataError(
             f"{path}: header claims {len(channels)} channels of {width}x{height} pixels; at most {_MAX_FLOATS} values are accepted"

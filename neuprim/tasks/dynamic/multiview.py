@@ -1,7 +1,7 @@
 """Posed images of a moving scene: ``transforms`` files in the layout of D-NeRF, with a ``time`` in every frame.
 
 Either ``transforms_SPLIT.json`` per split, whose scenes have z upwards, or one ``transforms.json``, of which every n-th frame by
-name is a test view unless it lists ``train_filenames`` or ``test_filenames``; where both are there the splits count. Cameras,
+name is a test view unless it lists ``train_filenames``, ``val_filenames`` or ``test_filenames``; where both are there the splits count. Cameras,
 lenses and masks are those of :mod:`neuprim.core.data.transforms`; images are PNG, JPEG or OpenEXR.
 
 Each view has the condition "time", a float32 tensor without dimensions, 0..1.
@@ -26,7 +26,7 @@ from neuprim.core.checked import Accepts, checked
 from neuprim.core.data import Dataset
 from neuprim.core.data.common import posed_images
 from neuprim.core.data.settings import EveryNth, FolderSettings, SplitName, data_folder
-from neuprim.core.data.transforms import read_frames, split_frames
+from neuprim.core.data.transforms import Layout, read_frames, split_frames
 from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import DataError
 from neuprim.core.io.records import Record, read_json
@@ -57,22 +57,35 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         document = read_json(single)
         records = sorted(document.objects("frames"), key=lambda r: r.text("file_path"))
         clock = _clock(records, [], asked.time_range)
-        records, frames = _frames(folder, document, records, clock)
+        records, frames = _frames(asked, document, records, clock)
         train, test = split_frames(document, records, frames, asked.test_every)
         return posed_images(str(single), name, train, test, asked, context, start=moving_points)
     if not any(path.is_file() for path in files.values()):
         raise DataError(f"{folder}: has neither {files[asked.train_split].name} nor transforms.json; expected one of them")
+    test = files[asked.test_split]
+    if not test.is_file():
+        hint = f"rename {files[asked.train_split].name} to transforms.json, of which every 8th frame is a test view (scene.test_every)"
+        raise DataError(f"{test}: file not found, so there are no views to judge by; {hint}")
     documents = {split: read_json(path) for split, path in files.items()}
     splits = {split: list(document.objects("frames")) for split, document in documents.items()}
     clock = _clock([r for s in splits.values() for r in s], _others(folder, splits), asked.time_range)
-    read = {split: _frames(folder, documents[split], splits[split], clock)[1] for split in splits}
-    train, test = read[asked.train_split], read[asked.test_split]
-    return posed_images(str(folder), name, train, test, asked, context, up=torch.tensor([0.0, 0.0, 1.0]), start=moving_points)
+    read = {split: _frames(asked, documents[split], splits[split], clock)[1] for split in splits}
+    return posed_images(
+        str(folder),
+        name,
+        read[asked.train_split],
+        read[asked.test_split],
+        asked,
+        context,
+        up=torch.tensor([0.0, 0.0, 1.0]),
+        start=moving_points,
+    )
 
 
-def _frames(folder: Path, document: Record, records: list[Record], clock: _Range) -> tuple[list[Record], list[ImageFrame]]:
+def _frames(asked: MultiviewSettings, document: Record, records: list[Record], clock: _Range) -> tuple[list[Record], list[ImageFrame]]:
     """The frames with their times 0..1, and their records."""
-    records, frames = read_frames(folder, document, records, skip_missing=False)
+    layout = Layout(keys=("time", "train_filenames", "val_filenames", "test_filenames", "ply_file_path"), masks=True)
+    records, frames = read_frames(data_folder(asked.path), document, records, asked, layout)
     low, high = clock
     times = [(r.number("time") - low) / (high - low) for r in records]
     return records, [replace(f, conditions={"time": torch.tensor(t, dtype=torch.float32)}) for f, t in zip(frames, times, strict=True)]

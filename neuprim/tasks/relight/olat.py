@@ -2,8 +2,8 @@
 
 ``transforms_SPLIT.json`` holds, in the file or in a frame, which wins:
 
-* ``camera_intrinsics``: [cx, cy, fx, fy] in pixels, in this order; else ``camera_angle_x``, the horizontal field of view in radians,
-  with square pixels and the principal point in the middle. In one place the intrinsics win.
+* ``camera_intrinsics``: [cx, cy, fx, fy] in pixels, in this order; or ``camera_angle_x``, the horizontal field of view in radians,
+  with square pixels and the principal point in the middle; or any other keys of :mod:`neuprim.core.cameras.intrinsics`.
 * ``pl_intensity``: three numbers or one; default 1. (GS³ does not read it.)
 * ``camera_near``, ``camera_far``: default 3 and 10 as in NRHints. Checked, but nothing depends on them: what lies in front of the
   camera is drawn.
@@ -28,28 +28,30 @@ Settings beside the common ones (``background`` is black by default): ``train_sp
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras import Camera, opengl_to_viewmat
+from neuprim.core.cameras import opengl_to_viewmat
 from neuprim.core.checked import Range, checked
 from neuprim.core.data import Dataset
-from neuprim.core.data.common import IMAGE_SUFFIXES, every_nth, find_image, missing_files, posed_images, unique_names
+from neuprim.core.data.common import IMAGE_SUFFIXES, find_image, posed_images
 from neuprim.core.data.settings import Background, FolderSettings, HoldOut, SplitName, data_folder
+from neuprim.core.data.transforms import Layout, read_frames, read_splits
 from neuprim.core.data.views import ImageFrame
-from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.images import ImageInfo, image_info
+from neuprim.core.errors import DataError
 from neuprim.core.io.records import Record, read_json
+from neuprim.core.model.fields import Conditions
 from neuprim.core.task import SceneContext
 from neuprim.tasks.relight.data import Lighting, bright
 
 __all__ = ["OlatSettings", "load", "read_split"]
+
+_KEYS = ("camera_near", "camera_far", "img_path", "file_ext", "pl_pos", "pl_intensity", "R_opt", "T_opt")
 
 
 def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
@@ -61,13 +63,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """
     asked = checked(OlatSettings, settings, "scene")
     folder = data_folder(asked.path)
-    train = read_split(folder, asked.train_split, asked.ignore_corrections)
-    if asked.hold_out:
-        if len(train) < 2:
-            raise ConfigError(f"scene.hold_out is {asked.hold_out}, but {folder} has only {len(train)} training view; expected at least 2")
-        train, test = every_nth(train, asked.hold_out)
-    else:
-        test = read_split(folder, asked.test_split, asked.ignore_corrections)
+    train, test = read_splits(folder, asked.train_split, asked.test_split, asked.hold_out, lambda split: read_split(folder, split, asked))
     return posed_images(
         str(folder),
         folder.resolve().name,
@@ -83,33 +79,28 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     )
 
 
-def read_split(folder: Path, split: str, ignore_corrections: bool = False) -> list[ImageFrame]:
+def read_split(folder: Path, split: str, asked: OlatSettings) -> list[ImageFrame]:
     """The frames of one split, with their lights as conditions.
 
     Raises:
         DataError: as :func:`load`.
     """
-    path = folder / f"transforms_{split}.json"
-    document = read_json(path)
+    document = read_json(folder / f"transforms_{split}.json")
     near = document.number_or("camera_near", 3.0, "a distance above 0", 0.0)
     if document.number_or("camera_far", max(10.0, 2.0 * near), f"a distance above camera_near, {near:g}") <= near:
         raise document.fail("camera_far", f"a distance above camera_near, {near:g}")
-    records = list(document.objects("frames"))
-    texts = [r.text("file_path" if r.has("file_path") or not r.has("img_path") else "img_path") for r in records]
-    files = [_image(folder, r) for r in records]
-    absent = [f"{t}{r.values.get('file_ext') or ''}" for t, r, f in zip(texts, records, files, strict=True) if f is None]
-    if absent:
-        raise missing_files(str(path), absent)
-    frames = []
-    for record, file, name in zip(records, files, unique_names(texts, str(path)), strict=True):
-        assert file is not None  # listed above otherwise
-        info = image_info(file)
-        fx, fy, cx, cy = _intrinsics(record, document, file, info)
-        camera = Camera(_viewmat(record, ignore_corrections), fx, fy, cx, cy, info.width, info.height)
-        light = {"light": record.array("pl_pos", (3,), "the point light's position, 3 numbers")}
-        light["light_intensity"] = _intensity(record if record.has("pl_intensity") else document)
-        frames.append(ImageFrame(name, file, camera.validate(record.where), info, conditions=light))
-    return frames
+    layout = Layout(_KEYS, _name, _image, lambda record: _viewmat(record, asked.ignore_corrections))
+    records, frames = read_frames(folder, document, list(document.objects("frames")), asked, layout)
+    return [replace(frame, conditions=_light(record, document)) for record, frame in zip(records, frames, strict=True)]
+
+
+def _light(record: Record, document: Record) -> Conditions:
+    position = record.array("pl_pos", (3,), "the point light's position, 3 numbers")
+    return {"light": position, "light_intensity": _intensity(record if record.has("pl_intensity") else document)}
+
+
+def _name(record: Record) -> str:
+    return record.text("file_path" if record.has("file_path") or not record.has("img_path") else "img_path")
 
 
 def _image(folder: Path, record: Record) -> Path | None:
@@ -134,29 +125,6 @@ def _file(path: Path) -> Path | None:
         return path if path.is_file() else None
     except OSError:  # a name longer than the file system can hold
         return None
-
-
-def _intrinsics(record: Record, document: Record, file: Path, info: ImageInfo) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy in pixels."""
-    width, height = info.width, info.height
-    for source in (record, document):
-        if source.has("camera_intrinsics"):
-            cx, cy, fx, fy = source.array("camera_intrinsics", (4,), "[cx, cy, fx, fy] in pixels").tolist()
-            if not (fx > 0 and fy > 0):
-                raise DataError(
-                    f"{source.where}: camera_intrinsics is {[cx, cy, fx, fy]}; expected [cx, cy, fx, fy], focal lengths above 0"
-                )
-            if not (0 <= cx <= width and 0 <= cy <= height) and fx <= width and fy <= height:
-                raise DataError(
-                    f"{source.where}: camera_intrinsics is {[cx, cy, fx, fy]}, with the principal point outside of {file} "
-                    f"({width}x{height}); expected the order [cx, cy, fx, fy]"
-                )
-            return fx, fy, cx, cy
-        if source.has("camera_angle_x"):
-            angle = source.number("camera_angle_x", "the horizontal field of view in radians, between 0 and pi", 0.0, math.pi)
-            focal = 0.5 * width / math.tan(0.5 * angle)
-            return focal, focal, 0.5 * width, 0.5 * height
-    raise record.fail("camera_intrinsics", "[cx, cy, fx, fy] in pixels, or camera_angle_x in radians, in the frame or in the file")
 
 
 def _viewmat(record: Record, ignore_corrections: bool) -> Tensor:

@@ -79,9 +79,12 @@ def test_missing_empty_foreign_and_folder(tmp_path: Path) -> None:
     (tmp_path / "empty.png").touch()
     refuse(tmp_path / "empty.png", "empty")
     (tmp_path / "text.png").write_text("no image")
-    refuse(tmp_path / "text.png", "expected PNG, JPEG or OpenEXR")
-    Image.fromarray(noise(4, 4, 3)).save(tmp_path / "a.bmp")
-    refuse(tmp_path / "a.bmp", "expected PNG, JPEG or OpenEXR")
+    refuse(tmp_path / "text.png", "expected PNG, JPEG, WebP or OpenEXR")
+    for kind in ("BMP", "GIF", "TIFF"):
+        Image.fromarray(noise(4, 4, 3)).save(tmp_path / "a.png", format=kind)
+        refuse(tmp_path / "a.png", f"image is {kind}", "convert it")
+    (tmp_path / "a.png").write_bytes(b"\0\0\0\x20ftypavif\0\0\0\0" + bytes(40))
+    refuse(tmp_path / "a.png", "image is AVIF", "convert it")
     refuse(tmp_path, "cannot be read")
 
 
@@ -110,10 +113,52 @@ def test_corrupt_png_data(tmp_path: Path) -> None:
     refuse(tmp_path / "a.png", "truncated or corrupt")
 
 
-@pytest.mark.parametrize("mode", ["L", "P", "LA", "1"])
-def test_grey_and_palette_png(tmp_path: Path, mode: str) -> None:
-    Image.fromarray(noise(4, 4, 3)).convert(mode).save(tmp_path / "a.png")
-    refuse(tmp_path / "a.png", "palette" if mode == "P" else "grey", "expected 8-bit RGB or RGBA")
+@pytest.mark.parametrize(("mode", "channels"), [("L", 3), ("P", 3), ("LA", 4), ("1", 3)])
+def test_grey_and_palette_images_are_what_they_show(tmp_path: Path, mode: str, channels: int) -> None:
+    image = Image.fromarray(noise(4, 6, 3)).convert(mode)
+    image.save(tmp_path / "a.png")
+    shown = np.asarray(image.convert("RGBA"))[..., :channels]
+    assert np.array_equal(images.read_image(tmp_path / "a.png").numpy(), shown)
+    assert images.image_info(tmp_path / "a.png") == images.ImageInfo(6, 4, channels, False)
+
+
+def test_a_palette_with_transparent_colours_has_alpha(tmp_path: Path) -> None:
+    Image.fromarray(noise(4, 6, 3)).convert("P").save(tmp_path / "a.png", transparency=bytes(range(256)))
+    read = images.read_image(tmp_path / "a.png")
+    assert read.shape == (4, 6, 4) and images.image_info(tmp_path / "a.png").channels == 4
+    assert np.array_equal(read.numpy(), np.asarray(Image.open(tmp_path / "a.png").convert("RGBA")))
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_webp(tmp_path: Path, channels: int) -> None:
+    pixels = np.concatenate([noise(5, 7, 3), np.full((5, 7, channels - 3), 200, np.uint8)], axis=-1)
+    images.write_webp(tmp_path / "a.webp", torch.from_numpy(pixels), lossless=True)
+    assert np.array_equal(images.read_image(tmp_path / "a.webp").numpy(), pixels)
+    frames = [Image.fromarray(noise(5, 7, 3)), Image.fromarray(255 - noise(5, 7, 3))]
+    frames[0].save(tmp_path / "b.webp", save_all=True, append_images=frames[1:])
+    refuse(tmp_path / "b.webp", "animation", "expected one picture")
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_exif_orientation_is_told_and_not_applied(tmp_path: Path, orientation: int) -> None:
+    image = Image.fromarray(np.full((4, 6, 3), 100, np.uint8))
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    image.save(tmp_path / "a.jpg", exif=exif)
+    assert images.image_info(tmp_path / "a.jpg") == images.ImageInfo(6, 4, 3, False, orientation)
+    assert images.read_image(tmp_path / "a.jpg").shape == (4, 6, 3)
+
+
+def test_a_lack_of_memory_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    images.write_png(tmp_path / "a.png", torch.zeros(4, 4, 3))
+
+    def load(self: Image.Image) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("PIL.PngImagePlugin.PngImageFile.load", load)
+    refuse(tmp_path / "a.png", "more memory than there is")
+    with pytest.raises(DataError, match=r"a\.png.*more memory"):
+        images.read_mask(tmp_path / "a.png")
 
 
 @pytest.mark.parametrize(("kind", "bytes_per_pixel"), [(0, 2), (2, 6), (6, 8)])
@@ -123,9 +168,10 @@ def test_16_bit_png(tmp_path: Path, kind: int, bytes_per_pixel: int) -> None:
 
 
 def test_grey_and_cmyk_jpeg(tmp_path: Path) -> None:
-    for mode, word in (("L", "grey"), ("CMYK", "CMYK")):
-        Image.fromarray(noise(4, 4, 3)).convert(mode).save(tmp_path / "a.jpg")
-        refuse(tmp_path / "a.jpg", word)
+    Image.fromarray(np.full((4, 4), 100, np.uint8)).save(tmp_path / "a.jpg")
+    assert (images.read_image(tmp_path / "a.jpg").int() - 100).abs().max() <= 2
+    Image.fromarray(noise(4, 4, 3)).convert("CMYK").save(tmp_path / "a.jpg")
+    refuse(tmp_path / "a.jpg", "CMYK")
 
 
 def test_colour_key_is_not_dropped(tmp_path: Path) -> None:
@@ -143,7 +189,7 @@ def test_wrong_size(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
 @pytest.mark.parametrize("side", [8200, 30_000, 2**31 - 1])
 def test_bombs_are_refused_from_the_header(tmp_path: Path, side: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(images, "_decode", lambda *a: pytest.fail("decoded"))
+    monkeypatch.setattr(images, "decode", lambda *a: pytest.fail("decoded"))
     (tmp_path / "a.png").write_bytes(png(side, side, 8, 2, b""))
     refuse(tmp_path / "a.png", "pixels")
     images.write_exr(tmp_path / "a.exr", torch.zeros(2, 2, 3))
@@ -181,6 +227,10 @@ def test_masks(tmp_path: Path) -> None:
     assert images.read_mask(tmp_path / "m.png").tolist() == [[True]]
     Image.fromarray(np.array([[[0, 0, 0, 255]]], np.uint8)).save(tmp_path / "m.png")
     assert images.read_mask(tmp_path / "m.png").tolist() == [[False]], "alpha is no mask"
+    palette = Image.fromarray(np.array([[0, 1, 2]], np.uint8), "P")
+    palette.putpalette([0, 0, 0, 255, 255, 255, 0, 0, 0])
+    palette.save(tmp_path / "m.png")
+    assert images.read_mask(tmp_path / "m.png").tolist() == [[False, True, False]], "colours, not their numbers"
     Image.fromarray(np.array([[True, False]])).save(tmp_path / "m.png")
     assert images.read_mask(tmp_path / "m.png").tolist() == [[True, False]]
     (tmp_path / "m.png").write_bytes(png(2, 2, 16, 0, (b"\0" + bytes(4)) * 2))

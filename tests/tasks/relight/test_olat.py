@@ -15,6 +15,7 @@ from torch import Tensor
 
 from neuprim.core.data import Dataset
 from neuprim.core.io.images import linear_to_srgb, srgb_to_linear, write_exr, write_png
+from neuprim.core.notices import NeuprimWarning
 from neuprim.core.task import SceneContext
 from neuprim.tasks.relight import judging
 from neuprim.tasks.relight.data import lighting_of
@@ -141,18 +142,22 @@ def test_opaque_photographs(folder: Path, context: SceneContext) -> None:
 
 
 @pytest.mark.parametrize("in_frame", [True, False])
-def test_intrinsics_come_as_principal_point_then_focal_lengths(folder: Path, context: SceneContext, in_frame: bool) -> None:
+def test_intrinsics_come_as_principal_point_then_focal_lengths(folder: Path, context: SceneContext, scenes: Any, in_frame: bool) -> None:
     order = [CX, CY, FX, FY]
     both(folder, each(lambda f: f.update(camera_intrinsics=order)) if in_frame else lambda d: d.update(camera_intrinsics=order))
+    if not in_frame:
+        scenes.refused(load, {"path": str(folder)}, context, "camera_intrinsics means a focal length of 20", "camera_angle_x 14.191")
+        both(folder, lambda d: d.pop("camera_angle_x"))
     camera = read(folder, context).train.view(0).camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (FX, FY, CX, CY)
 
 
 def test_a_frames_own_field_of_view_wins_over_the_files_intrinsics(folder: Path, context: SceneContext) -> None:
-    both(folder, lambda d: d.update(camera_intrinsics=[CX, CY, FX, FY]))
+    both(folder, lambda d: d.pop("camera_angle_x") and d.update(camera_intrinsics=[CX, CY, FX, FY]))
     edit(folder, lambda d: d["frames"][1].update(camera_angle_x=1.0))
     train = read(folder, context).train
     assert train.view(0).camera.fx == FX and train.view(1).camera.fx == pytest.approx(6 / math.tan(0.5))
+    assert (train.view(1).camera.cx, train.view(1).camera.cy) == (6, 6), "nothing of the file's four numbers is mixed in"
 
 
 def test_suffix_of_the_file_may_stand_apart(folder: Path, context: SceneContext) -> None:
@@ -292,13 +297,13 @@ FRAME = "transforms_train.json: frames[1]"
 )
 def test_wrong_frames_are_named(folder: Path, context: SceneContext, scenes: Any, change: Edit, words: tuple[str, ...]) -> None:
     edit(folder, lambda d: change(d["frames"][1]))
-    scenes.refused(load, {"path": str(folder)}, context, *words)
+    scenes.refused(load, {"path": str(folder), "strict": True}, context, *words)
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda d: d.pop("camera_angle_x"), ("frames[0]", "camera_intrinsics is missing", "camera_angle_x")),
+        (lambda d: d.pop("camera_angle_x"), ("frames[0]", "no focal length", "camera_intrinsics", "camera_angle_x")),
         (lambda d: d.update(camera_near=0), ("camera_near is 0", "above 0")),
         (lambda d: d.update(camera_near=5, camera_far=4), ("camera_far is 4", "above camera_near, 5")),
         (lambda d: d.update(frames=[]), ("frames is a list of 0", "non-empty")),
@@ -345,11 +350,15 @@ def test_one_kind_of_file(folder: Path, context: SceneContext, scenes: Any) -> N
 
 def test_darkness_has_no_exposure(folder: Path, context: SceneContext, scenes: Any) -> None:
     for png in (folder / "train").glob("*.png"):
-        write_png(png, torch.zeros(SIZE, SIZE, 4, dtype=torch.uint8))
+        write_png(png, torch.zeros(SIZE, SIZE, 3, dtype=torch.uint8))
+    for png in (folder / "test").glob("*.png"):
+        write_png(png, straight(0)[..., :3])
     scenes.refused(load, {"path": str(folder), "exposure": "auto"}, context, str(folder), "99.5 %", "scene.exposure")
 
 
 def test_a_damaged_image_is_found_before_training(folder: Path, context: SceneContext, scenes: Any) -> None:
     path = folder / "test" / "r_1.png"
     path.write_bytes(path.read_bytes()[:100])
-    scenes.refused(load, {"path": str(folder)}, context, str(path))
+    scenes.refused(load, {"path": str(folder), "strict": True}, context, str(path))
+    with pytest.warns(NeuprimWarning, match=r"r_1\.png: .*; view r_1 is left out"):
+        assert len(read(folder, context).test) == 1

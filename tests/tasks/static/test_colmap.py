@@ -14,7 +14,9 @@ import torch
 from PIL import Image
 
 from neuprim.core.cameras.colmap_files import check_binary_model
+from neuprim.core.cameras.file import read_camera_file
 from neuprim.core.errors import BackendUnavailable
+from neuprim.core.notices import NeuprimWarning
 from neuprim.tasks.static.datasets.colmap import load
 
 W, H = 64, 50
@@ -85,6 +87,62 @@ def test_points_are_the_models(capture: Any, context: Any) -> None:
     points = load({"path": capture()}, context).initial_points(5, torch.Generator().manual_seed(0))
     assert torch.allclose(points.means, torch.tensor(POINTS).float())
     assert torch.allclose(points.colors, torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.2, 1.0]]))
+
+
+def test_names_with_blanks_are_whole_in_text_models(capture: Any, context: Any) -> None:
+    path = capture(text=True)
+    file = path / "sparse" / "0" / "images.txt"
+    file.write_text(file.read_text().replace(" 03.png", " left cam/IMG  0003.JPG"))
+    (path / "images" / "left cam").mkdir()
+    (path / "images" / "03.png").rename(path / "images" / "left cam" / "IMG  0003.jpg")  # and in another case
+    data = load({"path": path}, context)
+    assert "IMG  0003" in [data.train.view(i).name for i in range(len(data.train))]
+
+
+@pytest.fixture
+def two(capture: Any, pycolmap: Any) -> Path:
+    """A reconstruction in two models: ``sparse/0`` has three of the ten images, ``sparse/1`` all."""
+    path: Path = capture()
+    sparse = path / "sparse"
+    (sparse / "0").rename(sparse / "1")
+    model = pycolmap.Reconstruction(str(sparse / "1"))
+    (sparse / "0").mkdir()
+    for image in sorted(model.images.values(), key=lambda i: i.name)[3:]:
+        model.deregister_frame(image.frame_id)
+    model.write(str(sparse / "0"))
+    return path
+
+
+def test_the_largest_of_several_models_is_taken_and_told(two: Path, context: Any) -> None:
+    with pytest.warns(NeuprimWarning, match=r"0 with 3, 1 with 10 posed images; takes 1 \(scene.model takes another\)"):
+        data = load({"path": two}, context)
+    assert len(data.train) + len(data.test) == 10
+    with pytest.warns(NeuprimWarning, match=r"7 of 10 images have no pose in .*sparse/0, e.g. 03.png"):
+        data = load({"path": two, "model": "sparse/0"}, context)
+    assert len(data.train) + len(data.test) == 3
+    assert len(read_camera_file(two).named) == 10
+
+
+@pytest.mark.parametrize("name", ["masks/03.png", "masks/03.png.png"])
+def test_masks_beside_the_images_count(capture: Any, context: Any, name: str) -> None:
+    path = capture()
+    mask = np.full((H, W), 255, np.uint8)
+    mask[:, :20] = 0
+    (path / "masks").mkdir()
+    Image.fromarray(mask).save(path / name)
+    with pytest.warns(NeuprimWarning, match=r"masks of 1 of 10 images are read"):
+        data = load({"path": path}, context)
+    masks = {data.train.view(i).name: data.train.pixels(i).mask for i in range(len(data.train))}
+    assert masks["01"] is None and np.array_equal(masks["03"], mask > 0)
+
+
+def test_damaged_views_are_left_out(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture(text=True)
+    file = path / "images" / "03.png"
+    file.write_bytes(file.read_bytes()[:-40])
+    with pytest.warns(NeuprimWarning, match=r"03.png: .*truncated or corrupt.*; view 03 is left out"):
+        data = load({"path": path}, context)
+    assert len(data.train) == 7 and len(data.test) == 2 and worst(scenes, data) < 0.02
 
 
 def test_without_points_a_box_in_front_of_the_cameras(capture: Any, context: Any) -> None:
@@ -260,9 +318,9 @@ def test_damaged_and_grey_images(capture: Any, scenes: Any, context: Any) -> Non
     path = capture()
     file = path / "images" / "03.png"
     file.write_bytes(file.read_bytes()[:-40])
-    scenes.refused(load, {"path": path}, context, str(file), "truncated or corrupt")
-    Image.fromarray(np.zeros((H, W), np.uint8)).save(file)
-    scenes.refused(load, {"path": path}, context, str(file), "grey")
+    scenes.refused(load, {"path": path, "strict": True}, context, str(file), "truncated or corrupt")
+    Image.fromarray(np.zeros((H, W), np.uint16)).save(file)
+    scenes.refused(load, {"path": path, "strict": True}, context, str(file), "16-bit grey")
 
 
 def test_too_few_images(capture: Any, scenes: Any, context: Any) -> None:

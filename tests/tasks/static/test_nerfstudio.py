@@ -13,6 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
+from neuprim.core.notices import NeuprimWarning
 from neuprim.tasks.static.datasets.nerfstudio import load
 
 W, H = 64, 50
@@ -178,6 +179,121 @@ def test_split_lists(capture: Any, context: Any, lists: Any, train: list[str], t
     assert (names(data.train), names(data.test)) == (train, test)
 
 
+@pytest.mark.parametrize(
+    ("lists", "train", "test"),
+    [
+        ({"val_filenames": ["00", "01"], "test_filenames": ["02", "03"]}, ["04", "05", "06", "07", "08", "09"], ["02", "03"]),
+        ({"train_filenames": ["04", "05"], "val_filenames": ["00", "01"]}, ["04", "05"], ["00", "01"]),
+        ({"val_filenames": ["00", "01"]}, ["02", "03", "04", "05", "06", "07", "08", "09"], ["00", "01"]),
+        ({"train_filenames": ["04"], "val_filenames": ["00"], "test_filenames": []}, ["04"], ["00"]),
+        ({"train_filenames": ["04"], "val_filenames": ["04"], "test_filenames": ["05"]}, ["04"], ["05"]),
+    ],
+)
+def test_views_for_validation_never_train(capture: Any, context: Any, lists: Any, train: list[str], test: list[str]) -> None:
+    data = load({"path": capture(**{key: [f"images/{name}.png" for name in named] for key, named in lists.items()})}, context)
+    assert (names(data.train), names(data.test)) == (train, test)
+
+
+def test_validation_that_would_train_is_refused(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture(train_filenames=["images/01.png", "images/02.png"], val_filenames=["images/01.png"])
+    scenes.refused(load, {"path": path}, context, "train_filenames and val_filenames share 1 images")
+
+
+@pytest.mark.parametrize("name", ["masks/{0}.png", "masks/{0}.png.png", "images/dynamic_mask_{0}.png"])
+def test_masks_beside_the_images_count(capture: Any, context: Any, name: str) -> None:
+    path = capture()
+    mask = np.full((H, W), 255, np.uint8)
+    mask[:, :20] = 0
+    (path / "masks").mkdir()
+    for i in range(10):
+        Image.fromarray(255 - mask if "dynamic" in name else mask).save(path / name.format(f"{i:02d}"))
+    with pytest.warns(NeuprimWarning, match="masks of 10 of 10 images are read"):
+        data = load({"path": path}, context)
+    found = data.train.pixels(0).mask
+    assert found is not None and np.array_equal(found.numpy(), mask > 0)
+    edit(path, lambda d: d["frames"][0].update(mask_path="images/09.png"))
+    assert load({"path": path}, context).train.pixels(0).mask is None, "what the file names counts alone"
+
+
+def test_resized_images_scale_the_camera(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture(sigma=2.0)
+    for file in (path / "images").iterdir():
+        Image.open(file).resize((W // 2, H // 2), Image.Resampling.BOX).save(file)
+    with pytest.warns(NeuprimWarning, match="w, h are 64x50 and the image 32x25; cameras are scaled"):
+        data = load({"path": path}, context)
+    assert worst(scenes, data) < 0.03
+    edit(path, lambda d: [d.pop(key) for key in ("w", "h")] and d.update(cx=W / 2, cy=H / 2))
+    scenes.refused(load, {"path": path}, context, "the middle of an image of 64x50", "32x25", "expected w, h")
+
+
+def test_turned_photographs(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture()
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    for file in sorted((path / "images").iterdir()):
+        Image.open(file).save(file.with_suffix(".jpg"), quality=98, exif=exif)
+        file.unlink()
+    edit(path, lambda d: [f.update(file_path=f["file_path"].replace("png", "jpg")) for f in d["frames"]])
+    assert worst(scenes, load({"path": path}, context)) < 0.1, "the stated size is that of the stored pixels"
+    edit(path, lambda d: d.update(w=H, h=W))
+    scenes.refused(load, {"path": path}, context, "image is 64x50; expected 50x64", "EXIF orientation is 6")
+
+
+def test_upper_and_lower_case(capture: Any, context: Any) -> None:
+    path = capture()
+    for file in (path / "images").iterdir():
+        file.rename(file.with_suffix(".PNG"))
+    (path / "images").rename(path / "Images")
+    assert len(load({"path": path}, context).train) == 8
+
+
+def damage_image(path: Path) -> None:
+    file = path / "images" / "03.png"
+    file.write_bytes(file.read_bytes()[:-40])
+
+
+def black_mask(path: Path) -> None:
+    Image.fromarray(np.zeros((H, W), np.uint8)).save(path / "black.png")
+    edit(path, lambda d: next(f for f in d["frames"] if "03" in f["file_path"]).update(mask_path="black.png"))
+
+
+def no_pose(path: Path) -> None:
+    edit(path, lambda d: next(f for f in d["frames"] if "03" in f["file_path"])["transform_matrix"][0].__setitem__(3, math.nan))
+
+
+def empty_file(path: Path) -> None:
+    (path / "images" / "03.png").write_bytes(b"")
+
+
+@pytest.mark.parametrize("damage", [damage_image, black_mask, no_pose, empty_file])
+def test_one_bad_view_is_left_out_and_named(capture: Any, scenes: Any, context: Any, damage: Callable[[Path], None]) -> None:
+    path = capture()
+    damage(path)
+    with pytest.warns(NeuprimWarning, match=r"; view 03 is left out \(scene.strict=true refuses it\)"):
+        data = load({"path": path}, context)
+    assert len(data.train) + len(data.test) == 9 and "03" not in names(data.train) + names(data.test)
+    assert worst(scenes, data) < 0.02, "poses stay with their images"
+    scenes.refused(load, {"path": path, "strict": True}, context)
+
+
+def test_most_views_bad_is_refused(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture()
+    for i in range(6):
+        (path / "images" / f"{i:02d}.png").write_bytes(b"")
+    scenes.refused(load, {"path": path}, context, "00.png: file is empty", "6 of 10 views of")
+
+
+def test_a_transparent_view_among_others_is_left_out(capture: Any, scenes: Any, context: Any) -> None:
+    path = capture()
+    for i in range(10):
+        spot = np.array(Image.open(path / "images" / f"{i:02d}.png"))[..., :1]
+        alpha = np.where(spot > 20, 255, 0).astype(np.uint8) * (i != 3)
+        Image.fromarray(np.concatenate([spot, spot, spot, alpha], axis=-1)).save(path / "images" / f"{i:02d}.png")
+    with pytest.warns(NeuprimWarning, match=r"03.png: image is transparent everywhere.*; view 03 is left out"):
+        data = load({"path": path}, context)
+    assert "03" not in names(data.train) and len(data.initial_points(10, torch.Generator().manual_seed(0)).means) == 10
+
+
 def test_every_nth_is_a_setting(capture: Any, context: Any) -> None:
     assert names(load({"path": capture(), "test_every": 3}, context).test) == ["00", "03", "06", "09"]
 
@@ -233,7 +349,7 @@ def frame(**fields: Any) -> Callable[[Any], None]:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda d: d.pop("fl_x"), ["fl_x is missing", "camera_angle_x"]),
+        (lambda d: d.pop("fl_x") and d.pop("fl_y"), ["no focal length", "fl_x", "camera_angle_x"]),
         (lambda d: d.update(fl_x=-3), ["fl_x is -3", "above 0"]),
         (lambda d: d.update(fl_y="x"), ['fl_y is "x"', "above 0"]),
         (lambda d: d.update(cx=math.nan), ["cx is NaN", "finite number"]),
@@ -263,7 +379,7 @@ def frame(**fields: Any) -> Callable[[Any], None]:
 def test_bad_fields(capture: Any, scenes: Any, context: Any, change: Callable[[Any], Any], words: list[str]) -> None:
     path = capture()
     edit(path, change)
-    scenes.refused(load, {"path": path}, context, str(path), *words)
+    scenes.refused(load, {"path": path, "strict": True}, context, str(path), *words)
 
 
 def test_missing_images_are_listed_or_skipped(capture: Any, scenes: Any, context: Any) -> None:
@@ -291,7 +407,7 @@ def test_bad_masks(capture: Any, scenes: Any, context: Any) -> None:
     Image.fromarray(np.ones((H, W - 1), np.uint8)).save(path / "mask.png")
     scenes.refused(load, {"path": path}, context, "mask.png", "63x50", "expected 64x50")
     Image.fromarray(np.zeros((H, W), np.uint8)).save(path / "mask.png")
-    scenes.refused(load, {"path": path}, context, "leave no pixel that counts")
+    scenes.refused(load, {"path": path}, context, "leave no pixel that counts")  # of all views
     (path / "mask.png").write_bytes(b"rubbish")
     scenes.refused(load, {"path": path}, context, "mask.png", "not a readable PNG")
 
@@ -307,7 +423,7 @@ def test_damaged_image(capture: Any, scenes: Any, context: Any) -> None:
     path = capture()
     file = path / "images" / "03.png"
     file.write_bytes(file.read_bytes()[:-40])
-    scenes.refused(load, {"path": path}, context, str(file), "truncated or corrupt")
+    scenes.refused(load, {"path": path, "strict": True}, context, str(file), "truncated or corrupt")
 
 
 def test_a_whole_run_ends_in_a_report(capture: Any, scenes: Any, tmp_path: Path) -> None:

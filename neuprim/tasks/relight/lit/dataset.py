@@ -75,7 +75,8 @@ def _known(dataset: Dataset, folder: Path) -> Lighting:
     baselines = {"no_cast_shadows": partial(companion, test, "unshadowed.exr")}
     if _beside(test.file(0), "nearest.exr").is_file():  # not where training views are held out
         baselines[f"nearest_light_of_{NEAR_LIGHTS}"] = partial(companion, test, "nearest.exr")
-    circle = ImageViews([in_scene(f, dataset.world, ("light",)) for f in olat.read_split(folder, "circle")], to_linear=True)
+    views = olat.read_split(folder, "circle", olat.OlatSettings(path=folder))
+    circle = ImageViews([in_scene(f, dataset.world, ("light",)) for f in views], to_linear=True)
     film = Clip("light_round", range(len(circle)), 12.0, circle)
     return Lighting("inverse_square", partial(classes, test), PARTS, baselines, (film,))
 

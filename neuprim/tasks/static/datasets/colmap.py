@@ -1,10 +1,12 @@
-"""COLMAP reconstructions: ``sparse/0`` and an image folder; needs the extra ``neuprim[colmap]``.
+"""COLMAP reconstructions: a model below ``sparse`` and an image folder; needs the extra ``neuprim[colmap]``.
 
 Sizes may differ from image to image. Distorted models are undistorted to a pinhole of the same focal lengths; what a
-photograph does not show is masked out. Reduced copies (``images_4``) scale the cameras to the files' actual sizes.
+photograph does not show is masked out, as is what an image in ``masks/`` blackens. Reduced copies (``images_4``) scale the cameras
+to the files' actual sizes. A line says how many images of the folder have no pose.
 
-Settings beside the common ones: ``images`` (folder, default "images"), ``model`` (default "sparse/0"), ``test_every``
-(default 8: every 8th image by name, from the first, is a test view) and ``skip_missing`` (default false).
+Settings beside the common ones: ``images`` (folder, default "images"), ``model`` (default "auto": of the models in ``sparse`` the one
+with the most posed images), ``test_every`` (default 8: every 8th image by name, from the first, is a test view) and ``skip_missing``
+(default false).
 """
 
 from __future__ import annotations
@@ -16,17 +18,23 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cameras.colmap import PINHOLES, pinhole_of, pycolmap_package, read_model, viewmat_of
+from neuprim.core.cameras.colmap import PINHOLES, largest_model, pinhole_of, pycolmap_package, read_model, viewmat_of
+from neuprim.core.cameras.intrinsics import same_shape
+from neuprim.core.cameras.pinhole import check_viewmat
 from neuprim.core.checked import checked, text
 from neuprim.core.data import Dataset, PointCloud
-from neuprim.core.data.common import every_nth, missing_files, posed_images, unique_names
+from neuprim.core.data.bad_views import BadViews
+from neuprim.core.data.common import IMAGE_SUFFIXES, every_nth, find_image, missing_files, posed_images, turned, unique_names
 from neuprim.core.data.distortion import Distortion
+from neuprim.core.data.masks import masks_beside
 from neuprim.core.data.settings import EveryNth, FolderSettings, data_folder
 from neuprim.core.data.views import ImageFrame
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import ImageInfo, image_info
+from neuprim.core.notices import warn_once
 from neuprim.core.task import SceneContext
 
 __all__ = ["ColmapSettings", "load"]
@@ -37,13 +45,13 @@ class ColmapSettings(FolderSettings):
     """What the user may set.
 
     Attributes:
-        images, model: folders of the images and of the reconstruction.
+        images, model: folders of the images and of the reconstruction; "auto" for the model in ``sparse`` with the most posed images.
         test_every: every n-th image is held out.
         skip_missing: leave out images that are missing; otherwise they are an error.
     """
 
     images: Annotated[str, text("the image folder's name, e.g. images_4")] = "images"
-    model: Annotated[str, text("the model's folder")] = "sparse/0"
+    model: Annotated[str, text("the model's folder, or auto")] = "auto"
     test_every: EveryNth = 8
     skip_missing: bool = False
 
@@ -60,46 +68,71 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     asked = checked(ColmapSettings, settings, "scene")
     folder = data_folder(asked.path)
     model = folder / asked.model
+    if asked.model == "auto":
+        largest, line = largest_model(folder)
+        model = largest or folder / "sparse" / "0"
+        if line:
+            warn_once(f"{line} (scene.model takes another)")
     reconstruction = read_model(model)
-    frames = _read_frames(model, folder / asked.images, reconstruction, asked.skip_missing)
+    frames = _read_frames(model, folder, reconstruction, asked)
     train, test = every_nth(frames, asked.test_every)
     prefix = "" if asked.images == "images" else asked.images
     points = _read_points(reconstruction, model)
     return posed_images(str(model), folder.resolve().name, train, test, asked, context, points=points, prefix=prefix, home=folder)
 
 
-def _read_frames(model: Path, folder: Path, reconstruction: Any, skip_missing: bool) -> list[ImageFrame]:
-    images = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
-    if not images:
+def _read_frames(model: Path, folder: Path, reconstruction: Any, asked: ColmapSettings) -> list[ImageFrame]:
+    posed = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
+    place = folder / asked.images
+    if not posed:
         raise DataError(f"{model}: has no images with a pose; expected at least two")
-    if not folder.is_dir():
-        raise DataError(f"{folder}: does not exist; expected the folder of images (scene.images)")
-    absent = [i.name for i in images if not (folder / i.name).is_file()]
-    if absent and (not skip_missing or len(absent) == len(images)):
-        raise missing_files(str(folder), absent, "" if skip_missing else "; scene.skip_missing=true leaves such images out")
-    images = [i for i in images if i.name not in set(absent)]
-    frames = []
-    for image, name in zip(images, unique_names([i.name for i in images], str(model)), strict=True):
-        file = folder / image.name
-        info = image_info(file)
+    if not place.is_dir():
+        raise DataError(f"{place}: does not exist; expected the folder of images (scene.images)")
+    files = [place / i.name if (place / i.name).is_file() else find_image(place, i.name) for i in posed]
+    absent = [i.name for i, file in zip(posed, files, strict=True) if file is None]
+    if absent and (not asked.skip_missing or len(absent) == len(posed)):
+        raise missing_files(str(place), absent, "" if asked.skip_missing else "; scene.skip_missing=true leaves such images out")
+    present = [(i, file) for i, file in zip(posed, files, strict=True) if file is not None]
+    _tell_unposed(place, {file for _, file in present}, model)
+    masks = masks_beside(folder, [file for _, file in present], place)
+    frames, bad = [], BadViews(str(model), asked.strict)
+    for (image, file), mask, name in zip(present, masks, unique_names([i.name for i, _ in present], str(model)), strict=True):
         where = f"{model}: camera {image.camera_id} of image {image.name}"
-        camera = _camera(where, image, file, info)
+        read = bad.read(name, _info_and_pose, image, file, where)
+        if read is None:
+            continue
+        info, viewmat = read
+        camera = _camera(where, image, viewmat, file, info)
         lens = reconstruction.cameras[image.camera_id]
         distortion = None if lens.model_name in PINHOLES else _Lens.of(lens, info)
-        frames.append(ImageFrame(name, file, camera.validate(where), info, None, distortion))
+        frames.append(ImageFrame(name, file, camera.validate(where), info, mask, distortion))
+    bad.settle(len(present))
     return frames
 
 
-def _camera(where: str, image: Any, file: Path, info: ImageInfo) -> Camera:
+def _tell_unposed(place: Path, posed: set[Path], model: Path) -> None:
+    """Say how many images of the folder the model has no pose of."""
+    suffixes = {suffix.lower() for suffix in IMAGE_SUFFIXES}
+    others = [p for p in place.rglob("*") if p.suffix.lower() in suffixes and p not in posed and not p.name.startswith("dynamic_mask_")]
+    if others:
+        warn_once(f"{place}: {len(others)} of {len(posed) + len(others)} images have no pose in {model}, e.g. {min(others).name}; left out")
+
+
+def _info_and_pose(image: Any, file: Path, where: str) -> tuple[ImageInfo, Tensor]:
+    info, viewmat = image_info(file), viewmat_of(image)
+    check_viewmat(viewmat, where)
+    return info, viewmat
+
+
+def _camera(where: str, image: Any, viewmat: Tensor, file: Path, info: ImageInfo) -> Camera:
     lens = image.camera
     if lens.width <= 0 or lens.height <= 0 or not np.isfinite(lens.params).all():
         raise DataError(f"{where}: size {lens.width}x{lens.height}, parameters {lens.params}; expected a positive size, finite numbers")
-    # a reduced copy keeps its shape to within the rounding of its sides to whole pixels
-    scale = max(info.width / lens.width, info.height / lens.height)
-    if abs(lens.width * scale - info.width) > 1.0 or abs(lens.height * scale - info.height) > 1.0:
-        raise DataError(f"{file}: image is {info.width}x{info.height}; expected {lens.width}x{lens.height} ({where}) or a reduction of it")
+    if not same_shape((lens.width, lens.height), (info.width, info.height)):
+        found = f"image is {info.width}x{info.height}; expected {lens.width}x{lens.height} ({where}) or a reduction of it"
+        raise DataError(f"{file}: {found}{turned(info)}")
     fx, fy, cx, cy = pinhole_of(lens, where)
-    return Camera(viewmat_of(image), fx, fy, cx, cy, int(lens.width), int(lens.height)).resized(info.width, info.height)
+    return Camera(viewmat, fx, fy, cx, cy, int(lens.width), int(lens.height)).resized(info.width, info.height)
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,11 @@
 """nerfstudio and instant-ngp captures: one ``transforms.json`` with intrinsics, lens distortion, OpenGL poses and masks.
 
 Frames are read by :mod:`neuprim.core.data.transforms`. Images are undistorted; what a photograph does not show is masked
-out, as is what ``mask_path`` blackens.
+out, as is what ``mask_path`` blackens, or an image in ``masks/`` where no frame names one.
 
 Settings beside the common ones: ``skip_missing`` (default false: absent images are an error that lists them) and
-``test_every`` (default 8: every 8th frame by name is a test view where the file has no ``train_filenames``/``test_filenames``).
+``test_every`` (default 8: every 8th frame by name is a test view where the file has no ``train_filenames``, ``val_filenames`` or
+``test_filenames``).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.common import missing_files, posed_images
 from neuprim.core.data.points_file import read_points
 from neuprim.core.data.settings import EveryNth, FolderSettings, data_folder
-from neuprim.core.data.transforms import read_frames, split_frames
+from neuprim.core.data.transforms import Layout, read_frames, split_frames
 from neuprim.core.io.records import Record, read_json
 from neuprim.core.task import SceneContext
 
@@ -51,7 +52,8 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     path = folder / "transforms.json"
     document = read_json(path)
     records = sorted(document.objects("frames"), key=lambda r: r.text("file_path"))
-    records, frames = read_frames(folder, document, records, asked.skip_missing)
+    layout = Layout(keys=("ply_file_path", "train_filenames", "val_filenames", "test_filenames"), masks=True)
+    records, frames = read_frames(folder, document, records, asked, layout, asked.skip_missing)
     train, test = split_frames(document, records, frames, asked.test_every)
     points = _read_points(folder, document) if document.has("ply_file_path") else None
     return posed_images(str(path), folder.resolve().name, train, test, asked, context, points=points)

@@ -70,7 +70,7 @@ CORE: dict[str, set[str]] = {
     "model": {"cameras", "checked", "compute", "errors", "settings"},
     "compressed": {"errors", "io", "model"},
     "volumes": {"compute", "errors", "model"},
-    "data": {"cameras", "checked", "compute", "errors", "io", "model", "volumes"},
+    "data": {"cameras", "checked", "compute", "errors", "io", "model", "notices", "volumes"},
     "layers": {"errors", "io", "render"},
     "task": {"checked", "data", "environment", "layers", "model", "volumes"},
     "conditions": {"errors", "model"},

@@ -225,7 +225,9 @@ def _binary(file: BinaryIO, path: Path, element: _Declared, order: str, left: in
                 return rows, {name: PlyList(np.full(count, size), table[name].reshape(-1)) for name, size in lists}
             file.seek(start)
         elif not any(length for _, _, length in fields):
-            raise DataError(f"{path}: {count} {_what(element)} of {dtype.itemsize} bytes; only {left} bytes follow")
+            raise DataError(
+                f"{path}: {count} {_what(element)} of {dtype.itemsize} bytes; only {left} bytes follow; expected a complete file"
+            )
     return _walked(file, path, element, order, left)
 
 
@@ -286,12 +288,11 @@ def _walked(file: BinaryIO, path: Path, element: _Declared, order: str, left: in
 def _ascii(file: BinaryIO, path: Path, element: _Declared, left: int) -> _Values:
     count, fields = element.count, element.fields
     if count * (2 * len(fields)) > left + 1:  # a digit and a blank each
-        raise DataError(f"{path}: {count} {_what(element)} of {len(fields)} numbers; only {left} bytes follow")
+        raise DataError(f"{path}: {count} {_what(element)} of {len(fields)} numbers; only {left} bytes follow; expected a complete file")
     scalars = [(name, kind) for name, kind, length in fields if not length]
     if not count or not fields:
         return np.zeros(0, [(name, "<" + kind) for name, kind in scalars]), {}
-    table: np.ndarray | list[np.ndarray]
-    lists = {}
+    lists: dict[str, PlyList] = {}
     try:
         if len(scalars) == len(fields):
             with warnings.catch_warnings():

@@ -140,6 +140,7 @@ def _placed(model: Model, matrix: NDArray[np.float64], mesh: trimesh.Trimesh) ->
     name = getattr(getattr(mesh.visual, "material", None), "name", None)
     uv, colour = getattr(mesh.visual, "uv", None), getattr(mesh.visual, "vertex_attributes", {}).get("color")
     glow_uv = mesh.vertex_attributes.get(GLOW_UV)
+    glow_uv = None if glow_uv is None else np.array([0, 1]) - np.array([-1, 1]) * glow_uv  # v upward, as trimesh turns the other
     uv, colour, glow_uv = (None if value is None else np.asarray(value, np.float32)[faces] for value in (uv, colour, glow_uv))
     normals = None if normals is None else normals[faces]
     return Faces(moved[faces], name if isinstance(name, str) else "", normals, colour, uv, glow_uv)

@@ -152,7 +152,7 @@ def test_light_and_opacity_of_an_objs_library(tmp_path: Path) -> None:
     assert look("Ke 1 1 1", "d 1.0\nTr 1.0") == look("Ke 1 1 1", "Tr 1.0\nd 1.0") == list(BLUE)  # writers disagree about Tr
     with pytest.raises(DataError, match="material 'pane' has the opacity 'clear'; expected a number"):
         look("", "d clear")
-    with pytest.raises(DataError, match="no face has an opacity of at least 0.5"):
+    with pytest.raises(DataError, match=r"no face has an opacity of at least 0\.5"):
         look("d 0.1", "Tr 1")
     with pytest.warns(match="map_d of material 'pane' is not read"):
         look("", "map_d mask.png")

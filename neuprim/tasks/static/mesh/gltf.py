@@ -1,7 +1,7 @@
 """glTF 2 (.gltf, .glb): what a document says, checked and written anew with nothing in it but surfaces, for trimesh to read.
 
-Accessors are unpacked, quantized ones too. Materials and images are not passed on, so no decoder runs before its turn. Morph targets have their default weights, and skins the pose of their joints' nodes;
-animations, lights and cameras are left out.
+Accessors are unpacked, quantized ones too. Materials and images are not passed on, so no decoder runs before its turn. Morph targets have
+their default weights, and skins the pose of their joints' nodes; animations, lights and cameras are left out.
 
 Extensions: those in ``_READ`` are honoured, those in ``_HARMLESS`` change nothing that is drawn, and beside those of ``_COMPRESSION`` a file
 may hold what is read, or is refused. Any other is named in one line, and refused where the file requires it.
@@ -64,6 +64,11 @@ GLOW_UV = "_GLOW_UV"
 
 _POINTS_AND_LINES, _TRIANGLES, _FAN = (0, 1, 2, 3), (4, 5, 6), 6
 _MAX_DEPTH = 200
+_MOST_JOINTS = 32
+"""That a vertex hangs on."""
+_ROWS = 50_000
+"""Vertices that are posed at once."""
+
 _WHITE = (1.0, 1.0, 1.0)
 
 
@@ -231,20 +236,18 @@ class _Document:
                 values = values + weight * self._per_vertex(target[name], ["VEC3"], len(values))
         if pose is None:
             return values
-        matrices = np.zeros((len(values), 4, 4))
-        attributes = primitive["attributes"]
-        for i in range(8):
-            if f"JOINTS_{i}" not in attributes:
-                break
-            joints = self._per_vertex(attributes[f"JOINTS_{i}"], ["VEC4"], len(values)).astype(np.int64)
-            shares = self._per_vertex(attributes[f"WEIGHTS_{i}"], ["VEC4"], len(values))
-            for k in range(4):
-                matrices += shares[:, k, None, None] * pose[joints[:, k]]
-        moved: NDArray = np.einsum("nij,nj->ni", matrices[:, :3, :3], values)
-        if name == "NORMAL":
-            return moved
-        total = matrices[:, 3, 3:]  # 1 where the weights add up to it
-        return (moved + matrices[:, :3, 3]) / np.where(total > 0, total, 1.0)
+        attributes, count = primitive["attributes"], len(values)
+        pairs = [i for i in range(_MOST_JOINTS // 4) if f"JOINTS_{i}" in attributes]
+        joints = np.concatenate([self._per_vertex(attributes[f"JOINTS_{i}"], ["VEC4"], count) for i in pairs], axis=1).astype(np.int64)
+        shares = np.concatenate([self._per_vertex(attributes[f"WEIGHTS_{i}"], ["VEC4"], count) for i in pairs], axis=1)
+        moved, total = np.zeros((count, 3)), np.maximum(shares.sum(axis=1, keepdims=True), 1e-9)
+        whole = np.concatenate([values, np.full((count, 1), name == "POSITION")], axis=1)  # normals do not move
+        for first in range(0, count, _ROWS):
+            rows = slice(first, first + _ROWS)
+            for k in range(joints.shape[1]):
+                at = np.einsum("nij,nj->ni", pose[joints[rows, k], :3], whole[rows])
+                moved[rows] += shares[rows, k, None] / total[rows] * at
+        return moved
 
     def _per_vertex(self, index: int, kinds: Sequence[str], count: int) -> NDArray:
         values = self.data.array(index, kinds)

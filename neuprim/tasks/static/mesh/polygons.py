@@ -22,6 +22,9 @@ _FANS = 8
 _MOST_TESTS = 500_000
 """Of ears, in a model: about 20 seconds."""
 
+_COSTLY = 500
+"""Corners of a polygon that make a test as long again."""
+
 _FLAT = 1e-10
 """Twice an area, over the square of the polygon's size, that counts as none."""
 
@@ -119,7 +122,7 @@ def _ears(points: NDArray[np.float64], tests: int) -> tuple[NDArray[np.int64] | 
             if not strict:
                 return None, tests
             strict, failed = False, 0
-        tests -= 1
+        tests -= 1 + len(left) // _COSTLY
         if tests < 0:
             return None, tests
         i = place % len(left)

@@ -42,6 +42,7 @@ class Hits:
         solid: (M,) index into the scene's solids.
         triangle: (M,) index into the faces of all solids.
         weight: (M, 3) float32 barycentric coordinates in that triangle.
+        emission: (M, 3) float32 linear RGB of the light that the surface sends out by itself; None: none.
     """
 
     hit: NDArray[np.bool_]
@@ -55,6 +56,7 @@ class Hits:
     solid: NDArray[np.intp]
     triangle: NDArray[np.integer]
     weight: NDArray[np.float32]
+    emission: NDArray[np.float32] | None = None
 
     def lifted(self) -> NDArray[np.float32]:
         """(M, 3) the positions just off the surface, where a shadow ray starts without meeting its own triangle."""

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from neuprim.core.cameras import Camera, look_at
+from neuprim.core.data.points_file import read_points
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.ply import read_ply
 from neuprim.core.model.colours import sh
@@ -183,6 +184,9 @@ def test_a_dynamic_model_needs_a_time_and_colours_follow_it(tmp_path: Path) -> N
         report = export_run(run, "gaussian-ply", tmp_path / f"{t}.ply", [f"time={t}"])
         found[t] = read_ply(report.files[0])
         assert any("linear" in note for note in report.notes) and report.errors["psnr"] > 15
+        rows, back = read_ply(report.files[0]), read_points(report.files[0], 3, "linear")  # its comment says that they are linear
+        light = torch.from_numpy(rows.columns(["f_dc_0", "f_dc_1", "f_dc_2"]) * sh.C0 + 0.5).clamp_min(0).float()
+        assert torch.allclose(back.colors, light, atol=1e-5)
     assert np.allclose(found[0.5].rows["f_dc_0"] - found[0.25].rows["f_dc_0"], 0.1 * 0.25, atol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""Starting points from a PLY file: points with or without colours, or the Gaussians of 3D Gaussian splatting."""
+"""Starting points from a PLY file: points with or without colours, or the Gaussians of 3D or 2D Gaussian splatting."""
 
 from __future__ import annotations
 
@@ -15,91 +15,153 @@ from neuprim.core.io.ply import PlyVertices, read_ply
 from neuprim.core.model.colours.sh import C0
 from neuprim.core.notices import warn_once
 
-__all__ = ["read_points"]
+__all__ = ["COMPRESSED", "LINEAR", "read_points"]
+
+COMPRESSED = (".splat", ".spz", ".ksplat", ".sog", ".sogs", ".lcc")
+"""Suffixes of Gaussian formats that are named when they are refused."""
+
+LINEAR = "colours are linear light"
+"""A comment of files whose colours are not sRGB; ``neuprim export --format gaussian-ply`` writes it."""
 
 _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-_LARGEST = 1e6
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+
+_LARGEST_LOG = 50.0
+"""Logarithms of sizes beyond this are no sizes; those below its negative are none at all."""
+
+_FLATNESS = 0.1
+"""Thickness of a Gaussian without a size along an axis, over its smallest size."""
+
+_FARTHEST = 1e4
+"""Distance of a point from the median point, over the median of all such distances, beyond which it does not belong to the scene."""
+
 _COARSE = 1e-3
 """Of the size of the cloud: what coordinates may be rounded to without a word."""
 
-_FARTHEST = 1e8
-"""From the origin of the file's coordinates: maps reach 1e7 metres."""
-
 
 def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
-    """The vertices of a PLY file as starting points, in the file's own coordinates, float64.
+    """The vertices of a PLY file as starting points, in the file's own coordinates, ``means`` in float64.
 
-    Properties ``x y z`` are required. Colours come from ``f_dc_0..2`` or from ``red green blue`` (bytes, or floats 0..1), both taken for
+    Properties ``x y z`` are required. Colours come from ``f_dc_0..2`` or from ``red green blue`` (integers, or floats 0..1), both taken for
     sRGB; points without are mid-grey. ``scale_0..2`` (logarithms of standard deviations) with ``rot_0..3`` (wxyz) make Gaussians of them,
-    and ``opacity`` (a logit) says how opaque they are. All else is ignored, view-dependent colour too.
+    and ``opacity`` (a logit, infinite for 0 and 1) says how opaque they are. ``scale_0..1`` alone are the discs of 2D Gaussian splatting,
+    ``scale_0`` alone are balls. All else is ignored, view-dependent colour too.
+
+    A vertex that stands for no point is left out, and all such are counted in one warning: a NaN among what is read, a size or rotation
+    that is none, a place far from all others.
 
     Args:
         channels: of the data set. color_space: "srgb" or "linear", what the colours become.
 
     Raises:
-        DataError: a damaged file, one without points, or values that are not finite or out of all proportion.
+        DataError: a damaged or compressed file, or one without usable points.
     """
+    if path.suffix.lower() in COMPRESSED:
+        raise _compressed(path, f"{path.suffix} is a compressed format of Gaussians")
     found = read_ply(path)
-    means = _means(found, path)
+    if "packed_position" in found.names:
+        raise _compressed(path, "a compressed PLY (property packed_position)")
+    means = _columns(found, ("x", "y", "z"))
     if means is None:
         raise DataError(f"{path}: no properties x, y, z; expected points")
     if not len(means):
         raise DataError(f"{path}: no vertices; expected at least one point")
+    scales, opacity = _sizes(found, path), _columns(found, ("opacity",))
+    quats = _columns(found, _ROTATION) if "scale_1" in found.names else None
     colors = _colors(found, path)
-    if color_space == "linear":
-        colors = images.srgb_to_linear(colors)
+    faults = {"place": ~(np.abs(means) < 1e30).all(1), "colour": ~np.isfinite(colors).all(1)}
+    if scales is not None:
+        faults["size"] = ~(scales <= _LARGEST_LOG).all(1) | ~(scales >= -_LARGEST_LOG).any(1)
+        if quats is not None:
+            faults["rotation"] = ~(np.isfinite(quats).all(1) & (np.abs(quats).max(1) > 1e-12))
+    if opacity is not None:
+        faults["opacity"] = np.isnan(opacity[:, 0])
+    kept = ~np.any(list(faults.values()), axis=0)
+    if kept.any():
+        away = np.linalg.norm(np.where(kept[:, None], means, np.nan) - np.median(means[kept], axis=0), axis=1)
+        faults["place"] |= kept & (away > _FARTHEST * np.median(away[kept])) & (np.median(away[kept]) > 0)
+        kept &= ~faults["place"]
+    if not kept.all():
+        parts = [f"{rows.sum()} for their {what}, as vertex {rows.argmax()}" for what, rows in faults.items() if rows.any()]
+        text = f"{path}: {(~kept).sum()} of {len(kept)} vertices are no usable points ({'; '.join(parts)})"
+        if not kept.any():
+            raise DataError(f"{text}; expected at least one with finite numbers")
+        warn_once(f"{text}; left out")
+    _warn_of_rounding(found, means[kept], path)
+    rgb = _in_space(torch.from_numpy(colors[kept]).float(), LINEAR in found.comments, color_space)
     if channels != 3:
-        colors = colors.mean(1, keepdim=True).expand(-1, channels)
-    scales = _numbers(found, ("scale_0", "scale_1", "scale_2"), path)
-    quats = _numbers(found, ("rot_0", "rot_1", "rot_2", "rot_3"), path)
-    opacity = _numbers(found, ("opacity",), path)
-    if scales is None or quats is None:
-        deviations, quats = None, None
-    else:
-        if bool((scales.abs() > 50).any()) or bool((quats.norm(dim=1) < 1e-12).any()):
-            raise DataError(f"{path}: scale or rot of a vertex is out of proportion; expected logarithms, and quaternions of some length")
-        deviations = scales.double().exp().float()
-    alphas = None if opacity is None else torch.sigmoid(opacity[:, 0])
-    return PointCloud(means, colors.contiguous(), {}, None, quats, alphas, deviations)
+        rgb = rgb.mean(1, keepdim=True).expand(-1, channels)
+    deviations = None if scales is None else torch.from_numpy(_thickened(np.exp(scales[kept]))).float()
+    rotations = None if scales is None else torch.tensor([1.0, 0, 0, 0]).repeat(int(kept.sum()), 1)
+    if scales is not None and quats is not None:
+        rotations = torch.from_numpy(quats[kept] / np.linalg.norm(quats[kept], axis=1, keepdims=True)).float()
+    alphas = None if opacity is None else torch.sigmoid(torch.from_numpy(opacity[kept, 0]).float())
+    return PointCloud(torch.from_numpy(means[kept]), rgb.contiguous(), {}, None, rotations, alphas, deviations)
 
 
-def _colors(found: PlyVertices, path: Path) -> Tensor:
-    """(N, 3) sRGB."""
-    dc = _numbers(found, ("f_dc_0", "f_dc_1", "f_dc_2"), path)
+def _compressed(path: Path, what: str) -> DataError:
+    return DataError(
+        f"{path}: {what}, which is not read; expected an uncompressed PLY. "
+        "Convert it with SuperSplat (export as PLY) or splat-transform FILE OUT.ply"
+    )
+
+
+def _columns(found: PlyVertices, names: tuple[str, ...]) -> np.ndarray | None:
+    """(N, len(names)) float64; None if one of them is missing."""
+    return found.columns(names) if set(names) <= set(found.names) else None
+
+
+def _sizes(found: PlyVertices, path: Path) -> np.ndarray | None:
+    """(N, 3) logarithms of sizes, -inf along the axis that discs lack; None without sizes that can be used."""
+    there = [name for name in _SCALES if name in found.names]
+    if not there:
+        return None
+    if there != list(_SCALES[: len(there)]) or (len(there) > 1 and not set(_ROTATION) <= set(found.names)):
+        lacking = [name for name in (*_SCALES, *_ROTATION) if name not in found.names]
+        warn_once(f"{path}: has {', '.join(there)}, but no {', '.join(lacking)}; sizes are ignored, and come from distances")
+        return None
+    scales = found.columns(there)
+    if len(there) == 1:
+        return np.repeat(scales, 3, axis=1)
+    return np.pad(scales, ((0, 0), (0, 3 - len(there))), constant_values=-np.inf)
+
+
+def _thickened(deviations: np.ndarray) -> np.ndarray:
+    """Sizes with a thickness along axes that have none."""
+    flat = deviations < np.exp(-_LARGEST_LOG)
+    least = np.where(flat, np.inf, deviations).min(1, keepdims=True)
+    return np.where(flat, _FLATNESS * least, deviations)
+
+
+def _colors(found: PlyVertices, path: Path) -> np.ndarray:
+    """(N, 3) as the file has them, 0..1 unless it holds more light than that."""
+    dc = _columns(found, ("f_dc_0", "f_dc_1", "f_dc_2"))
     if dc is not None:
-        return (dc * C0 + 0.5).clamp(0, 1)
+        return dc * C0 + 0.5
     for names in _COLOURS:
-        rgb = _numbers(found, names, path)
+        rgb = _columns(found, names)
         if rgb is not None:
             kind = found.rows.dtype[names[0]]
-            return (rgb / (np.iinfo(kind).max if kind.kind in "iu" else 1.0)).clamp(0, 1)
-    return torch.full((len(found.rows), 3), 0.5)
+            bytes_as_floats = kind.kind == "f" and bool(np.nanmax(rgb, initial=0.0, where=np.isfinite(rgb)) > 2.0)
+            if bytes_as_floats:
+                warn_once(f"{path}: {', '.join(names)} are numbers above 2; taken for 0 to 255")
+            return rgb / (np.iinfo(kind).max if kind.kind in "iu" else 255.0 if bytes_as_floats else 1.0)
+    return np.full((len(found.rows), 3), 0.5)
 
 
-def _means(found: PlyVertices, path: Path) -> Tensor | None:
-    """(N, 3) float64, however far from the origin; None where the file has no points."""
-    if not {"x", "y", "z"} <= set(found.names):
-        return None
-    values = found.columns(("x", "y", "z"))
-    bad = ~(np.abs(values) <= _FARTHEST)
-    if bad.any():
-        row, column = (int(i) for i in np.argwhere(bad)[0])
-        raise DataError(f"{path}: {'xyz'[column]} of vertex {row} is {values[row, column]}; expected a number of at most {_FARTHEST:g}")
-    size, step = np.ptp(values, axis=0).max() if len(values) else 0.0, np.spacing(np.abs(values).max(initial=0.0).astype(np.float32))
+def _warn_of_rounding(found: PlyVertices, means: np.ndarray, path: Path) -> None:
+    """Say where float32 coordinates far from the origin are too coarse for the cloud. Rule: coordinates are kept in float64 and moved by an
+    offset, but what the file itself rounded is lost."""
+    largest = np.abs(means).max(initial=0.0)
+    size, step = np.ptp(means, axis=0).max(), np.spacing(np.float32(largest))
     if found.rows.dtype["x"].itemsize == 4 and step > _COARSE * size > 0:
-        warn_once(
-            f"{path}: x y z are float, which rounds coordinates as large as {np.abs(values).max():.7g} to {step:.2g}; expected double there"
-        )
-    return torch.from_numpy(values)
+        warn_once(f"{path}: x y z are float, which rounds coordinates as large as {largest:.7g} to {step:.2g}; expected double there")
 
 
-def _numbers(found: PlyVertices, names: tuple[str, ...], path: Path) -> Tensor | None:
-    """(N, len(names)) float32; None if one of them is missing."""
-    if not set(names) <= set(found.names):
-        return None
-    values = found.columns(names)
-    bad = ~(np.abs(values) <= _LARGEST)
-    if bad.any():
-        row, column = (int(i) for i in np.argwhere(bad)[0])
-        raise DataError(f"{path}: {names[column]} of vertex {row} is {values[row, column]}; expected a number of at most {_LARGEST:g}")
-    return torch.from_numpy(values).float()
+def _in_space(colors: Tensor, linear: bool, color_space: str) -> Tensor:
+    if linear:
+        colors = colors.clamp_min(0)
+        return colors if color_space == "linear" else images.linear_to_srgb(colors.clamp_max(1))
+    colors = colors.clamp(0, 1)
+    return images.srgb_to_linear(colors) if color_space == "linear" else colors

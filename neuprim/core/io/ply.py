@@ -1,14 +1,15 @@
-"""The vertices of a PLY file (Turk 1994), with any scalar properties; for untrusted files.
+"""PLY files (Turk 1994), with any properties; for untrusted files.
 
-Read are ASCII and binary files of either byte order; written are binary little-endian ones. Elements after the vertices (faces) are
-left alone. No claim in a header makes memory be taken that the file's bytes do not pay for.
+Read are ASCII and binary files of either byte order, their elements in any order; written are the vertices of binary little-endian ones.
+No claim in a header makes memory be taken that the file's bytes do not pay for.
 """
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
@@ -17,7 +18,7 @@ import numpy as np
 from neuprim.core.errors import DataError
 from neuprim.core.io.files import atomic_path
 
-__all__ = ["PlyVertices", "read_ply", "write_ply"]
+__all__ = ["PlyElement", "PlyList", "PlyVertices", "read_elements", "read_ply", "write_ply"]
 
 _TYPES = {
     "char": "i1",
@@ -34,6 +35,8 @@ _TYPES = {
     "uint16": "u2",
     "int32": "i4",
     "uint32": "u4",
+    "int64": "i8",
+    "uint64": "u8",
     "float32": "f4",
     "float64": "f8",
 }
@@ -45,7 +48,7 @@ _PROPERTIES = 10_000
 
 @dataclass(frozen=True)
 class PlyVertices:
-    """``rows`` is a structured array (N,) with one field per property, in the file's byte order; ``comments`` without the keyword."""
+    """``rows`` is a structured array (N,) with one field per scalar property, in the file's byte order; ``comments`` without the keyword."""
 
     rows: np.ndarray
     comments: tuple[str, ...] = ()
@@ -57,6 +60,30 @@ class PlyVertices:
     def columns(self, names: Sequence[str]) -> np.ndarray:
         """(N, len(names)) float64."""
         return np.stack([self.rows[name].astype(np.float64) for name in names], -1) if names else np.zeros((len(self.rows), 0))
+
+
+@dataclass(frozen=True)
+class PlyList:
+    """A list property: row i has ``sizes[i]`` of the ``values``, which follow each other without gaps."""
+
+    sizes: np.ndarray
+    values: np.ndarray
+
+
+@dataclass(frozen=True)
+class PlyElement(PlyVertices):
+    """The rows of any element, and its list properties by name."""
+
+    lists: dict[str, PlyList] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Declared:
+    """An element as the header declares it: (property, type, type of the length of a list or "" for a scalar)."""
+
+    name: str
+    count: int
+    fields: list[tuple[str, str, str]]
 
 
 def write_ply(path: Path, rows: np.ndarray, comments: Sequence[str] = ()) -> None:
@@ -82,33 +109,42 @@ def read_ply(path: Path) -> PlyVertices:
         DataError: names the file, what was found and what was expected.
     """
     try:
-        size = path.stat().st_size
         with open(path, "rb") as file:
-            order, count, fields, comments = _header(file, path)
-            left = size - file.tell()
-            if order:
-                dtype = np.dtype([(name, order + kind) for name, kind in fields])
-                if count * dtype.itemsize > left:
-                    raise DataError(f"{path}: {count} vertices of {dtype.itemsize} bytes; only {left} bytes follow the header")
-                rows = np.fromfile(file, dtype, count)
-            else:
-                rows = _ascii(file, path, count, fields, left)
+            return read_elements(file, path.stat().st_size, path, ("vertex",))["vertex"]
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
-    if len(rows) != count:
-        raise DataError(f"{path}: {count} vertices announced, {len(rows)} found")
-    return PlyVertices(rows, comments)
 
 
-def _header(file: BinaryIO, path: Path) -> tuple[str, int, list[tuple[str, str]], tuple[str, ...]]:
-    """Byte order ("" for ASCII), vertex count, (name, type) of the properties, comments."""
+def read_elements(file: BinaryIO, size: int, path: Path, wanted: Sequence[str]) -> dict[str, PlyElement]:
+    """Those of the ``wanted`` elements that a file has; vertices must be there. What follows the last of them is left alone.
+
+    Args:
+        size: of the file, in bytes. path: for messages.
+
+    Raises:
+        DataError: as :func:`read_ply`.
+    """
+    order, elements, comments = _header(file, path)
+    found: dict[str, PlyElement] = {}
+    missing = set(wanted) & {element.name for element in elements}
+    for element in elements:
+        if not missing:
+            break
+        left = size - file.tell()
+        rows, lists = _binary(file, path, element, order, left) if order else _ascii(file, path, element, left)
+        if element.name in missing:
+            found[element.name] = PlyElement(rows, comments, lists)
+            missing.remove(element.name)
+    return found
+
+
+def _header(file: BinaryIO, path: Path) -> tuple[str, list[_Declared], tuple[str, ...]]:
+    """Byte order ("" for ASCII), elements, comments."""
     order: str | None = None
-    count: int | None = None
-    element = ""
-    fields: list[tuple[str, str]] = []
+    elements: list[_Declared] = []
     comments: list[str] = []
     budget = _HEADER_BYTES
-    for number in range(2**31):
+    for number in itertools.count():
         raw = file.readline(budget + 1)
         budget -= len(raw)
         if budget < 0 or not raw.endswith(b"\n"):
@@ -116,7 +152,7 @@ def _header(file: BinaryIO, path: Path) -> tuple[str, int, list[tuple[str, str]]
         line = raw.decode("utf-8", "replace").rstrip("\r\n")
         words = line.split()
         if number == 0:
-            if line != "ply":
+            if words != ["ply"]:
                 raise DataError(f"{path}: starts with {line[:40]!r}; expected a PLY file ('ply')")
         elif not words or words[0] == "obj_info":
             continue
@@ -125,60 +161,184 @@ def _header(file: BinaryIO, path: Path) -> tuple[str, int, list[tuple[str, str]]
         elif words[0] == "format" and len(words) == 3 and words[1] in _FORMATS and order is None:
             order = _FORMATS[words[1]]
         elif words[0] == "element" and len(words) == 3:
-            element = words[1]
-            if element == "vertex" and count is None:
-                count = _count(words[2], path)
-            elif count is None:
-                raise DataError(f"{path}: first element is {element!r}; expected vertex")
-            elif element == "vertex":
-                raise DataError(f"{path}: element vertex twice")
-        elif words[0] == "property" and element:
-            if element == "vertex":
-                fields.append(_property(words, path))
-                if len(fields) > _PROPERTIES:
-                    raise DataError(f"{path}: more than {_PROPERTIES} properties per vertex")
+            if any(element.name == words[1] for element in elements):
+                raise DataError(f"{path}: element {words[1][:40]} twice")
+            elements.append(_Declared(words[1], _count(words[1], words[2], path), []))
+        elif words[0] == "property" and elements:
+            elements[-1].fields.append(_property(words, path))
+            if sum(len(element.fields) for element in elements) > _PROPERTIES:
+                raise DataError(f"{path}: more than {_PROPERTIES} properties")
         elif words == ["end_header"]:
             break
         else:
             raise DataError(f"{path}: header line {number + 1} is {line[:60]!r}; expected format, element, property or comment")
-    if order is None or count is None or not fields:
-        missing = "format" if order is None else "element vertex" if count is None else "property of the vertices"
-        raise DataError(f"{path}: header has no {missing}")
-    names = [name for name, _ in fields]
-    if len(set(names)) != len(names):
-        raise DataError(f"{path}: property {next(n for n in names if names.count(n) > 1)!r} twice")
-    return order, count, fields, tuple(comments)
+    vertices = next((element for element in elements if element.name == "vertex"), None)
+    if order is None or vertices is None or not vertices.fields:
+        missing = "format" if order is None else "element vertex" if vertices is None else "property of the vertices"
+        raise DataError(f"{path}: header has no {missing}; expected vertex properties, as 'property float x'")
+    for element in elements:
+        names = [name for name, _, _ in element.fields]
+        if len(set(names)) != len(names):
+            raise DataError(f"{path}: property {next(n for n in names if names.count(n) > 1)!r} twice")
+    return order, elements, tuple(comments)
 
 
-def _count(text: str, path: Path) -> int:
+def _count(name: str, text: str, path: Path) -> int:
     if not (text.isascii() and text.isdigit() and len(text) <= 12):
-        raise DataError(f"{path}: {text[:20]!r} vertices; expected a count")
+        raise DataError(f"{path}: {text[:20]!r} for the number of {name[:20]}; expected a count")
     return int(text)
 
 
-def _property(words: list[str], path: Path) -> tuple[str, str]:
-    if len(words) != 3 or words[1] not in _TYPES:
-        raise DataError(f"{path}: {' '.join(words)[:60]!r}; expected a scalar property of the vertices, as 'property float x'")
-    return words[2], _TYPES[words[1]]
+def _property(words: list[str], path: Path) -> tuple[str, str, str]:
+    if len(words) == 3 and words[1] in _TYPES:
+        return words[2], _TYPES[words[1]], ""
+    if len(words) == 5 and words[1] == "list" and words[3] in _TYPES and _TYPES.get(words[2], "f")[0] != "f":
+        return words[4], _TYPES[words[3]], _TYPES[words[2]]
+    raise DataError(f"{path}: {' '.join(words)[:60]!r}; expected a property as 'property float x' or 'property list uchar int x'")
 
 
-def _ascii(file: BinaryIO, path: Path, count: int, fields: list[tuple[str, str]], left: int) -> np.ndarray:
+_Values = tuple[np.ndarray, dict[str, PlyList]]
+
+
+def _what(element: _Declared) -> str:
+    return {"vertex": "vertices", "face": "faces"}.get(element.name, f"rows of {element.name[:40]}")
+
+
+def _binary(file: BinaryIO, path: Path, element: _Declared, order: str, left: int) -> _Values:
+    """Rows of equal size are read at once; where lists differ in length, row by row."""
+    count, fields = element.count, element.fields
+    if not count or not fields:
+        return np.zeros(0, [(name, order + kind) for name, kind, length in fields if not length]), {}
+    start = file.tell()
+    sizes = _first_sizes(file, fields, order)
+    file.seek(start)
+    if sizes is not None:
+        dtype = np.dtype([part for field_, size in zip(fields, sizes, strict=True) for part in _parts(field_, size, order)])
+        if count * dtype.itemsize <= left:
+            table = np.frombuffer(bytearray(file.read(count * dtype.itemsize)), dtype)  # of a bytearray, that it may be written to
+            lists = [(name, size) for (name, _, length), size in zip(fields, sizes, strict=True) if length]
+            if all((table["#" + name] == size).all() for name, size in lists):
+                scalars = [name for name, _, length in fields if not length]
+                rows = table if not lists else np.empty(count, [(name, dtype[name]) for name in scalars])
+                for name in scalars if lists else ():
+                    rows[name] = table[name]
+                return rows, {name: PlyList(np.full(count, size), table[name].reshape(-1)) for name, size in lists}
+            file.seek(start)
+        elif not any(length for _, _, length in fields):
+            raise DataError(
+                f"{path}: {count} {_what(element)} of {dtype.itemsize} bytes; only {left} bytes follow; expected a complete file"
+            )
+    return _walked(file, path, element, order, left)
+
+
+def _parts(declared: tuple[str, str, str], size: int, order: str) -> list[tuple]:
+    name, kind, length = declared
+    return [("#" + name, order + length), (name, order + kind, (size,))] if length else [(name, order + kind)]
+
+
+def _first_sizes(file: BinaryIO, fields: list[tuple[str, str, str]], order: str) -> list[int] | None:
+    """The lengths of the lists of the first row, 1 for scalars; None where they are no lengths."""
+    sizes = []
+    for _, kind, length in fields:
+        size = 1
+        if length:
+            raw = file.read(int(length[1]))
+            size = int(np.frombuffer(raw, order + length)[0]) if len(raw) == int(length[1]) else -1
+            if not 0 <= size < 2**24:
+                return None
+        file.seek(size * int(kind[1]), 1)
+        sizes.append(size)
+    return sizes
+
+
+def _walked(file: BinaryIO, path: Path, element: _Declared, order: str, left: int) -> _Values:
+    data, place = file.read(left), 0
+    start = file.tell() - len(data)
+    byteorder = "little" if order == "<" else "big"
+    starts: list[list[int]] = [[] for _ in element.fields]
+    sizes: list[list[int]] = [[] for _ in element.fields]
+    plan = [(int(kind[1]), int(length[1]) if length else 0, length[:1] == "i") for _, kind, length in element.fields]
+    for row in range(element.count):
+        for i, (width, head, signed) in enumerate(plan):
+            size = 1
+            if head:
+                size = int.from_bytes(data[place : place + head], byteorder, signed=signed)  # type: ignore[arg-type]
+                place += head
+            starts[i].append(place)
+            sizes[i].append(size)
+            place += size * width
+            if place > len(data) or size < 0:
+                raise DataError(f"{path}: {element.count} {_what(element)} announced; the file ends in row {row}")
+    file.seek(start + place)
+    octets = np.frombuffer(data, np.uint8)
+    scalars = [(name, order + kind) for name, kind, length in element.fields if not length]
+    rows = np.empty(element.count, scalars)
+    lists = {}
+    for (name, kind, length), begin, many in zip(element.fields, starts, sizes, strict=True):
+        long, width = np.array(many), int(kind[1])
+        first = np.repeat(np.array(begin) - width * (np.cumsum(long) - long), long) + width * np.arange(long.sum())
+        values = octets[first[:, None] + np.arange(width)].reshape(-1).view(order + kind)
+        if length:
+            lists[name] = PlyList(long, values)
+        else:
+            rows[name] = values
+    return rows, lists
+
+
+def _ascii(file: BinaryIO, path: Path, element: _Declared, left: int) -> _Values:
+    count, fields = element.count, element.fields
     if count * (2 * len(fields)) > left + 1:  # a digit and a blank each
-        raise DataError(f"{path}: {count} vertices of {len(fields)} numbers; only {left} bytes follow the header")
-    rows = np.zeros(count, [(name, "<" + kind) for name, kind in fields])
-    if not count:
-        return rows
+        raise DataError(f"{path}: {count} {_what(element)} of {len(fields)} numbers; only {left} bytes follow; expected a complete file")
+    scalars = [(name, kind) for name, kind, length in fields if not length]
+    if not count or not fields:
+        return np.zeros(0, [(name, "<" + kind) for name, kind in scalars]), {}
+    lists: dict[str, PlyList] = {}
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a file without lines; refused below
-            found = np.loadtxt(file, np.float64, max_rows=count, ndmin=2, comments=None, encoding="ascii")
-    except (ValueError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: vertices are not numbers ({' '.join(str(error).split())[:120]})") from error
-    if found.shape != (count, len(fields)):
-        raise DataError(f"{path}: {found.shape[0]} vertices of {found.shape[1]} numbers; expected {count} of {len(fields)}")
-    for i, (name, kind) in enumerate(fields):
-        info = None if kind[0] == "f" else np.iinfo(kind)
-        if info is not None and not ((found[:, i] >= info.min) & (found[:, i] <= info.max)).all():
-            raise DataError(f"{path}: {name} has values outside its type; expected {info.min} to {info.max}")
-        rows[name] = found[:, i]
-    return rows
+        if len(scalars) == len(fields):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # a file without lines; refused below
+                table = np.loadtxt(file, np.float64, max_rows=count, ndmin=2, comments=None, encoding="ascii")
+        else:
+            table, lists = _ascii_lists(file, element)
+    except (ValueError, IndexError) as error:
+        raise DataError(f"{path}: {_what(element)} are not numbers ({' '.join(str(error).split())[:120]})") from error
+    if table.shape != (count, len(scalars)):
+        found = f"{table.shape[0]} {_what(element)} of {table.shape[1]} numbers"
+        raise DataError(f"{path}: {found}; expected {count} of {len(scalars)}")
+    rows = np.zeros(count, [(name, "<" + kind) for name, kind in scalars])
+    for i, (name, kind) in enumerate(scalars):
+        rows[name] = _typed(table[:, i], name, kind, path)
+    kinds = {name: kind for name, kind, length in fields if length}
+    return rows, {name: PlyList(found.sizes, _typed(found.values, name, kinds[name], path)) for name, found in lists.items()}
+
+
+def _typed(values: np.ndarray, name: str, kind: str, path: Path) -> np.ndarray:
+    info = None if kind[0] == "f" else np.iinfo(kind)
+    if info is not None and not ((values >= info.min) & (values <= info.max)).all():
+        raise DataError(f"{path}: {name} has values outside its type; expected {info.min} to {info.max}")
+    with np.errstate(over="ignore"):
+        return values.astype(kind)
+
+
+def _ascii_lists(file: BinaryIO, element: _Declared) -> tuple[np.ndarray, dict[str, PlyList]]:
+    scalars: list[list[float]] = []
+    sizes: dict[str, list[int]] = {name: [] for name, _, length in element.fields if length}
+    values: dict[str, list[float]] = {name: [] for name in sizes}
+    for line in itertools.islice((line for line in file if not line.isspace()), element.count):
+        words, place = [float(word) for word in line.split()], 0
+        plain = []
+        for name, _, length in element.fields:
+            if not length:
+                plain.append(words[place])
+                place += 1
+                continue
+            size = int(words[place])
+            if not 0 <= size < len(words) - place:
+                raise ValueError(f"a list of {words[place]:g} numbers, in a line of {len(words)}")
+            sizes[name].append(size)
+            values[name] += words[place + 1 : place + 1 + size]
+            place += 1 + size
+        scalars.append(plain)
+    width = len(element.fields) - len(sizes)
+    table = np.array(scalars, np.float64).reshape(len(scalars), width)
+    return table, {name: PlyList(np.array(sizes[name]), np.array(values[name], np.float64)) for name in sizes}

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.check import check_points
 from neuprim.core.data.initial import subset
-from neuprim.core.data.points_file import read_points
+from neuprim.core.data.points_file import COMPRESSED, read_points
 from neuprim.core.data.rays import NOT_SEEN, views_that_see
 from neuprim.core.data.surroundings import surrounding_points
 from neuprim.core.errors import ConfigError, DataError, nearest
@@ -43,7 +43,7 @@ def initial_model(density: DensityField, colour: ColourField, dataset: Dataset, 
             raise ConfigError(f"model.init.{key}: no such setting{nearest(key, known)}")
     generator = torch.Generator().manual_seed(seed)
     where = settings.init.get("points", "matter")
-    if isinstance(where, str) and where.lower().endswith(".ply"):
+    if isinstance(where, str) and where.lower().endswith((".ply", *COMPRESSED)):
         points = read_points(Path(where).expanduser(), dataset.channels, dataset.color_space).within(dataset.world)
         cloud = subset(points, settings.primitives, generator)
     elif where in ("matter", "box"):

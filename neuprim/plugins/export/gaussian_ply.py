@@ -20,6 +20,7 @@ from torch import Tensor
 
 from neuprim.core.cameras.world import World
 from neuprim.core.data import View
+from neuprim.core.data.points_file import LINEAR
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
 from neuprim.core.io.ply import write_ply
@@ -65,8 +66,9 @@ def _write(job: ExportJob) -> ExportReport:
     size = max(scores, key=lambda name: float(np.mean(scores[name])))
     gaussians, errors = fits[size], {"psnr": float(np.mean(scores[size])), "psnr_worst": float(np.min(scores[size]))}
     rows = _rows(gaussians, colours, job.run.world)
-    write_ply(job.out, rows, ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"])
     space = channels.color_space
+    comments = ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"] + [LINEAR] * (space == "linear")
+    write_ply(job.out, rows, comments)
     notes = [
         f"{len(gaussians.means)} Gaussians, size={size}; PSNR of them drawn as the 3DGS rasteriser does, against the model's images, {seen}, {space} values",
         "axes and units are those of the run's data; degree 3 harmonics",

@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import numpy.lib.recfunctions
 import pytest
 import torch
 from torch import Tensor
@@ -116,19 +117,20 @@ def test_sizes_can_be_scaled_and_the_count_is_kept(tmp_path: Path) -> None:
     assert fresh(path, primitives=2).count == 2
 
 
-@pytest.mark.parametrize("form", ["bytes", "floats", "ascii", "none"])
+@pytest.mark.parametrize("form", ["bytes", "floats", "large floats", "ascii", "none"])
 def test_plain_clouds(tmp_path: Path, form: str) -> None:
     path = tmp_path / "p.ply"
     if form == "ascii":
         head = "property float x\nproperty float y\nproperty float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n"
         path.write_text(f"ply\nformat ascii 1.0\nelement vertex 2\n{head}end_header\n0 0 0 51 102 255\n1 2 3 51 102 255\n")
     else:
-        kind = {"bytes": [("red", "u1"), ("green", "u1"), ("blue", "u1")], "floats": [(c, "<f4") for c in ("red", "green", "blue")]}
+        floats = [(c, "<f4") for c in ("red", "green", "blue")]
+        kind = {"bytes": [("red", "u1"), ("green", "u1"), ("blue", "u1")], "floats": floats, "large floats": floats}
         rows = np.zeros(2, [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), *kind.get(form, [])])
         rows["x"], rows["y"], rows["z"] = [0, 1], [0, 2], [0, 3]
         for name, value in zip(("red", "green", "blue"), (51, 102, 255), strict=True):
             if form in kind:
-                rows[name] = value if form == "bytes" else value / 255
+                rows[name] = value / 255 if form == "floats" else value
         write_ply(path, rows)
     cloud = read_points(path, 3, "srgb")
     assert cloud.means.tolist() == [[0, 0, 0], [1, 2, 3]] and cloud.axes is None and cloud.alphas is None and cloud.deviations is None
@@ -141,15 +143,93 @@ def test_plain_clouds(tmp_path: Path, form: str) -> None:
     assert model.count == 2 and torch.allclose(model.params["log_scales"].exp(), torch.tensor(math.sqrt(14.0)), rtol=1e-5)
 
 
-@pytest.mark.parametrize(("name", "value"), [("x", math.nan), ("f_dc_1", math.inf), ("scale_0", 1e5), ("opacity", math.nan), ("y", 1e9)])
-def test_impossible_numbers_are_named(tmp_path: Path, name: str, value: float) -> None:
-    with pytest.raises(DataError, match=r"g\.ply: (scale or rot|" + name + ")"):
-        fresh(splats(tmp_path / "g.ply", **{name: value}))
+@pytest.mark.parametrize(
+    ("what", "changes"),
+    [
+        ("place", {"x": math.nan}),
+        ("place", {"y": 4e7}),
+        ("place", {"z": -math.inf}),
+        ("colour", {"f_dc_1": math.inf}),
+        ("size", {"scale_0": 1e5}),
+        ("size", {"scale_2": math.nan}),
+        ("size", {"scale_0": -math.inf, "scale_1": -90.0, "scale_2": -math.inf}),
+        ("rotation", {"rot_0": 0.0, "rot_3": 0.0}),
+        ("rotation", {"rot_2": math.nan}),
+        ("opacity", {"opacity": math.nan}),
+    ],
+)
+def test_rows_that_are_no_points_are_left_out_and_counted(tmp_path: Path, what: str, changes: dict[str, float]) -> None:
+    path = splats(tmp_path / "g.ply", **changes)
+    with pytest.warns(match=rf"g\.ply: 1 of 3 vertices are no usable points \(1 for their {what}, as vertex 1\); left out"):
+        cloud = read_points(path, 3, "srgb")
+    assert cloud.means.tolist() == [[0, 0.5, -1], [2, float(np.float32(0.7)), 1]] and fresh(path).count == 2
+    rows = read_ply(path).rows
+    write_ply(path, rows[[1]])
+    if changes != {"y": 4e7}:  # alone it is not far from anything
+        with pytest.raises(DataError, match="1 of 1 vertices are no usable points"):
+            read_points(path, 3, "srgb")
 
 
-def test_quaternions_of_no_length_points_without_places_and_empty_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="rot"):
-        read_points(splats(tmp_path / "g.ply", rot_0=0.0, rot_3=0.0), 3, "srgb")
+def test_numbers_that_are_not_read_drop_nothing(tmp_path: Path) -> None:
+    kept = read_ply(splats(tmp_path / "g.ply")).rows
+    rows = np.zeros(3, [(n, "<f4") for n in ("nx", "f_rest_0", *reversed(kept.dtype.names or ()), "label")])
+    for name in kept.dtype.names or ():
+        rows[name] = kept[name]
+    rows["nx"], rows["f_rest_0"], rows["label"] = np.nan, np.inf, -np.inf
+    write_ply(tmp_path / "more.ply", rows)
+    found, expected = (read_points(tmp_path / name, 3, "srgb") for name in ("more.ply", "g.ply"))
+    for name in ("means", "colors", "quats", "alphas", "deviations"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))
+
+
+def test_infinite_logits_are_opaque_and_clear(tmp_path: Path) -> None:
+    for value, alpha in ((math.inf, 1.0), (-math.inf, 0.0)):
+        cloud = read_points(splats(tmp_path / "g.ply", opacity=value), 3, "srgb")
+        assert cloud.alphas is not None and float(cloud.alphas[1]) == alpha
+        assert all(bool(v.isfinite().all()) for v in fresh(tmp_path / "g.ply").params.values())
+
+
+def test_discs_are_flat_along_their_third_axis_and_balls_are_round(tmp_path: Path) -> None:
+    path = splats(tmp_path / "g.ply")
+    rows = read_ply(path).rows
+    discs = rows[[n for n in rows.dtype.names or () if n != "scale_2"]]
+    write_ply(tmp_path / "discs.ply", np.lib.recfunctions.repack_fields(discs))
+    cloud = read_points(tmp_path / "discs.ply", 3, "srgb")
+    assert cloud.deviations is not None and torch.allclose(cloud.deviations, torch.tensor([0.1, 0.2, 0.01]).expand(3, 3))
+    assert torch.equal(cloud.quats, read_points(path, 3, "srgb").quats)
+    assert float(fresh(tmp_path / "discs.ply").geometry.scales.max() / fresh(path).geometry.scales[:, 1].max()) == pytest.approx(
+        1, rel=1e-5
+    )
+    flat = read_points(splats(tmp_path / "flat.ply", scale_1=-math.inf), 3, "srgb").deviations
+    assert flat is not None and torch.allclose(flat[1], torch.tensor([0.1, 0.01, 0.3]))
+    balls = rows[[n for n in rows.dtype.names or () if n not in ("scale_1", "scale_2") and "rot" not in n]]
+    write_ply(tmp_path / "balls.ply", np.lib.recfunctions.repack_fields(balls))
+    found = read_points(tmp_path / "balls.ply", 3, "srgb").deviations
+    assert found is not None and torch.allclose(found, torch.tensor(0.1))
+    bare = rows[[n for n in rows.dtype.names or () if n != "rot_2"]]
+    write_ply(tmp_path / "bare.ply", np.lib.recfunctions.repack_fields(bare))
+    with pytest.warns(match="has scale_0, scale_1, scale_2, but no rot_2; sizes are ignored"):
+        assert read_points(tmp_path / "bare.ply", 3, "srgb").deviations is None
+
+
+def test_places_keep_the_digits_of_the_file(tmp_path: Path) -> None:
+    rows = np.zeros(2, [(n, "<f8") for n in "xyz"])
+    rows["x"], rows["y"] = [448250.125, 448250.1251], 5411931.0625
+    write_ply(tmp_path / "utm.ply", rows)
+    means = read_points(tmp_path / "utm.ply", 3, "srgb").means
+    assert means.dtype == torch.float64 and means[1, 0] - means[0, 0] == pytest.approx(1e-4, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["a.splat", "a.spz", "a.KSPLAT", "a.sog", "a.lcc", "a.compressed.ply"])
+def test_compressed_formats_are_named_with_what_to_do(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    head = "element chunk 1\nproperty float min_x\nelement vertex 1\nproperty uint packed_position\nend_header\n"
+    path.write_bytes(f"ply\nformat binary_little_endian 1.0\n{head}".encode() + bytes(8))
+    with pytest.raises(DataError, match=r"is not read; expected an uncompressed PLY. Convert it with SuperSplat .* or splat-transform"):
+        fresh(path)
+
+
+def test_points_without_places_and_empty_files_are_refused(tmp_path: Path) -> None:
     write_ply(tmp_path / "n.ply", np.zeros(1, [("a", "<f4")]))
     with pytest.raises(DataError, match="x, y, z"):
         fresh(tmp_path / "n.ply")

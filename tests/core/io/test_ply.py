@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import tracemalloc
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.ply import read_ply, write_ply
+from neuprim.core.io.ply import read_elements, read_ply, write_ply
 
 ROWS = np.array([(1.5, -2, 250, 1e-300), (np.float32(0.1), 7, 3, 2.5)], [("x", "<f4"), ("count", "<i2"), ("red", "|u1"), ("mass", "<f8")])
 
@@ -43,6 +44,41 @@ def test_ascii_big_endian_and_lists_after_the_vertices(tmp_path: Path) -> None:
     assert read_ply(tmp_path / "b.ply").rows["x"].tolist() == [0.5, -2.0]
 
 
+@pytest.mark.parametrize("order", ["<", ">", ""])
+def test_elements_in_any_order_with_lists_of_any_length(tmp_path: Path, order: str) -> None:
+    """Lists of one length are read at once, of several row by row; both before what is wanted, and among it."""
+    name = {"<": "binary_little_endian", ">": "binary_big_endian", "": "ascii"}[order]
+    head = (
+        f"ply\r\nformat {name} 1.0\r\nelement face 2\r\nproperty uchar red\r\nproperty list uchar int vertex_indices\r\nelement vertex 2\r\n"
+        "property double x\r\nproperty list short float more\r\nproperty uchar tag\r\nend_header\r\n"
+    )
+    for more in ([1.5, 2.5], [1.5]), ([], [1.0, 2.0, 3.0]):
+        if order:
+            body = struct.pack(f"{order}BB3iBB4i", 7, 3, 0, 1, 2, 8, 4, 3, 2, 1, 0)
+            body += b"".join(struct.pack(f"{order}dh{len(m)}fB", 1e-300 + i, len(m), *m, 9 + i) for i, m in enumerate(more))
+        else:
+            rows = "\n".join(" ".join(map(str, [1e-300 + i, len(m), *m, 9 + i])) for i, m in enumerate(more))
+            body = f"7 3 0 1 2\n8 4 3 2 1 0\n{rows}\n".encode()
+        path = tmp_path / "a.ply"
+        path.write_bytes(head.encode() + body)
+        found = read_ply(path)
+        assert found.names == ("x", "tag") and found.rows["x"].tolist() == [1e-300, 1.0] and found.rows["tag"].tolist() == [9, 10]
+        with open(path, "rb") as file:
+            both = read_elements(file, path.stat().st_size, path, ("face", "vertex"))
+        corners, numbers = both["face"].lists["vertex_indices"], both["vertex"].lists["more"]
+        assert corners.sizes.tolist() == [3, 4] and corners.values.tolist() == [0, 1, 2, 3, 2, 1, 0]
+        assert numbers.sizes.tolist() == [len(m) for m in more] and numbers.values.tolist() == [*more[0], *more[1]]
+        path.write_bytes((head.encode() + body)[:-3])
+        with pytest.raises(DataError, match=r"2 vertices|vertices are not numbers"):
+            read_ply(path)
+
+
+def test_rows_that_cost_nothing_are_not_counted_through(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    path.write_text("ply\nformat binary_little_endian 1.0\nelement none 999999999999\nelement vertex 1\nproperty uchar x\nend_header\n7")
+    assert read_ply(path).rows["x"].tolist() == [ord("7")]
+
+
 HEAD = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nend_header\n"
 
 
@@ -64,7 +100,10 @@ HEAD = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nend_header\n"
         ("ply\nelement vertex 1\nproperty float x\nend_header\n", "no format"),
         ("ply\nformat ascii 1.0\nend_header\n", "no element vertex"),
         ("ply\nformat ascii 1.0\nelement face 1\nend_header\n", "expected vertex"),
-        (HEAD.format("ascii", 1).replace("float x", "list uchar int x"), "scalar property"),
+        (HEAD.format("ascii", 1).replace("float x", "list uchar x"), "as 'property float x' or 'property list uchar int x'"),
+        (HEAD.format("ascii", 1).replace("float x", "list float int x"), "as 'property float x' or 'property list uchar int x'"),
+        (HEAD.format("ascii", 1).replace("float x", "list uchar int x") + "3 1 2\n", "a list of 3 numbers, in a line of 3"),
+        ("ply\nformat ascii 1.0\nelement a 1\nelement a 1\n", "element a twice"),
         (HEAD.format("ascii", 1).replace("float x", "float x\nproperty float x"), "twice"),
         (HEAD.format("ascii", 1).replace("float", "uchar") + "256\n", "outside its type"),
         (HEAD.format("ascii", 1).replace("float", "uchar") + "nan\n", "outside its type"),

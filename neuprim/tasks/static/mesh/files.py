@@ -16,6 +16,9 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import unquote
 
+import numpy as np
+from numpy.typing import NDArray
+
 from neuprim.core.errors import DataError, nearest
 from neuprim.core.notices import warn_once
 
@@ -26,11 +29,13 @@ __all__ = [
     "MAX_TEXELS",
     "MAX_VERTICES",
     "SUFFIXES",
+    "Faces",
     "Folder",
     "Material",
     "Model",
     "Up",
     "check_counts",
+    "check_vertices",
     "model_file",
 ]
 
@@ -64,14 +69,42 @@ class Material:
         texture: name of the image among :attr:`Model.images`.
         wrap: what happens to texture coordinates beyond 0..1 along u and v: "repeat", "clamp" or "mirror".
         transform: (2, 3) of texture coordinates whose v runs down; None leaves them.
-        cutoff: alpha below which the texture has a hole; None: its alpha means nothing.
+        opacity: what the alpha of the texture and of the vertices is multiplied with.
+        cutoff: alpha below which there is a hole; None: alpha means nothing.
+        blend: whether the file means alpha as translucency, which is not drawn.
+        glow: the light that is emitted, of any strength: its ``colour``, ``texture``, ``wrap`` and ``transform``.
+        unlit: whether the colours are emitted instead of reflected.
     """
 
     colour: tuple[float, float, float] | None = None
     texture: str | None = None
     wrap: tuple[str, str] = ("repeat", "repeat")
     transform: tuple[tuple[float, ...], ...] | None = None
+    opacity: float = 1.0
     cutoff: float | None = None
+    blend: bool = False
+    glow: Material | None = None
+    unlit: bool = False
+
+
+@dataclass(frozen=True)
+class Faces:
+    """Triangles of one material as a file has them.
+
+    Attributes:
+        corners: (F, 3, 3) float64 positions in the file's units and axes.
+        material: its name.
+        normals: (F, 3, 3) of any length, 0 where there is none; None without.
+        colour: (F, 3, 3) or, with alpha, (F, 3, 4), 0..1; None without.
+        uv, glow_uv: (F, 3, 2) coordinates in the texture and in that of the light emitted, v upward; None without.
+    """
+
+    corners: NDArray[np.float64]
+    material: str = ""
+    normals: NDArray[np.float64] | None = None
+    colour: NDArray[np.float32] | None = None
+    uv: NDArray[np.floating] | None = None
+    glow_uv: NDArray[np.floating] | None = None
 
 
 @dataclass(frozen=True)
@@ -80,9 +113,9 @@ class Model:
 
     Attributes:
         path: for messages.
-        kind: what trimesh calls the format of ``data``.
-        data: what trimesh parses.
-        parts: further bytes that it may ask for, by name.
+        kind: the format of ``data``, as trimesh calls it.
+        data: what is parsed.
+        parts: further bytes that trimesh may ask for, by name.
         materials: name -> material. "" is that of surfaces without one.
         images: name -> encoded bytes of the textures.
         upward: "y" or "z", the axis that points up by the format's custom.
@@ -231,3 +264,19 @@ def check_counts(folder: Folder, found: Mapping[str, tuple[int, int]]) -> None:
     for what, (count, most) in found.items():
         if count > most:
             raise DataError(f"{folder.file}: {count} {what}; expected at most {most}")
+
+
+def check_vertices(path: Path, places: NDArray[np.float64], faces: NDArray[np.integer]) -> None:
+    """Refuse faces, of any shape, with vertices that are not among ``places`` (V, 3), or are no finite numbers there.
+
+    Raises:
+        DataError: naming the first of them.
+    """
+    if not faces.size:
+        return
+    low, high = int(faces.min()), int(faces.max())
+    if low < 0 or high >= len(places):
+        raise DataError(f"{path}: a face has the vertex {high if low >= 0 else low} of {len(places)}; expected one that is there")
+    bad = np.flatnonzero(~np.isfinite(places).all(axis=1) & np.isin(np.arange(len(places)), faces))
+    if len(bad):
+        raise DataError(f"{path}: vertex {bad[0]} is at {places[bad[0]].tolist()}; expected finite numbers")

@@ -35,7 +35,7 @@ from neuprim.tasks.static.solids.shading import DAYLIGHT, Daylight, radiance
 
 __all__ = ["GENERATOR_VERSION", "LIGHT", "MeshSettings", "generate", "load"]
 
-GENERATOR_VERSION = 1
+GENERATOR_VERSION = 2
 """Part of the cache's key: to be raised with every change to how models are read, placed, lit or looked at."""
 
 _READERS: dict[str, Callable[[Folder], Model]] = {
@@ -118,5 +118,5 @@ def _colours(scene: Scene, origins: NDArray[np.float64], directions: NDArray[np.
     """What N rays see without any light: (N, 3) linear RGB, zero where nothing is hit, and (N,) bool of hits."""
     hits = scene.intersect(origins, directions)
     image = np.zeros(directions.shape, dtype=np.float32)
-    image[hits.hit] = hits.albedo
+    image[hits.hit] = hits.albedo if hits.emission is None else hits.albedo + hits.emission
     return image, hits.hit

@@ -1,28 +1,39 @@
 """Wavefront OBJ with its material libraries (.mtl).
 
-Of a library, colours (``Kd``) and their textures (``map_Kd``) are read; both are taken for sRGB, and a texture stands in the place of
-the colour, as many exporters write a colour of 0 beside it.
+Of a library, colours (``Kd``), emitted light (``Ke``), their textures and opacity (``d``, else 1 - ``Tr``) are read; colours and textures
+are taken for sRGB, and a texture stands in the place of the colour, as many exporters write a colour of 0 beside it.
 """
 
 from __future__ import annotations
 
 import re
+from array import array
 from dataclasses import replace
 from pathlib import PurePosixPath
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import srgb_to_linear
-from neuprim.tasks.static.mesh.files import MAX_FACES, MAX_PARTS, MAX_VERTICES, Folder, Material, Model, check_counts
+from neuprim.core.notices import warn_once
+from neuprim.tasks.static.mesh.files import MAX_FACES, MAX_PARTS, MAX_VERTICES, Faces, Folder, Material, Model, check_counts, check_vertices
+from neuprim.tasks.static.mesh.polygons import divided
 
-__all__ = ["read_obj"]
+__all__ = ["obj_faces", "read_obj"]
 
 _NUMBERS = {"-mm": 2, "-o": 3, "-s": 3, "-t": 3}
 """Options of a texture that are followed by this many numbers, at most."""
 
 _WORDS = {"-blendu", "-blendv", "-bm", "-boost", "-cc", "-clamp", "-imfchan", "-texres", "-type"}
 """Options that are followed by one word."""
+
+_WIDTHS = {"v": (3, 8), "vt": (1, 3), "vn": (3, 3)}
+"""Numbers of a vertex (x y z, then a colour or a weight), its texture coordinates and its normal: fewest and most that are read."""
+
+_NONE = -1
+"""The index of texture coordinates or a normal that a corner does without."""
 
 
 def read_obj(folder: Folder) -> Model:
@@ -36,50 +47,191 @@ def read_obj(folder: Folder) -> Model:
     check_counts(folder, {**found, "changes of material": (data.count(b"usemtl "), MAX_PARTS)})
     materials: dict[str, Material] = {}
     images: dict[str, bytes] = {}
-    wanted = re.findall(rb"(?m)^\s*mtllib[ \t]+(.+?)\s*$", data)
-    for library in dict.fromkeys(name.decode("utf-8", "replace") for name in wanted):
+    wanted = [line.decode("utf-8", "replace") for line in re.findall(rb"(?m)^\s*mtllib[ \t]+(.+?)\s*$", data)]
+    libraries = [name.strip() for line in wanted for name in re.findall(r"(?i).+?\.mtl(?=\s|$)", line) or [line]]  # names may hold blanks
+    for library in dict.fromkeys(libraries):
         text = folder.optional([library, PurePosixPath(library.replace("\\", "/")).name], "material file")
         if text is not None:
             materials |= _library(text.decode("utf-8", "replace"), folder, images)
-    names = "\n".join(f"newmtl {name}" for name in materials).encode()
-    return Model(folder.file, "obj", data, {"": names}, materials, images, "y", False, folder.digest)
+    return Model(folder.file, "obj", data, {}, materials, images, "y", False, folder.digest)
+
+
+def obj_faces(model: Model) -> tuple[list[Faces], int]:
+    """All triangles, by material, and the number of vertices.
+
+    Raises:
+        DataError: a line that is damaged, a face with a vertex that is not there, or polygons that cross themselves.
+    """
+    text = re.sub(r"\\\r?\n", " ", model.data.decode("utf-8", "replace"))
+    numbers, lengths = {key: array("d") for key in _WIDTHS}, {key: array("q") for key in _WIDTHS}
+    indices, sizes, owners = array("q"), array("q"), array("q")
+    names = {"": 0}
+    material = 0
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        key = words[0] if words else ""
+        if key == "usemtl":
+            material = names.setdefault(" ".join(words[1:]), len(names))
+        if key != "f" and key not in _WIDTHS:
+            continue
+        if "#" in line:
+            words = line.partition("#")[0].split()
+        try:
+            if key in _WIDTHS:
+                if len(words) <= _WIDTHS[key][0]:
+                    raise ValueError(f"{len(words) - 1} numbers, at least {_WIDTHS[key][0]} expected")
+                numbers[key].extend(map(float, words[1:]))
+                lengths[key].append(len(words) - 1)
+            elif len(words) > 3:
+                for word in words[1:]:
+                    for name, value in zip(_WIDTHS, (*word.split("/"), "", "")[:3], strict=True):
+                        index, count = int(value or 0), len(lengths[name])
+                        if (index == 0 and (value or name == "v")) or index < -count:
+                            raise ValueError(f"the index {value or 'missing'} of {count} {name}")
+                        indices.append(index - 1 if index > 0 else count + index if value else _NONE)
+                sizes.append(len(words) - 1)
+                owners.append(material)
+        except (ValueError, OverflowError) as error:
+            said = f"{' '.join(line.split())[:60]!r} ({' '.join(str(error).split())[:80]})"
+            raise DataError(
+                f"{model.path}: line {number} is {said}; expected numbers, or f v/vt/vn ... with vertices that are there"
+            ) from None
+    v, vt, vn = (_table(key, np.array(numbers.pop(key)), np.array(lengths.pop(key))) for key in _WIDTHS)
+    used = np.frombuffer(indices, np.int64).reshape(-1, 3) if indices else np.zeros((0, 3), np.int64)
+    check_vertices(model.path, v[:, :3], used[:, 0])
+    for column, table, what in ((1, vt, "texture coordinates"), (2, vn, "normal")):
+        if len(used) and used[:, column].max() >= len(table):
+            raise DataError(f"{model.path}: a face has the {what} {used[:, column].max() + 1} of {len(table)}; expected one that is there")
+    corners = v[used[:, 0], :3]
+    faces, polygon = divided(model.path, corners, np.frombuffer(sizes, np.int64) if sizes else np.zeros(0, np.int64))
+    owner = np.frombuffer(owners, np.int64)[polygon] if owners else polygon
+    colours = _colours(model, v)
+    found = []
+    for name, index in names.items():
+        mine = used[faces[owner == index]]
+        if len(mine):
+            normals = _looked_up(vn, mine[..., 2], 0.0) if len(vn) else None
+            uv = _looked_up(vt[:, :2], mine[..., 1], np.nan) if (mine[..., 1] != _NONE).any() else None
+            found.append(Faces(v[mine[..., 0], :3], name, normals, None if colours is None else colours[mine[..., 0]], uv, uv))
+    return found, len(v)
+
+
+def _looked_up(table: NDArray[np.float64], index: NDArray[np.int64], missing: float) -> NDArray[np.float64]:
+    return np.where((index == _NONE)[..., None], missing, table[index])
+
+
+def _table(key: str, numbers: NDArray[np.float64], lengths: NDArray[np.integer]) -> NDArray[np.float64]:
+    """(N, 2 or more) NaN where a row has fewer numbers; texture coordinates without v are at 0."""
+    width = min(max(2, int(lengths.max(initial=2))), _WIDTHS[key][1])
+    table = np.full((len(lengths), width), 0.0 if key == "vt" else np.nan)
+    first = np.cumsum(lengths) - lengths
+    for column in range(width):
+        there = lengths > column
+        table[there, column] = numbers[first[there].astype(np.int64) + column]
+    return table
+
+
+def _colours(model: Model, v: NDArray[np.float64]) -> NDArray[np.float32] | None:
+    """(V, 3) colours of vertices, which stand after x y z; None without."""
+    if v.shape[1] < 6:
+        return None
+    found = v[:, 3:6]
+    without = int(np.isnan(found).any(axis=1).sum())
+    if without:
+        warn_once(f"{model.path}: {without} of {len(v)} vertices have no colour; the colours of the others are ignored")
+        return None
+    scale = 255.0 if found.max(initial=0.0) > 2 else 1.0
+    return np.clip(found / scale, 0, 1).astype(np.float32)
 
 
 def _library(text: str, folder: Folder, images: dict[str, bytes]) -> dict[str, Material]:
     found: dict[str, Material] = {}
     name = ""
+    told = set[str]()  # of what d is known, which wins over Tr
     for line in text.splitlines():
-        key, _, rest = line.strip().partition(" ")
-        words = rest.split()
+        key, _, rest = line.strip().replace("\t", " ").partition(" ")
+        key, words = key.lower(), rest.split()
         if key == "newmtl":
             name = " ".join(words)
             found[name] = Material()
-        elif key.lower() == "kd" and name in found and len(words) >= 3:
-            found[name] = replace(found[name], colour=_colour(words, folder, name))
-        elif key.lower() == "map_kd" and name in found and words:
-            image = _file_name(words, rest)
-            spellings = [image, PurePosixPath(image.replace("\\", "/")).name]
-            if image not in images:
-                data = folder.optional(spellings[:1] if spellings[0] == spellings[1] else spellings, "texture")
-                if data is None:
-                    continue
-                images[image] = data
-            found[name] = replace(found[name], texture=image, cutoff=0.5)
-    return {name: replace(m, colour=(1.0, 1.0, 1.0)) if m.texture is not None else m for name, m in found.items()}
+        if name not in found or not words:
+            continue
+        old = found[name]
+        glow = old.glow or Material()
+        if key == "kd" and len(words) >= 3:
+            found[name] = replace(old, colour=_colour(words, folder, name))
+        elif key == "ke" and len(words) >= 3:
+            found[name] = replace(old, glow=replace(glow, colour=_colour(words, folder, name)))
+        elif key in ("map_kd", "map_ke"):
+            image = _texture(words, rest, folder, images)
+            if image is not None and key == "map_kd":
+                found[name] = replace(old, texture=image.texture, wrap=image.wrap, transform=image.transform, cutoff=0.5, blend=True)
+            elif image is not None:
+                found[name] = replace(old, glow=replace(image, colour=glow.colour))
+        elif key == "d" or (key == "tr" and name not in told):
+            value = _number_of(words[-1], folder, name)
+            told |= {name} if key == "d" else set()
+            found[name] = replace(old, opacity=value if key == "d" else 1 - value, cutoff=0.5, blend=True)
+        elif key == "map_d" and _file_name(words, rest)[0] != old.texture:
+            warn_once(f"{folder.file}: map_d of material {name[:40]!r} is not read; drawn as opaque as d and the alpha of map_Kd say")
+    return {name: _textured(material) for name, material in found.items()}
 
 
-def _file_name(words: list[str], rest: str) -> str:
-    """A texture's name without the options before it; it may hold blanks."""
+def _textured(material: Material) -> Material:
+    """Without the colour that a texture stands in the place of, and without emitted light of no strength."""
+    white = (1.0, 1.0, 1.0)
+    glow = material.glow
+    if glow is not None and glow.texture is not None:
+        glow = replace(glow, colour=white)
+    elif glow is not None and not any(glow.colour or ()):
+        glow = None
+    return replace(material, colour=white if material.texture is not None else material.colour, glow=glow)
+
+
+def _texture(words: list[str], rest: str, folder: Folder, images: dict[str, bytes]) -> Material | None:
+    """The texture that a line names, with its place; None where it is missing and that is allowed."""
+    image, options = _file_name(words, rest)
+    spellings = [image, PurePosixPath(image.replace("\\", "/")).name]
+    if image not in images:
+        data = folder.optional(spellings[:1] if spellings[0] == spellings[1] else spellings, "texture")
+        if data is None:
+            return None
+        images[image] = data
+    (su, sv), (ou, ov) = options.get("-s", (1.0, 1.0)), options.get("-o", (0.0, 0.0))
+    moved = (su, sv, ou, ov) != (1.0, 1.0, 0.0, 0.0)
+    wrap = ("clamp", "clamp") if "-clamp" in options else ("repeat", "repeat")
+    # scale and offset are said for a v that runs up
+    return Material(texture=image, wrap=wrap, transform=((su, 0.0, ou), (0.0, sv, 1 - sv - ov)) if moved else None)
+
+
+def _file_name(words: list[str], rest: str) -> tuple[str, dict[str, tuple[float, float]]]:
+    """A texture's name, which may hold blanks, without the options before it; and those of them that move it."""
     place, last = 0, len(words) - 1
+    options: dict[str, tuple[float, float]] = {}
     while place < last and words[place] in {*_NUMBERS, *_WORDS}:
-        numbers, place = _NUMBERS.get(words[place], 0), place + (words[place] in _WORDS) + 1
-        while numbers and place < last and _number(words[place]):
-            numbers, place = numbers - 1, place + 1
-    return rest.strip() if place == 0 else " ".join(words[place:])
+        option, place = words[place], place + 1
+        if option in _WORDS:
+            if option == "-clamp" and words[place].lower() == "on":
+                options[option] = (0.0, 0.0)
+            place += 1
+            continue
+        values: list[float] = []
+        while len(values) < _NUMBERS[option] and place < last and _number(words[place]):
+            values.append(float(words[place]))
+            place += 1
+        default = 1.0 if option == "-s" else 0.0
+        options[option] = ((*values, default, default)[0], (*values, default, default)[1])
+    return rest.strip() if place == 0 else " ".join(words[place:]), options
 
 
 def _number(word: str) -> bool:
-    return re.fullmatch(r"[-+0-9.eE]+", word) is not None
+    return re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", word) is not None
+
+
+def _number_of(word: str, folder: Folder, name: str) -> float:
+    if not _number(word):
+        raise DataError(f"{folder.file}: material {name[:40]!r} has the opacity {word[:20]!r}; expected a number from 0 to 1")
+    return min(max(float(word), 0.0), 1.0)
 
 
 def _colour(words: list[str], folder: Folder, name: str) -> tuple[float, float, float]:

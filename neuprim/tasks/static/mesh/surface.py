@@ -36,6 +36,8 @@ _LAYERS = 64
 _MOST_AROUND = 64
 """Faces around a vertex that are smoothed over; work and memory for a vertex grow with their square."""
 
+_Pool = dict[tuple[str, tuple[str, str]], Texture]
+
 _Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
@@ -92,29 +94,31 @@ class Surface(Scene):
             if not kept.any():
                 raise DataError(f"{found}; expected triangles")
             warn_once(f"{found}; left out")
+        faint = np.concatenate([_faint(part) for part in parts])
+        if not (kept & ~faint).any():
+            raise DataError(f"{model.path}: no face has an opacity of at least 0.5; expected a model that is not all clear (alpha, d, Tr)")
+        kept &= ~faint
         mesh = _mesh(points, faces[kept])
         normals = _smooth(_file_normals(parts, matrix[:3, :3])[kept], across[kept], mesh)
         super().__init__([Solid("mesh", mesh, plain("#ffffff"), 0.0, normals=normals)], engine)
-        self._colour = np.concatenate([part.colour for part in parts])[kept]
-        self._textures, owner = _textures(model, parts)
-        self._texture = np.repeat(owner, [len(part.colour) for part in parts])[kept]
-        self._uv = np.concatenate([np.zeros((len(p.colour), 3, 2), np.float32) if p.uv is None else p.uv for p in parts])[kept]
-        cutoffs = [np.nan if part.material.cutoff is None or part.uv is None else part.material.cutoff for part in parts]
+        pool: _Pool = {}
+        area = double / spacing**2
+        self._base = _Layer(model, parts, kept, area, pool)
+        _say_translucent(model, parts, pool)
+        glows = [p.glow or replace(p, colour=np.zeros_like(p.colour), uv=None, alpha=None) for p in parts]
+        self._glow = _Layer(model, glows, kept, area, pool) if any(p.glow for p in parts) else None
+        cutoffs = [np.nan if p.material.cutoff is None or (p.uv is None and p.alpha is None) else p.material.cutoff for p in parts]
         self._cutoff = np.repeat(np.array(cutoffs, np.float32), [len(part.colour) for part in parts])[kept]
         self._holes = bool((self._cutoff > 0).any())
-        # texels per scene unit: the square root of the area in the texture over that in space, of every face
-        sides = self._uv[:, 1:] - self._uv[:, :1]
-        inside = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
-        texels = np.array([texture.texels for texture in self._textures] + [0], np.float64)
-        self._blur = (spacing * np.sqrt(inside * texels[self._texture] / double[kept])).astype(np.float32)
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
         """As of any scene; normals are those of the side that is seen."""
         hits = super().intersect(origins, directions)
         towards = np.asarray(directions, dtype=np.float32)[hits.hit]
         side = np.where(dot(hits.face, towards) > 0, np.float32(-1), np.float32(1))[:, None]
-        albedo = self._seen(hits.triangle, hits.weight, hits.distance)[:, :3]
-        return replace(hits, normal=side * hits.normal, face=side * hits.face, albedo=albedo)
+        albedo = self._base.seen(hits.triangle, hits.weight, hits.distance)[:, :3]
+        emission = None if self._glow is None else self._glow.seen(hits.triangle, hits.weight, hits.distance)[:, :3]
+        return replace(hits, normal=side * hits.normal, face=side * hits.face, albedo=albedo, emission=emission)
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
         """As of any scene; holes let light through."""
@@ -148,19 +152,72 @@ class Surface(Scene):
         cutoff = self._cutoff[triangle]
         able = np.flatnonzero(cutoff > 0)
         through = np.zeros(len(triangle), dtype=np.bool_)
-        through[able] = self._seen(triangle[able], weight[able], distance[able])[:, 3] < cutoff[able]
+        through[able] = self._base.seen(triangle[able], weight[able], distance[able])[:, 3] < cutoff[able]
         return through
 
-    def _seen(self, triangle: NDArray, weight: NDArray[np.float32], distance: NDArray) -> NDArray[np.float32]:
-        """(M, 4) linear RGB reflectance and the texture's alpha."""
-        found = np.ones((len(triangle), 4), dtype=np.float32)
-        found[:, :3] = np.einsum("nk,nkc->nc", weight, self._colour[triangle])
+
+class _Layer:
+    """Colours of all faces that are drawn: values at their corners, times textures.
+
+    Args:
+        kept: (F,) which faces of the parts are drawn.
+        area: (F,) twice that of a face, in rays at distance 1.
+        pool: textures that are decoded already, by image and wrapping; those of the parts are added.
+    """
+
+    def __init__(self, model: Model, parts: Sequence[Part], kept: NDArray[np.bool_], area: NDArray[np.float64], pool: _Pool) -> None:
+        owner = np.full(len(parts), -1, dtype=np.intp)
+        for i, part in enumerate(parts):
+            name, wrap = part.material.texture, part.material.wrap
+            if part.uv is None or name is None:
+                continue
+            if (name, wrap) not in pool:
+                left = MAX_TEXELS - sum(texture.texels for texture in pool.values())
+                pool[name, wrap] = Texture(decode(model.path, name, model.images[name], left), wrap)
+            owner[i] = list(pool).index((name, wrap))
+        self._textures = list(pool.values())
+        self._texture = np.repeat(owner, [len(part.colour) for part in parts])[kept]
+        self._colour = np.ones((len(kept), 3, 4), np.float32)
+        self._colour[..., :3] = np.concatenate([part.colour for part in parts])
+        self._colour[..., 3] = np.concatenate([np.ones(part.colour.shape[:2]) if part.alpha is None else part.alpha for part in parts])
+        self._colour = self._colour[kept]
+        self._uv = np.concatenate([np.zeros((len(p.colour), 3, 2), np.float32) if p.uv is None else p.uv for p in parts])[kept]
+        # texels per scene unit: the square root of the area in the texture over that in space, of every face
+        sides = self._uv[:, 1:] - self._uv[:, :1]
+        inside = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
+        texels = np.array([texture.texels for texture in self._textures] + [0], np.float64)
+        self._blur = np.sqrt(inside * texels[self._texture] / area[kept]).astype(np.float32)
+
+    def seen(self, triangle: NDArray, weight: NDArray[np.float32], distance: NDArray) -> NDArray[np.float32]:
+        """(M, 4) linear RGB and alpha."""
+        found: NDArray[np.float32] = np.einsum("nk,nkc->nc", weight, self._colour[triangle])
         texture = self._texture[triangle]
         for index in np.unique(texture[texture >= 0]):
             mine = np.flatnonzero(texture == index)
             uv = np.einsum("nk,nkc->nc", weight[mine], self._uv[triangle[mine]])
             found[mine] *= self._textures[index].look_up(uv, self._blur[triangle[mine]] * distance[mine])
         return found
+
+
+def _faint(part: Part) -> NDArray[np.bool_]:
+    """(F,) faces that are holes all over."""
+    if part.alpha is None or part.material.cutoff is None:
+        return np.zeros(len(part.colour), dtype=np.bool_)
+    clear: NDArray[np.bool_] = part.alpha.max(axis=1) < part.material.cutoff
+    return clear
+
+
+def _say_translucent(model: Model, parts: Sequence[Part], pool: _Pool) -> None:
+    """One line for what should show what is behind it: nothing is translucent here."""
+    soft = {key for key, texture in pool.items() if ((texture.levels[0][..., 3] > 0) & (texture.levels[0][..., 3] < 255)).any()}
+    count = 0
+    for part in parts:
+        if part.material.blend and part.uv is not None and (part.material.texture, part.material.wrap) in soft:
+            count += len(part.colour)
+        elif part.material.blend and part.alpha is not None:
+            count += int(((part.alpha > 0) & (part.alpha < 1)).any(axis=1).sum())
+    if count:
+        warn_once(f"{model.path}: {count} faces are translucent; drawn opaque where their opacity is at least 0.5, left out elsewhere")
 
 
 def _mesh(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trimesh:
@@ -186,21 +243,3 @@ def _smooth(given: NDArray[np.float64], across: NDArray[np.float64], mesh: trime
     unit *= np.where(np.einsum("fkc,fc->fk", unit, across) < 0, -1.0, 1.0)[:, :, None]
     usable = np.isfinite(unit).all(axis=2) & (length[..., 0] > 0)
     return unit if usable.all() else np.where(usable[..., None], unit, corner_normals(mesh))
-
-
-def _textures(model: Model, parts: Sequence[Part]) -> tuple[list[Texture], NDArray[np.intp]]:
-    """The textures of all parts, and which of them each part has, -1 for none."""
-    found: dict[tuple[str, tuple[str, str]], int] = {}
-    textures: list[Texture] = []
-    owner = np.full(len(parts), -1, dtype=np.intp)
-    for i, part in enumerate(parts):
-        name = part.material.texture
-        if part.uv is None or name is None:
-            continue
-        key = name, part.material.wrap
-        if key not in found:
-            left = MAX_TEXELS - sum(texture.texels for texture in textures)
-            found[key] = len(textures)
-            textures.append(Texture(decode(model.path, name, model.images[name], left), part.material.wrap))
-        owner[i] = found[key]
-    return textures, owner

@@ -50,6 +50,8 @@ def radiance(scene: Scene, origins: ArrayLike, directions: ArrayLike, light: Day
     lit = unshadowed(scene, hits, np.broadcast_to(to_sun, hits.position.shape), np.inf)
     rgb = reflected(hits, to_eye, to_sun) * (np.array(light.sun, dtype=np.float32) * lit[:, None])
     add_surroundings(rgb, hits, to_eye, light.sky, light.ground)
+    if hits.emission is not None:
+        rgb += hits.emission
     image = np.zeros(d.shape, dtype=np.float32)
     image[hits.hit] = rgb
     return image, hits.hit

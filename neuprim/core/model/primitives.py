@@ -266,6 +266,12 @@ class Primitives:
         except FormError as error:  # of a sum of forms, which knows no field
             raise FormError(f"{method(self.density, 'lower')}: {error}") from error
 
+    def component(self, name: str) -> Primitives:
+        """The part of the extinction that comes from the source grid ``name``: every density times its share. KeyError: there is none."""
+        own = {key: value.detach() for key, value in self.of(self.density).items()}
+        scaled = self.density.scale_density(own, self.density.components(own)[name])
+        return Primitives(self.density, self.colour, {**self.params, **scaled})
+
     def living(self, conditions: Conditions, dtype: torch.dtype | None = None) -> Living:
         """Which primitives live in a frame, and where; differentiable. With ``dtype``, everything is detached and of that type."""
         rows = self.density.alive(self.of(self.density), conditions)

@@ -251,8 +251,10 @@ class Trainer:
     def _bound(self) -> None:
         """No primitive's extinction goes beyond the largest of the data: needles between their voxels would show in other resolutions."""
         largest, model = self.dataset.largest, self.model
+        if largest is None:
+            return
         own = model.of(model.density)
-        found = None if largest is None else model.density.largest(own, model.geometry)
+        found = model.density.largest(own, model.geometry)
         if found is None or not bool((over := found > largest).any()):
             return
         scaled = model.density.scale_density(own, torch.where(over, largest / found, torch.ones_like(found)))

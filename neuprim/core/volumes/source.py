@@ -97,9 +97,9 @@ class Placement:
             raise DataError(f"{where}: header field 'world' is damaged ({error!r})") from None
         matrix = made.scene_from_world
         sound = np.isfinite(matrix).all() and (matrix[3] == (0, 0, 0, 1)).all() and abs(np.linalg.det(matrix)) > 0
-        if not sound or not 0 < made.sigma_per_unit < np.inf or any(
-            len(v) != len(made.numbers) for v in (*made.times.values(), *([made.extents] if made.extents else ()))
-        ):
+        sound = sound and all(0 <= one.largest < np.inf and (one.box is None or np.isfinite(one.box).all()) for one in made.extents)
+        per_frame = [*made.times.values(), *([made.extents] if made.extents else [])]
+        if not sound or not 0 < made.sigma_per_unit < np.inf or any(len(v) != len(made.numbers) for v in per_frame):
             raise DataError(f"{where}: header field 'world' is damaged; expected an invertible affine matrix, and a time per frame")
         return made
 

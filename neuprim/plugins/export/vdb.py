@@ -106,7 +106,9 @@ def _write(job: ExportJob) -> ExportReport:
     if placement is not None and not placement.exact:
         notes.append(f"flames absorb, too: written is the part of the extinction that comes from {what!r} alone")
     if cut != _Cut(0, 0):
-        notes.append(f"{cut.above} voxels were above the source's largest value and are set to it; {cut.outside} outside its bounds are left out")
+        notes.append(
+            f"{cut.above} voxels were above the source's largest value and are set to it; {cut.outside} outside its bounds are left out"
+        )
     where = (
         "the source's own voxels and world"
         if own
@@ -183,8 +185,9 @@ def _origin(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Placemen
         except NeuprimError as error:
             notes.append(f"the source's files cannot be read, so neither their voxels nor errors against them: {error}")
     record = job.run.header.get("world")
-    known = isinstance(record, dict) and "grid" in record
-    kept = Placement.from_json(record, str(job.run.directory / "model.safetensors")) if known else None
+    kept = None
+    if isinstance(record, dict) and "grid" in record:
+        kept = Placement.from_json(record, str(job.run.directory / "model.safetensors"))
     if source is not None and kept is not None and not kept.same(source.placement):
         notes.append("the source's files are not those that the model was fitted to, so neither their voxels nor errors against them")
         source = None

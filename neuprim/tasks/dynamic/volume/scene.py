@@ -114,12 +114,14 @@ def _prepare(
         if not survey.hottest > 0:  # no frame has a flame: what only flames need is left out of everything that follows
             reader = dataclasses.replace(reader, names={m: n for m, n in reader.names.items() if m != "flames"})
         if source == "real":
-            look = dataclasses.replace(look, **{key: v for key, v in _following(look, reader.extinction, survey).items() if key not in asked.optics})
+            look = dataclasses.replace(
+                look, **{key: v for key, v in _following(look, reader.extinction, survey).items() if key not in asked.optics}
+            )
         normalisation, measured = Normalisation.from_bounds(survey.box), survey.extents
         bounds = normalisation.to_scene(survey.box)
     else:
-        look = dataclasses.replace(look, **{key: known["look"][key] for key in FOLLOWING})
-        look = dataclasses.replace(look, flame_range=tuple(look.flame_range))
+        low, high = known["look"]["flame_range"]
+        look = dataclasses.replace(look, **{**{key: known["look"][key] for key in FOLLOWING}, "flame_range": (low, high)})
         reader = dataclasses.replace(reader, names=known["grids"])
         normalisation, bounds = Normalisation.from_json(known["normalisation"]), np.array(known["bounds"])
     train, test = rig(asked.size, asked.cameras, up=asked.up, field_of_view=asked.field_of_view)

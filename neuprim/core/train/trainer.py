@@ -227,7 +227,8 @@ class Trainer:
 
         self.population.observe(model, tally)
         self.optimizer.step(model.params, self.rates())
-        self._bound()
+        if self.dataset.largest is not None:
+            self.model.limit(self.dataset.largest)
         for name, zero in self.zeros.items():
             model.params[name].detach()[zero] = 0
         if self.exposures is not None:
@@ -246,21 +247,6 @@ class Trainer:
         else:
             cost, parts, psnr, name = of_views(step.seen)
         return StepReport(self.step, self.elapsed, cost, parts, psnr, self.count, name, change.text if change else None)
-
-    @torch.no_grad()
-    def _bound(self) -> None:
-        """No primitive's extinction goes beyond the largest of the data: needles between their voxels would show in other resolutions."""
-        largest, model = self.dataset.largest, self.model
-        if largest is None:
-            return
-        own = model.of(model.density)
-        found = model.density.largest(own, model.geometry)
-        if found is None or not bool((over := found > largest).any()):
-            return
-        scaled = model.density.scale_density(own, torch.where(over, largest / found, torch.ones_like(found)))
-        for name, value in scaled.items():
-            if value is not own[name]:
-                own[name].copy_(value)
 
     @property
     def count(self) -> int:

@@ -181,14 +181,14 @@ def medium_of(
 
 
 def _bounds_in(grid: Grid, transform: np.ndarray) -> Bounds | None:
-    """The bounds of a grid's active voxels as indices under another index-to-world map."""
+    """Bounds, under another index-to-world map, of the voxels whose centres lie in the box of a grid's active ones."""
     if grid.bounds is None or _aligned(grid.transform, transform):
         return grid.bounds
-    ends = np.array(grid.bounds, np.float64) + np.array([[-1.0], [0.0]])  # trilinear values reach to the next voxels' centres
+    ends = np.array(grid.bounds, np.float64) - 0.5  # of the voxels' own extent
     corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), -1).reshape(-1, 3)
     chain = np.linalg.inv(transform) @ grid.transform
     index = corners @ chain[:3, :3].T + chain[:3, 3]
-    low, high = np.floor(index.min(0)).astype(int).tolist(), (np.ceil(index.max(0)).astype(int) + 1).tolist()
+    low, high = np.ceil(index.min(0) - 1e-6).astype(int).tolist(), (np.floor(index.max(0) + 1e-6).astype(int) + 1).tolist()
     return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
 

@@ -239,9 +239,11 @@ def _run(args: argparse.Namespace) -> int:
 
 def _eval(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
-    from neuprim.runs.measure import evaluate_run
+    from neuprim.runs.measure import evaluate_run, in_words
 
-    print_metrics(evaluate_run(run_dir, args.lpips, args.words))
+    metrics = evaluate_run(run_dir, args.lpips, args.words)
+    print_metrics(metrics)
+    print(in_words(metrics), file=sys.stderr)
     return 0
 
 

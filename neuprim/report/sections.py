@@ -67,7 +67,7 @@ def heading(run: RunRecord) -> str:
 
 
 def banner(run: RunRecord) -> str:
-    """What is not as it should be: no final metrics, unreadable log lines."""
+    """What is not as it should be: no final metrics, unreadable log lines, views worse than nothing."""
     notes = []
     if not run.finished:
         last = run.last("step")
@@ -80,6 +80,10 @@ def banner(run: RunRecord) -> str:
         notes.append(
             f"{lines} of metrics.jsonl could not be read and {'is' if run.unreadable_lines == 1 else 'are'} left out of the curves."
         )
+    bad = run.field("worse_than_black_image")
+    if isinstance(bad, list) and bad:
+        views = "1 view is" if len(bad) == 1 else f"{count(len(bad))} views are"
+        notes.append(f"<strong>{views} worse than a black image</strong>, which the mean hides: {escape(', '.join(map(str, bad)))}.")
     return "".join(f'<p class="banner" role="status">{note}</p>' for note in notes)
 
 
@@ -134,6 +138,7 @@ def _final_tiles(run: RunRecord) -> list[Tile]:
         ("SSIM", decimal(similarity, 4), "", "" if similarity is None else "mean over views" + _padded(metrics)),
         *_lpips_tile(metrics),
         *_masked_tile(metrics),
+        *_volume_tiles(metrics),
         ("Primitives", count(metrics.get("primitives")), "", ""),
         ("Parameters", count(metrics.get("parameters")), "", "" if each is None else f"{count(each)} per primitive"),
         ("Model size", size, size_unit, ""),
@@ -170,6 +175,20 @@ def _masked_tile(metrics: Mapping[str, object]) -> list[Tile]:
         return []
     note = "where anything ever is" if black is None else f"where anything ever is; a black image: {decimal(black, 1)} dB"
     return [("PSNR inside the mask", decimal(inside, 2), _unit("dB", inside), note)]
+
+
+def _volume_tiles(metrics: Mapping[str, object]) -> list[Tile]:
+    """The largest error of extinctions that are known, over the compared frames."""
+    tiles: list[Tile] = []
+    for key, frames in metrics.items():
+        known = isinstance(frames, list) and key.endswith("_frames") and all(isinstance(frame, Mapping) for frame in frames)
+        errors = [value for frame in frames if (value := from_json(frame, "max_error")) is not None] if known else []  # type: ignore[attr-defined]
+        if errors:
+            what = "extinction" if key == "sigma_frames" else escape(key.removesuffix("_frames"))
+            tiles.append(
+                (f"Largest error of {what}", decimal(100 * max(errors), 0), "%", "of the frame’s largest value, on the files’ voxels")
+            )
+    return tiles
 
 
 def _unit(unit: str, value: float | None) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -27,8 +28,8 @@ _SHOWN_VIEWS = 8  # held-out views in renders/ and the report
 _ORBIT_FRAMES = 36
 
 
-def finish(fitted: Fitted, directory: Path) -> None:
-    """Writes ``metrics.json``, ``renders/`` and the report of a run whose model is on disk in ``directory``."""
+def finish(fitted: Fitted, directory: Path) -> dict[str, Any]:
+    """Writes ``metrics.json``, ``renders/`` and the report of a run whose model is on disk in ``directory``; returns the metrics."""
     config, task, dataset, channels, model = fitted.config, fitted.task, fitted.dataset, fitted.channels, fitted.model
     fitted.unlock()
     count = len(dataset.test)
@@ -68,11 +69,13 @@ def finish(fitted: Fitted, directory: Path) -> None:
             truth = clip.source.pixels(i).over(dataset.background)
             film(clip, i, draw(model, clip.source.view(i), config.renderer, dataset.background), truth)
     size = (directory / "model.safetensors").stat().st_size
-    write_json(directory / "metrics.json", summary(config, model, task, dataset, channels, views, size, fitted.training, fitted.lpips))
+    metrics = summary(config, model, task, dataset, channels, views, size, fitted.training, fitted.lpips)
+    write_json(directory / "metrics.json", metrics)
     views_around = orbit_of(task, dataset, _ORBIT_FRAMES)
     frames = [channels.display(draw(model, v, config.renderer, dataset.background)) for v in views_around]
     images.write_animation(folder / "orbit.webp", frames, fps=12.0)
     write_report(directory, task.conditions, _viewer(fitted, directory))
+    return metrics
 
 
 def _viewer(fitted: Fitted, directory: Path) -> Viewer | None:

@@ -209,6 +209,8 @@ def make_trainer(config: RunConfig, task: TaskSpec, dataset: Dataset, loss: Loss
         DataError: the data set offers no starting point.
         PluginError: the task of another package does not build what the data set needs.
     """
+    if config.train.supervision == "images":  # the model has nothing that only points could teach
+        dataset = replace(dataset, points=None)
     origin = suspects_of(config).task.origin
     with blamed(origin, f"build of task {task.name!r}", config.output_dir / LOGS):
         density, colour = task.build(build_settings(task, config.model, config.options), dataset)

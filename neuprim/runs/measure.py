@@ -10,6 +10,7 @@ weights, are LPIPS as published and as these tools take it.
 
 from __future__ import annotations
 
+import math
 import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +29,7 @@ from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.check import check_dataset, check_pixels
 from neuprim.core.data.rays import NOT_SEEN
 from neuprim.core.io import images
-from neuprim.core.metrics import means, psnr, psnr_gain, ssim, ssim_3dgs, to_json
+from neuprim.core.metrics import from_json, means, psnr, psnr_gain, ssim, ssim_3dgs, to_json
 from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
@@ -41,7 +42,13 @@ from neuprim.runs.operating import read_point
 from neuprim.runs.storage import file_bytes
 from neuprim.version import __version__
 
-__all__ = ["ViewMetrics", "draw", "draw_sum", "evaluate_run", "measure", "quality", "summary"]
+__all__ = ["ViewMetrics", "draw", "draw_sum", "evaluate_run", "in_words", "measure", "quality", "summary"]
+
+_VISIBLE = 20 * math.log10(255)
+"""dB: smaller errors than one of 255 levels are not visible, and an empty frame's black image has no error at all."""
+
+_LISTED = 6
+"""Views that a line names; files name all."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +58,7 @@ class ViewMetrics:
     Attributes:
         psnr, ssim: in the data set's colour space.
         seconds: of the forward pass alone.
+        black: PSNR of an image of the background alone.
         empty: the model is not in the view; the image is the background alone.
         more: further numbers by name: ``psnr_srgb``, ``ssim_srgb`` of linear images, or ``psnr_display``, ``ssim_display`` of what the
             task's own display shows; ``psnr_gain`` of opaque photographs; ``ssim_3dgs``, ``lpips``; ``psnr_mask`` and ``mse_mask`` inside the task's mask; ``psnr_black_image`` and ``psnr_black_image_mask`` of an image without
@@ -61,6 +69,7 @@ class ViewMetrics:
     psnr: float
     ssim: float
     seconds: float
+    black: float = -math.inf
     more: dict[str, float] = field(default_factory=dict)
     empty: bool = False
 
@@ -130,7 +139,9 @@ def measure(
         if pixels.alpha is None:
             more["psnr_gain"] = psnr_gain(rendered, truth, pixels.mask)
         more |= judged(task, dataset, i, rendered, truth)
-        result.append(ViewMetrics(view.name, psnr(rendered, truth, pixels.mask), ssim(rendered, truth), seconds, more, empty))
+        black = psnr(background.to(truth).expand_as(truth), truth, pixels.mask)
+        score = psnr(rendered, truth, pixels.mask)
+        result.append(ViewMetrics(view.name, score, ssim(rendered, truth), seconds, black, more, empty))
         if seen is not None:
             seen(i, view, rendered, truth)
     if all(view.empty for view in result):
@@ -235,6 +246,7 @@ def summary(
         **_lpips(views, lpips),
         **to_json("psnr_worst", worst.psnr),
         "view_worst": worst.name,
+        "worse_than_black_image": [v.name for v in views if v.psnr < min(v.black, _VISIBLE)],
         "per_view": [_entry(v) for v in views],
         **({"views_empty": sum(v.empty for v in views)} if any(v.empty for v in views) else {}),
         **_per_frame(clips_of(task, dataset) if split == "test" else (), views),
@@ -266,6 +278,18 @@ def summary(
         },
         **({} if config.made_by is None else {"made_by": config.made_by.in_words()}),
     }
+
+
+def in_words(metrics: Mapping[str, Any]) -> str:
+    """What a mean hides, in one line: the worst view, and which are worse than an image of the background alone."""
+    worst, bad, count = from_json(metrics, "psnr_worst"), metrics["worse_than_black_image"], len(metrics["per_view"])
+    text = f"PSNR of {count} views: mean {from_json(metrics, 'psnr'):.2f} dB, worst {worst:.2f} dB ({metrics['view_worst']})"
+    if not bad:
+        return text
+    named = ", ".join(bad[:_LISTED]) + (
+        f" and {len(bad) - _LISTED} more, see worse_than_black_image in metrics.json" if len(bad) > _LISTED else ""
+    )
+    return f"{text}; worse than a black image: {len(bad)} of {count} ({named})"
 
 
 def _entry(view: ViewMetrics) -> dict[str, Any]:

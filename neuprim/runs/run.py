@@ -10,9 +10,10 @@ from neuprim.config.launcher import LauncherSettings
 from neuprim.core.train.ranks import ALONE, Alone
 from neuprim.runs.chunks.asked import asked, refuse_chunks
 from neuprim.runs.chunks.train import train_in_chunks
-from neuprim.runs.events import Events, Finishing, silent
+from neuprim.runs.events import Events, Finishing, Note, silent
 from neuprim.runs.finish import finish
 from neuprim.runs.lock import held
+from neuprim.runs.measure import in_words
 from neuprim.runs.open import LOGS
 from neuprim.runs.parts import assemble
 from neuprim.runs.training import Between, alone, train
@@ -54,7 +55,7 @@ def run(
         if ranks.first:
             events(Finishing("measuring held-out views"))
             assemble(fitted, directory)
-            finish(fitted, directory)
+            events(Note(in_words(finish(fitted, directory))))
     if interrupted:
         raise KeyboardInterrupt
     return directory

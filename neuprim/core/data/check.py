@@ -117,14 +117,16 @@ def check_samples(samples: PointSamples, dataset: Dataset) -> None:
         ("points", samples.points, (count, 3)),
         ("sigma", samples.sigma, (count,)),
         ("source", samples.source, (count, dataset.channels)),
+        *((f"component {name}", value, (count,)) for name, (value, _) in samples.components.items()),
     ]
     for name, value, shape in wanted:
         if not (_is(value, torch.float32) and value is not None and tuple(value.shape) == shape) and not (
             name == "source" and value is None
         ):
             _refuse(f"{where} of {samples.name}: {name}", value, torch.float32, shape)
-    for name in ("sigma_scale", "source_scale"):
-        number = getattr(samples, name)
+    scales = {name: getattr(samples, name) for name in ("sigma_scale", "source_scale")}
+    scales |= {f"scale of component {name}": scale for name, (_, scale) in samples.components.items()}
+    for name, number in scales.items():
         if not isinstance(number, (int, float)) or not 0 < number < float("inf"):
             raise DatasetFault(f"{where} of {samples.name}: {name} is {number!r}; expected a positive number")
 

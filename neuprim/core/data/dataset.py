@@ -171,6 +171,7 @@ class Dataset:
         exposure: what the linear values of the files were divided by.
         world: how all these coordinates follow from those of the user's files; the same unless said.
         placement: which voxel files the scene was made from, in the same world; None without such files.
+        largest: the largest extinction anywhere, 1/scene unit, that no primitive goes beyond; None where it is not known.
         points: points at which extinction and source radiance are known, for ``train.supervision=voxels`` and ``both``; None where they
             are not.
         extra: what else the scene's own task likes to know, of the class that this task names, e.g. what pixels show or what the images
@@ -194,6 +195,7 @@ class Dataset:
     exposure: float = 1.0
     world: World = field(default_factory=World)
     placement: Placement | None = None
+    largest: float | None = None
     points: PointSupervision | None = None
     extra: object = None
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -25,6 +26,7 @@ class PointSamples:
         source: (M, C) float32 extinction times source radiance in the data set's colour space, where it is the same towards all directions;
             None where it is not, or not known: then the extinction alone is learned from points.
         sigma_scale, source_scale: typical sizes of both where there is matter, what errors are divided by.
+        components: name -> (M,) float32, the part of ``sigma`` that comes from the source grid of that name, and its typical size.
     """
 
     name: str
@@ -34,10 +36,17 @@ class PointSamples:
     source: Tensor | None
     sigma_scale: float
     source_scale: float = 1.0
+    components: Mapping[str, tuple[Tensor, float]] = field(default_factory=dict)
 
 
 class PointSupervision(ABC):
-    """Points to learn from; a data set's ``points``."""
+    """Points to learn from; a data set's ``points``.
+
+    Attributes:
+        components: names of the source grids whose part of the extinction is known (:attr:`PointSamples.components`).
+    """
+
+    components: tuple[str, ...] = ()
 
     @abstractmethod
     def draw(self, count: int, generator: torch.Generator) -> PointSamples:

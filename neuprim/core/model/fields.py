@@ -197,6 +197,18 @@ class DensityField(Field):
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         """Rows whose density is ``factor`` (rows,) times as large everywhere (a clone in place halves both copies)."""
 
+    def components(self, params: Params) -> dict[str, Tensor]:
+        """Name -> (N,) share, 0..1, of each primitive's extinction that comes from the source grid of that name.
+
+        Only fields fitted to data in which several grids make the extinction have any (:attr:`neuprim.core.data.PointSamples.components`).
+        Images do not depend on them.
+        """
+        return {}
+
+    def largest(self, params: Params, geometry: Geometry) -> Tensor | None:
+        """(N,) upper bound of each primitive's sigma, 1/scene unit, at any point and under any conditions; None where none is known."""
+        return None
+
     def alive(self, params: Params, conditions: Conditions) -> Tensor | None:
         """(M,) int64 ascending rows that can absorb anything under these conditions; None for all of them.
 

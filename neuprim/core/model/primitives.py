@@ -266,6 +266,27 @@ class Primitives:
         except FormError as error:  # of a sum of forms, which knows no field
             raise FormError(f"{method(self.density, 'lower')}: {error}") from error
 
+    def component(self, name: str) -> Primitives:
+        """The part of the extinction that comes from the source grid ``name``: every density times its share. KeyError: there is none."""
+        own = {key: value.detach() for key, value in self.of(self.density).items()}
+        scaled = self.density.scale_density(own, self.density.components(own)[name])
+        return Primitives(self.density, self.colour, {**self.params, **scaled})
+
+    @torch.no_grad()
+    def limit(self, largest: float) -> None:
+        """Scale, in place, every primitive that may have more than this extinction anywhere, so that it has no more.
+
+        The largest extinction of the data is none of a single primitive: needles between their voxels would show at other resolutions.
+        """
+        own = self.of(self.density)
+        found = self.density.largest(own, self.geometry)
+        if found is None or not bool((over := found > largest).any()):
+            return
+        scaled = self.density.scale_density(own, torch.where(over, largest / found, torch.ones_like(found)))
+        for name, value in scaled.items():
+            if value is not own[name]:
+                own[name].copy_(value)
+
     def living(self, conditions: Conditions, dtype: torch.dtype | None = None) -> Living:
         """Which primitives live in a frame, and where; differentiable. With ``dtype``, everything is detached and of that type."""
         rows = self.density.alive(self.of(self.density), conditions)

@@ -17,6 +17,9 @@ from neuprim.core.volumes.points import Shares, values_at
 
 __all__ = ["PointStep", "point_step"]
 
+_COMPONENT = 0.1
+"""Weight of an extinction's components: it teaches the primitives' shares, whose rate does not depend on it, and hardly moves primitives."""
+
 
 @dataclass(frozen=True)
 class PointStep:
@@ -51,7 +54,7 @@ def point_step(
     """Look what the model holds at points, and compare.
 
     The loss is the mean square of errors over their scale: the extinction's, which is the square of its relative L2 error but for how
-    the points are spread, and ``train.voxel_colour`` times the source's.
+    the points are spread, :data:`_COMPONENT` times that of each of its components, and ``train.voxel_colour`` times the source's.
     """
     check_samples(samples, dataset)
     colour = samples.source is not None and settings.voxel_colour > 0
@@ -64,6 +67,11 @@ def point_step(
         light = ((found.source - device.from_host(samples.source, where)) / samples.source_scale).square().mean()
         parts["voxel_source"] = light.item()
         loss = loss + settings.voxel_colour * light
+    for name, (value, scale) in samples.components.items():
+        if name in found.components:
+            part = ((found.components[name] - device.from_host(value, where)) / scale).square().mean()
+            parts[f"voxel_{name}"] = part.item()
+            loss = loss + _COMPONENT * part
     peak = max(float(samples.sigma.max()), 1e-30) / samples.sigma_scale
     psnr = -10 * math.log10(max(parts["voxel_sigma"] / peak**2, 1e-20))
     return PointStep(loss, parts, psnr, samples.name, found.rows, found.watch(wrong.detach().abs()))

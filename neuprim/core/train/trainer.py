@@ -231,6 +231,8 @@ class Trainer:
 
         self.population.observe(model, tally)
         self.optimizer.step(model.params, self.rates())
+        if self.dataset.largest is not None:
+            self.model.limit(self.dataset.largest)
         for name, zero in self.zeros.items():
             model.params[name].detach()[zero] = 0
         if self.exposures is not None:

@@ -72,19 +72,28 @@ class Comparison:
 
 
 def frame_errors(
-    model: Primitives, conditions: Conditions, truth: DensityTruth, frame: int, threads: int = 0, where: torch.device = device.HOST
+    model: Primitives,
+    conditions: Conditions,
+    truth: DensityTruth,
+    frame: int,
+    threads: int = 0,
+    where: torch.device = device.HOST,
+    component: str | None = None,
 ) -> dict[str, float] | None:
     """The model under ``conditions`` against a frame of the truth, see :meth:`Comparison.numbers`; None where there is nothing to compare with.
 
     Args:
         where: the device that computes the model's extinction.
+        component: what is compared is this part of both extinctions, against the truth's own values of it.
     """
     place = truth.points(frame)
     if place is None:
         return None
+    model = model if component is None else model.component(component)
+    part = {} if component is None else {"component": component}
     found = Comparison()
     for matrix, shape in blocks(*place):
-        sigma = truth.grid(frame, matrix, shape).numpy()
+        sigma = truth.grid(frame, matrix, shape, **part).numpy()
         found.add(sigma, density_grid(model, conditions, matrix, shape, threads, where).numpy())
     return found.numbers()
 

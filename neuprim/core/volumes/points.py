@@ -57,6 +57,7 @@ class PointValues(NamedTuple):
     Attributes:
         sigma: (M,) extinction, 1/scene unit.
         source: (M, C) sigma times colour; None for colours that have no part that is the same from all directions.
+        components: name -> (M,) the part of sigma that comes from the source grid of that name.
         rows: (N,) int64 rows of the model that live in the frame, None for all.
         shares: of these primitives; zeros until a backward pass.
     """
@@ -65,6 +66,7 @@ class PointValues(NamedTuple):
     source: Tensor | None
     rows: Tensor | None
     shares: Shares
+    components: dict[str, Tensor]
 
     def watch(self, error: Tensor) -> Shares:
         """Let the backward pass sum up each primitive's part in an ``error`` (M,), which gets no gradient; call it before ``backward()``."""
@@ -85,6 +87,9 @@ def values_at(model: Primitives, conditions: Conditions, points: Tensor, colour:
     """
     living = model.living(conditions)
     colors = _flat_colours(model.colour, living, conditions) if colour else None
+    named = model.density.components(living.own)
+    columns = [*([] if colors is None else [colors]), *(share[:, None] for share in named.values())]  # what sums are weighted by, alike
+    weights = torch.cat(columns, 1) if columns else None
     form = model.density.lower(living.own, living.geometry, conditions)
     shares = Shares(living.geometry.count, living.geometry.means.device)
     places = points.detach().double().cpu().contiguous().numpy()
@@ -92,19 +97,21 @@ def values_at(model: Primitives, conditions: Conditions, points: Tensor, colour:
         if not numbers_finite(living.geometry, form):
             model.check_finite()
             raise NonFiniteError("extinction at points: a product of finite parameters is not finite")
-        sigma, source = _elsewhere(living, form, places, colors, shares)
+        sigma, sums = _elsewhere(living, form, places, weights, shares)
     elif isinstance(form, Cosine):
-        g, shown = living.geometry, torch.zeros(living.geometry.count, 0) if colors is None else colors
+        g, shown = living.geometry, torch.zeros(living.geometry.count, 0) if weights is None else weights
         given = (g.means, g.log_scales, g.quats, form.W1, form.b1, form.w2, form.b2.reshape(-1), shown)
         try:
             whole = _Values.apply(places, form.omega0, form.edge, shares, threads, *given)
         except NonFiniteError:
             model.check_finite()  # names the parameter, if it is one
             raise
-        sigma, source = whole[:, 0], (None if colors is None else whole[:, 1:])
+        sigma, sums = whole[:, 0], (None if weights is None else whole[:, 1:])
     else:
-        sigma, source = _asked(living, places, colors, shares)
-    return PointValues(sigma, source, living.rows, shares)
+        sigma, sums = _asked(living, places, weights, shares)
+    width = 0 if colors is None else colors.shape[1]
+    source = None if colors is None or sums is None else sums[:, :width]
+    return PointValues(sigma, source, living.rows, shares, {} if sums is None else dict(zip(named, sums[:, width:].unbind(1), strict=True)))
 
 
 def _flat_colours(field: ColourField, living: Living, conditions: Conditions) -> Tensor | None:

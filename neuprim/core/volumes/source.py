@@ -6,14 +6,28 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from neuprim.core.errors import DataError
 from neuprim.core.volumes.truth import DensityTruth
 
-__all__ = ["Placement", "VolumeSource"]
+__all__ = ["Extent", "Placement", "VolumeSource"]
+
+
+class Extent(NamedTuple):
+    """What the absorbing grid of a frame holds: its largest value, and the (2, 3) box around its active voxels, world units; None: nothing."""
+
+    largest: float
+    box: np.ndarray | None
+
+    @staticmethod
+    def around(extents: Sequence[Extent]) -> Extent:
+        """That of several frames together."""
+        boxes = [extent.box for extent in extents if extent.box is not None]
+        box = np.stack([np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)]) if boxes else None
+        return Extent(max((extent.largest for extent in extents), default=0.0), box)
 
 
 @dataclass(frozen=True)
@@ -27,6 +41,8 @@ class Placement:
         sigma_per_unit: extinction, 1/scene unit, of a grid value of 1.
         grid: name of the grid that absorbs.
         exact: whether that grid alone makes the extinction; if not, other grids add to it.
+        component: the name of that grid's part of the extinction in models (:meth:`~neuprim.core.model.fields.DensityField.components`).
+        extents: of that grid in every frame; none: not known.
     """
 
     scene_from_world: np.ndarray
@@ -35,6 +51,13 @@ class Placement:
     sigma_per_unit: float
     grid: str
     exact: bool = True
+    component: str = "density"
+    extents: Sequence[Extent] = ()
+
+    def same(self, other: Placement) -> bool:
+        """Whether both mean the same frames, places and values."""
+        a, b = ((p.scene_from_world.tolist(), list(p.numbers), p.sigma_per_unit, p.grid, p.exact) for p in (self, other))
+        return a == b
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers, exact when read back."""
@@ -45,6 +68,8 @@ class Placement:
             "sigma_per_unit": self.sigma_per_unit,
             "grid": self.grid,
             "exact": self.exact,
+            "component": self.component,
+            "extents": [[one.largest, None if one.box is None else one.box.tolist()] for one in self.extents],
         }
 
     @staticmethod
@@ -62,12 +87,19 @@ class Placement:
                 float(record["sigma_per_unit"]),
                 str(record["grid"]),
                 bool(record["exact"]),
+                str(record.get("component", "density")),
+                [
+                    Extent(float(largest), None if box is None else np.array(box, np.float64).reshape(2, 3))
+                    for largest, box in record.get("extents", ())
+                ],
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise DataError(f"{where}: header field 'world' is damaged ({error!r})") from None
         matrix = made.scene_from_world
         sound = np.isfinite(matrix).all() and (matrix[3] == (0, 0, 0, 1)).all() and abs(np.linalg.det(matrix)) > 0
-        if not sound or not 0 < made.sigma_per_unit < np.inf or any(len(v) != len(made.numbers) for v in made.times.values()):
+        sound = sound and all(0 <= one.largest < np.inf and (one.box is None or np.isfinite(one.box).all()) for one in made.extents)
+        per_frame = [*made.times.values(), *([made.extents] if made.extents else [])]
+        if not sound or not 0 < made.sigma_per_unit < np.inf or any(len(v) != len(made.numbers) for v in per_frame):
             raise DataError(f"{where}: header field 'world' is damaged; expected an invertible affine matrix, and a time per frame")
         return made
 

@@ -44,5 +44,9 @@ class DensityTruth(ABC):
         """
 
     @abstractmethod
-    def grid(self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int]) -> Tensor:
-        """(X, Y, Z) float32 extinction of a frame at the points ``scene_from_index @ (i, j, k, 1)``, float64 (4, 4)."""
+    def grid(self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None) -> Tensor:
+        """(X, Y, Z) float32 extinction of a frame at the points ``scene_from_index @ (i, j, k, 1)``, float64 (4, 4).
+
+        Args:
+            component: the part alone that comes from the source grid of this name (:meth:`~neuprim.core.model.fields.DensityField.components`).
+        """

@@ -1,9 +1,11 @@
 """``vdb``: the density as an OpenVDB fog volume, one file per frame for models that change in time; lossy (sampled).
 
 Grid ``density`` is the sum over primitives of their density clamped at 0, at the voxels' centres; what is below ``threshold`` is not
-stored (background 0, inactive). A model that was fitted to .vdb files is written on the voxels and in the units of these files, frame
-by frame, so that both overlay each other; else in the coordinates of the run's data on cubic voxels whose lattice has a corner of its
-index space in the scene's origin, one lattice for all frames. Axes are those of the data; nothing is turned.
+stored (background 0, inactive). Where flames add to the extinction of the source's grid, only that grid's part is written: what absorbs
+because it burns is no density. A model that was fitted to .vdb files is written on the voxels and in the units of these files, frame by
+frame, so that both overlay each other, with no value above the source frame's largest and nothing outside its active voxels; else in the
+coordinates of the run's data on cubic voxels whose lattice has a corner of its index space in the scene's origin, one lattice for all
+frames. Axes are those of the data; nothing is turned.
 
 Units (metadata ``neuprim_units``): ``source``: sigma divided by the extinction per unit of the file's grid, as the scene's look has
 it; ``world``: extinction per world unit of the file, what a volume shader multiplies with a length; ``scene``: extinction per scene
@@ -16,20 +18,23 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from scipy import ndimage
+from torch import Tensor
 
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
 from neuprim.core.io.vdb import Grid, Tiles, read_grid, scale_transform, write_vdb
 from neuprim.core.model.fields import Conditions
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.backends import computing_device
 from neuprim.core.task import API_VERSION
 from neuprim.core.volumes.errors import Comparison, blocks, frame_errors
 from neuprim.core.volumes.grid import density_grid
-from neuprim.core.volumes.source import Placement, VolumeSource
+from neuprim.core.volumes.source import Extent, Placement, VolumeSource
 from neuprim.plugins.export.common import model_box
 
 __all__ = ["EXPORTER", "sampled_grid"]
@@ -58,7 +63,7 @@ class _GridFrame:
 
 def _write(job: ExportJob) -> ExportReport:
     source, placement, notes = _origin(job, job.flag("source"))
-    frames = _frames(job, placement, source)
+    frames = _frames(job, placement)
     paths = _paths(job, frames)
     units = job.choice("units", "auto", "source", "world", "scene")
     if units == "auto":
@@ -74,13 +79,18 @@ def _write(job: ExportJob) -> ExportReport:
     name = str(job.options["name"])
     own = job.number("grid") is None and job.number("voxel_size") is None and source is not None
     fallback = _transform(job, box, scene_from_world, np.zeros(3) if placement else job.run.world.world_from_scene[:3, 3].numpy())
+    model = _component(job, placement)
+    cut = _Cut(0, 0)
     metadata = {"neuprim_units": units, "neuprim_sigma_per_unit": 1 / factor, "neuprim_threshold": threshold}
     errors: dict[str, float] = {}
     for i, (frame, path) in enumerate(zip(frames, paths, strict=True)):
         job.progress("writing frames", i / len(frames))
         transform = source.transform(frame.source) if own and source is not None and frame.source is not None else None
         transform = fallback if transform is None else transform
-        grid = sampled_grid(job, frame.conditions, transform, scene_from_world, name, factor, threshold)
+        grid = sampled_grid(job, model, frame.conditions, transform, scene_from_world, name, factor, threshold)
+        if placement is not None and placement.extents:
+            grid, more_cut = _within(grid, _extent(placement, frame), placement.sigma_per_unit * factor)
+            cut = _Cut(*(a + b for a, b in zip(cut, more_cut, strict=True)))
         more = {f"neuprim_{key}": float(v) for key, v in frame.conditions.items() if v.numel() == 1}
         grid = replace(grid, half=job.flag("half"), metadata={**metadata, **more})
         write_vdb(path, [grid])
@@ -93,8 +103,12 @@ def _write(job: ExportJob) -> ExportReport:
         "scene": "extinction per scene unit",
     }
     notes.append(f"grid {name!r} is {said[units]}: extinction per scene unit = value x {1 / factor:g}; clamped at 0 per primitive")
-    if placement is not None and not placement.exact and units == "source":
-        notes.append(f"the look adds extinction of other grids to {what!r}, so the density holds these too, in the units of {what!r}")
+    if placement is not None and not placement.exact:
+        notes.append(f"flames absorb, too: written is the part of the extinction that comes from {what!r} alone")
+    if cut != _Cut(0, 0):
+        notes.append(
+            f"{cut.above} voxels were above the source's largest value and are set to it; {cut.outside} outside its bounds are left out"
+        )
     where = (
         "the source's own voxels and world"
         if own
@@ -103,10 +117,59 @@ def _write(job: ExportJob) -> ExportReport:
     notes.append(f"on {where}; values below {threshold:.3g} are left out")
     if errors:
         notes.append(
-            "errors: the model's sigma against the files on all their voxels, as in metrics.json; file_*: what was written against them; "
+            f"errors: the model's extinction from {what!r} against the files' own values of that grid, on all their voxels, as in metrics.json; "
+            "file_*: what was written against them; "
             "psnr_active over voxels with matter, max_error as a share of the frame's largest sigma: a proxy with a measured error, no bound"
         )
     return ExportReport(tuple(paths), False, errors, tuple(notes))
+
+
+class _Cut(NamedTuple):
+    """How many voxels were above the source's largest value, and outside its bounds."""
+
+    above: int
+    outside: int
+
+
+def _component(job: ExportJob, placement: Placement | None) -> Primitives:
+    """The model, or its part that comes from the source's grid where other grids absorb, too.
+
+    Raises:
+        ConfigError: the model does not know that part.
+    """
+    model = job.run.model
+    if placement is None or placement.exact:
+        return model
+    if placement.component not in model.density.components(model.params):
+        raise ConfigError(
+            f"{job.run.directory}: flames absorb beside grid {placement.grid!r}, and the model has learned no share of it in its extinction, so "
+            "its density is not known; train again with voxels (train.supervision=both, scene.optics.extinction above 0)"
+        )
+    return model.component(placement.component)
+
+
+def _extent(placement: Placement, frame: _GridFrame) -> Extent:
+    """That of the source's frame, or of all of them for a time between."""
+    return Extent.around(placement.extents) if frame.source is None else placement.extents[frame.source]
+
+
+def _within(grid: Grid, extent: Extent, per_unit: float) -> tuple[Grid, _Cut]:
+    """The grid with no value above the extent's largest and none outside its box; and how many voxels that changed.
+
+    Args:
+        per_unit: what a source value of 1 is in the grid.
+    """
+    if not len(grid.origins):
+        return grid, _Cut(0, 0)
+    offsets = np.stack(np.meshgrid(*(np.arange(8),) * 3, indexing="ij"), -1)
+    centres = (grid.origins[:, None, None, None] + offsets) @ grid.transform[:3, :3].T + grid.transform[:3, 3]
+    inside = np.zeros(grid.masks.shape, bool) if extent.box is None else ((centres >= extent.box[0]) & (centres <= extent.box[1])).all(-1)
+    kept, largest = grid.masks & inside, np.float32(extent.largest * per_unit)
+    above = kept & (grid.values > largest)
+    values = np.where(kept, np.minimum(grid.values, largest), np.float32(0))
+    some = kept.any((1, 2, 3))
+    cut = _Cut(int(above.sum()), int((grid.masks & ~inside).sum()))
+    return replace(grid, origins=grid.origins[some], values=values[some], masks=kept[some]), cut
 
 
 # ---------------------------------------------------------------- which frames, and where
@@ -121,33 +184,36 @@ def _origin(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Placemen
             source = job.run.volume()
         except NeuprimError as error:
             notes.append(f"the source's files cannot be read, so neither their voxels nor errors against them: {error}")
-    if source is not None:
-        return source, source.placement, notes
     record = job.run.header.get("world")
+    kept = None
     if isinstance(record, dict) and "grid" in record:
-        return None, Placement.from_json(record, str(job.run.directory / "model.safetensors")), notes
-    return None, None, notes
+        kept = Placement.from_json(record, str(job.run.directory / "model.safetensors"))
+    if source is not None and kept is not None and not kept.same(source.placement):
+        notes.append("the source's files are not those that the model was fitted to, so neither their voxels nor errors against them")
+        source = None
+    return source, kept if source is None else source.placement, notes
 
 
-def _frames(job: ExportJob, placement: Placement | None, source: VolumeSource | None) -> list[_GridFrame]:
+def _frames(job: ExportJob, placement: Placement | None) -> list[_GridFrame]:
     """Those the user names, else those of the run; a model without conditions has one."""
     if not job.run.task.conditions:
         return [_GridFrame(0, {})]
     if job.conditions or placement is None:
         frames = [_GridFrame(i, c) for i, c in enumerate(job.frames(several=True))]
-        return [_GridFrame(f.number, f.conditions, _same(f.conditions, source)) for f in frames]
-    times = placement.times
-    return [
-        _GridFrame(n, {name: torch.tensor(values[i]) for name, values in times.items()}, i if source is not None else None)
-        for i, n in enumerate(placement.numbers)
-    ]
+        return [_GridFrame(f.number, f.conditions, _same(f.conditions, placement)) for f in frames]
+    return [_GridFrame(n, _conditions(placement, i), i) for i, n in enumerate(placement.numbers)]
 
 
-def _same(conditions: Conditions, source: VolumeSource | None) -> int | None:
+def _conditions(placement: Placement, frame: int) -> dict[str, Tensor]:
+    return {name: torch.tensor(values[frame]) for name, values in placement.times.items()}
+
+
+def _same(conditions: Conditions, placement: Placement | None) -> int | None:
     """The frame of the source with these conditions."""
-    for i in range(len(source.placement.numbers) if source else 0):
-        assert source is not None
-        known = source.frames[i].conditions
+    if placement is None:
+        return None
+    for i in range(len(placement.numbers)):
+        known = _conditions(placement, i)
         if known.keys() == conditions.keys() and all(torch.allclose(known[k].float(), v.float(), atol=1e-6) for k, v in conditions.items()):
             return i
     return None
@@ -181,7 +247,14 @@ def _transform(job: ExportJob, box: np.ndarray, scene_from_world: np.ndarray, or
 
 
 def sampled_grid(
-    job: ExportJob, conditions: Conditions, transform: np.ndarray, scene_from_world: np.ndarray, name: str, factor: float, threshold: float
+    job: ExportJob,
+    model: Primitives,
+    conditions: Conditions,
+    transform: np.ndarray,
+    scene_from_world: np.ndarray,
+    name: str,
+    factor: float,
+    threshold: float,
 ) -> Grid:
     """The model's extinction x ``factor`` on voxels of a world, slab by slab; dense memory is that of one slab.
 
@@ -207,7 +280,7 @@ def sampled_grid(
     size = last - first
     if math.prod(size.tolist()) > _MOST_VOXELS:
         raise ConfigError(f"{' x '.join(map(str, size))} voxels around the model; expected at most {_MOST_VOXELS:.0e} (voxel_size, grid)")
-    parts = [g for g in _slabs(job, conditions, scene_from_index, first, size, name, factor, threshold) if len(g.origins)]
+    parts = [g for g in _slabs(job, model, conditions, scene_from_index, first, size, name, factor, threshold) if len(g.origins)]
     leaves = (
         np.concatenate([g.origins for g in parts]) if parts else np.zeros((0, 3), np.int32),
         np.concatenate([g.values for g in parts]) if parts else np.zeros((0, 8, 8, 8), np.float32),
@@ -218,6 +291,7 @@ def sampled_grid(
 
 def _slabs(
     job: ExportJob,
+    model: Primitives,
     conditions: Conditions,
     scene_from_index: np.ndarray,
     first: np.ndarray,
@@ -237,7 +311,7 @@ def _slabs(
             shape = (min(planes, int(size[0]) - x), min(rows, int(size[1]) - y), int(size[2]))
             shifted = scene_from_index.copy()
             shifted[:3, 3] += shifted[:3, :3] @ corner
-            sigma = density_grid(job.run.model, conditions, torch.from_numpy(shifted), shape, settings.threads, where).numpy()
+            sigma = density_grid(model, conditions, torch.from_numpy(shifted), shape, settings.threads, where).numpy()
             values = sigma * np.float32(factor)
             values[values < threshold] = 0.0
             yield Grid.from_dense(name, values, lower=corner.tolist())
@@ -249,12 +323,14 @@ def _errors(
     """The model and the written file, each against the source on the source's own voxels, as ``metrics.json`` has it."""
     assert frame.source is not None
     settings = job.run.settings
-    model = frame_errors(job.run.model, frame.conditions, source, frame.source, settings.threads, computing_device(settings))
+    component = None if source.placement.exact else source.placement.component
+    part: dict[str, str] = {} if component is None else {"component": component}
+    found = frame_errors(job.run.model, frame.conditions, source, frame.source, settings.threads, computing_device(settings), **part)
     place = source.points(frame.source)
-    if model is None or place is None:
+    if found is None or place is None:
         return {}
     name = f"frame_{source.placement.numbers[frame.source]:04d}"
-    result = {f"{name}.{key}": value for key, value in model.items()}
+    result = {f"{name}.{key}": value for key, value in found.items()}
     grid, written = read_grid(path, str(job.options["name"])), Comparison()
     if grid.bounds is None:
         return result
@@ -262,8 +338,8 @@ def _errors(
     for matrix, shape in blocks(*place):
         chain = np.linalg.inv(scene_from_world @ grid.transform) @ matrix.numpy()
         offset = chain[:3, 3] - np.array(grid.bounds[0])
-        found = ndimage.affine_transform(dense, chain[:3, :3], offset, shape, order=1, mode="grid-constant") / factor
-        written.add(source.grid(frame.source, matrix, shape).numpy(), found)
+        values = ndimage.affine_transform(dense, chain[:3, :3], offset, shape, order=1, mode="grid-constant") / factor
+        written.add(source.grid(frame.source, matrix, shape, **part).numpy(), values)
     numbers = written.numbers()
     assert numbers is not None
     return result | {f"{name}.file_{key}": value for key, value in numbers.items()}

@@ -121,7 +121,7 @@ class SceneUnits(DensityTruth):
         source = self._read(self._files[frame])
         return None if source.bounds is None else voxels_within(self.bounds, self._placed(source))
 
-    def grid(self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int]) -> Tensor:
+    def grid(self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None) -> Tensor:
         source = self._read(self._files[frame])
         if source.bounds is None:
             return torch.zeros(shape)

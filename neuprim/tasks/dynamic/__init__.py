@@ -37,8 +37,8 @@ def _check(model: Mapping[str, Any]) -> None:
         raise ConfigError(f"model.colour: {error}") from error
 
 
-def _density(model: Mapping[str, Any]) -> TimeDensity:
-    return TimeDensity(model["neurons"], **model["density"])
+def _density(model: Mapping[str, Any], components: tuple[str, ...] = ()) -> TimeDensity:
+    return TimeDensity(model["neurons"], **model["density"], components=components)
 
 
 def _trade(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
@@ -48,7 +48,8 @@ def _trade(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
 
 
 def _build(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
-    return _density(model), TimeHarmonics(model["sh_degree"], dataset.channels, model["sh_every"], **model["colour"])
+    components = () if dataset.points is None else dataset.points.components
+    return _density(model, components), TimeHarmonics(model["sh_degree"], dataset.channels, model["sh_every"], **model["colour"])
 
 
 # Loaders are imported when used: each pulls in modules of its own.

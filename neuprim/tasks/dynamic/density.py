@@ -11,6 +11,9 @@ xi is time over the sequence, 0..1. Primitives outside their window are left out
 
 A model joined from chunks of a sequence has seams between them, and for every primitive the chunk that it was fitted in, a number that is not
 learned: what it lives of its own accord counts within its chunk alone, and is faded over at the seams (:mod:`neuprim.tasks.dynamic.seams`).
+
+Where several grids make the extinction (smoke and flames), each of ``components`` adds one parameter, share_NAME: the primitive's share of
+that grid, as a logit.
 """
 
 from __future__ import annotations
@@ -42,6 +45,7 @@ PARTS = ("phase", "offset", "window", "motion")
 
 OFFSET_TERMS = 4
 _MOTION = ("velocity", "acceleration")
+_SHARE = "share_"
 
 
 def time_of(conditions: Conditions) -> Tensor:
@@ -63,6 +67,7 @@ class TimeDensity(DensityField):
 
     Args:
         seams: (from, to) of the times over which one chunk of the sequence hands over to the next, ascending; none: the model is of one piece.
+        components: names of the source grids whose share of the extinction each primitive keeps.
     """
 
     init_settings = (*CosineDensity.init_settings, "window", "window_frames", "rate")
@@ -76,6 +81,7 @@ class TimeDensity(DensityField):
         edge: int = 0,
         gain: bool = False,
         seams: Sequence[Sequence[float]] = (),
+        components: Sequence[str] = (),
     ) -> None:
         parts = time.split("+") if isinstance(time, str) and time != "none" else []
         if not isinstance(time, str) or any(p not in PARTS for p in parts) or len(set(parts)) != len(parts):
@@ -84,14 +90,18 @@ class TimeDensity(DensityField):
         self.exact_split = self.static.exact_split
         self.time, self.parts = "+".join(p for p in PARTS if p in parts) or "none", frozenset(parts)
         self.seams = checked_seams(seams)
+        if isinstance(components, str) or not all(isinstance(name, str) and name.isidentifier() for name in components):
+            raise ValueError(f"components {components!r}; expected a list of names")
+        self.named = tuple(components)
 
     def settings(self) -> dict[str, Any]:
         joined = {"seams": [list(seam) for seam in self.seams]} if self.seams else {}
-        return {**self.static.settings(), "time": self.time, **joined}
+        named = {"components": list(self.named)} if self.named else {}
+        return {**self.static.settings(), "time": self.time, **joined, **named}
 
     @classmethod
     def every_parameter(cls) -> list[ParameterSpec]:
-        return cls(time="+".join(PARTS), gain=True, seams=[(0.0, 1.0)]).parameters()
+        return cls(time="+".join(PARTS), gain=True, seams=[(0.0, 1.0)], components=("density", "temperature")).parameters()
 
     def parameters(self) -> list[ParameterSpec]:
         K = self.static.neurons
@@ -107,7 +117,17 @@ class TimeDensity(DensityField):
             specs += [ParameterSpec(name, (3,), 1e-2, _zeros(3), lr_unit="extent") for name in _MOTION]
         if self.seams:
             specs.append(ParameterSpec("chunk", (1,), 0.0, _zeros(1)))
+        specs += [ParameterSpec(_SHARE + name, (1,), 0.3, _zeros(1)) for name in self.named]
         return specs
+
+    def components(self, params: Params) -> dict[str, Tensor]:
+        return {name: params[_SHARE + name].sigmoid().reshape(-1) for name in self.named}
+
+    def largest(self, params: Params, geometry: Geometry) -> Tensor:
+        own = dict(params)
+        if "offset" in self.parts:
+            own["b2"] = params["b2"] + (params["offset_cos"].abs() + params["offset_sin"].abs()).sum(1, keepdim=True)
+        return self.static.largest(own, geometry)
 
     # ------------------------------------------------------------ one frame
 

@@ -162,7 +162,7 @@ def test_every_variant_runs(files: Path, tmp_path: Path, time: str) -> None:
         files, tmp_path / "run", "train.iterations=5", f"model.density.time={time}", "model.colour.powers=4", "model.colour.waves=4"
     )
     named = time if time != "window+phase" else "phase+window"
-    assert load_run(folder)[2].density.settings() == {"neurons": 2, "edge": 2, "gain": True, "time": named}
+    assert load_run(folder)[2].density.settings() == {"neurons": 2, "edge": 2, "gain": True, "time": named, "components": ["density"]}
 
 
 def test_the_papers_preset_runs(files: Path, tmp_path: Path) -> None:
@@ -180,8 +180,9 @@ def test_the_preset_of_the_equations_is_the_papers_form_at_the_bytes_of_quick(fi
     assert (train, equations.renderer) == (quick.train, quick.renderer), "the budget and the rates are those of quick"
     words = ["preset=equations", "train.iterations=20", "train.population.every=5", "train.population.start=0", "model.neurons=8"]
     model = load_run(fit(files, tmp_path / "run", *words))[2]
-    assert model.parameters_per_primitive == 143 and bool(model.params["W_t"].any()) and bool(model.params["time_sin"].any())
-    fields = TASK.build(vars(quick.model), sequences.dataset(files, tmp_path))
+    assert model.parameters_per_primitive == 143 + 1 and bool(model.params["W_t"].any()) and bool(model.params["time_sin"].any())
+    data = dataclasses.replace(sequences.dataset(files, tmp_path), points=None)  # the form alone, without shares of components
+    fields = TASK.build(vars(quick.model), data)
     numbers = 10 + sum(spec.size for field in fields for spec in field.parameters())
     assert abs(143 * equations.model.primitives - numbers * quick.model.primitives) <= 143 / 2
 

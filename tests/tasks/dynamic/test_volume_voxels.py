@@ -140,7 +140,7 @@ def test_it_learns_the_voxels_better_than_images_alone(files: Path, supervision:
     for kind in ("images", supervision):
         results[kind] = fit(compose(words(files, *budget, f"train.supervision={kind}"), check_output=False)).metrics()
     images, voxels = results["images"], results[supervision]
-    assert voxels["sigma_relative_l2_middle"] < 0.6 * images["sigma_relative_l2_middle"]
+    assert voxels["sigma_relative_l2_middle"] < (0.6 if supervision == "voxels" else 0.9) * images["sigma_relative_l2_middle"]
     assert voxels["psnr_mask"] > voxels["psnr_black_image_mask"] + (2 if supervision == "voxels" else 4)
 
 
@@ -174,8 +174,8 @@ def test_the_preset_quick_learns_from_both_where_there_are_voxels(files: Path, t
     found = start(compose(words, check_output=False)).trainer
     every = found.settings.voxels_every
     assert {"voxel_sigma", "voxel_source"} <= [found.train_step().parts.keys() for _ in range(every)][-1]
-    assert found.model.density.settings() == {"neurons": 0, "edge": 2, "gain": True, "time": "window+motion"}
-    assert found.model.parameters_per_primitive == 23
+    assert found.model.density.settings() == {"neurons": 0, "edge": 2, "gain": True, "time": "window+motion", "components": ["density"]}
+    assert found.model.parameters_per_primitive == 23 + 1
 
 
 def test_auto_is_images_where_there_are_no_voxels() -> None:

@@ -182,20 +182,21 @@ class Grid:
         world = corners @ self.transform[:3, :3].T + self.transform[:3, 3]
         return np.stack([world.min(0), world.max(0)])
 
-    def _active_values(self) -> np.ndarray:
+    def active_values(self) -> np.ndarray:
+        """(M,) or (M, 3) float32 of active leaf voxels, and one for each active tile."""
         return np.concatenate([self.values[self.masks], self.tiles.values[self.tiles.active]])
 
     @cached_property
     def range(self) -> tuple[float, float] | None:
         """Least and greatest finite number among active values (of all channels); None if there is none."""
-        values = self._active_values()
+        values = self.active_values()
         values = values[np.isfinite(values)]
         return (float(values.min()), float(values.max())) if values.size else None
 
     @cached_property
     def non_finite(self) -> int:
         """How many active leaf voxels and active tiles hold a NaN or an infinite number."""
-        bad = ~np.isfinite(self._active_values())
+        bad = ~np.isfinite(self.active_values())
         return int(np.count_nonzero(bad.any(-1) if self.channels == 3 else bad))
 
     @property

@@ -126,6 +126,10 @@ class CosineDensity(DensityField):
     def script(self) -> str:
         return script_beside(__package__, "cosine.js")
 
+    def largest(self, params: Params, geometry: Geometry) -> Tensor:
+        w2, b2 = amplified(params["w2"], params["b2"], params.get("log_gain"))
+        return (b2.reshape(-1) + w2.abs().sum(1)).clamp_min(0) / geometry.length_scale
+
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         return {**params, "w2": params["w2"] * factor[:, None], "b2": params["b2"] * factor[:, None]}
 

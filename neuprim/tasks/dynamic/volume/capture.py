@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io import images
 from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
+from neuprim.core.volumes.source import Extent
 from neuprim.tasks.dynamic.volume.grids import GridReader
 from neuprim.tasks.dynamic.volume.march import integrate
 from neuprim.tasks.dynamic.volume.medium import Medium
@@ -31,7 +32,7 @@ from neuprim.tasks.dynamic.volume.optics import Look, medium_of
 
 __all__ = ["LAST", "POINTS", "RENDERER_VERSION", "Capture"]
 
-RENDERER_VERSION = 1
+RENDERER_VERSION = 2
 """Part of the cache's key: to be raised with every change to the march, the optics, the rig or the files' layout."""
 
 POINTS = 8192
@@ -54,6 +55,7 @@ class Capture:
         bounds: (2, 3) box around all matter, scene units.
         device: what renders them. A card's images have a folder of their own, as they differ in their last bits.
         ends: numbers whose times are 0 and 1; None: the first and the last frame's.
+        measured: number of a frame -> what its extinction grid holds; empty where nobody needs to know.
     """
 
     frames: Sequence[VdbFrame]
@@ -65,6 +67,12 @@ class Capture:
     bounds: np.ndarray
     device: torch.device = hardware.HOST
     ends: tuple[int, int] | None = None
+    measured: Mapping[int, Extent] = field(default_factory=dict)
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """The extinction grid's meaning where flames add to its extinction, so that its own part is kept apart; else none."""
+        return (self.reader.extinction,) if self.look.mixes(self.reader.names) else ()
 
     @property
     def clock(self) -> tuple[int, int]:
@@ -89,9 +97,9 @@ class Capture:
         return hashlib.sha256(json.dumps(parts, default=_plain).encode()).hexdigest()[:16]
 
     def medium(self, frame: VdbFrame) -> Medium:
-        """What a frame's file holds, as extinction and radiance; nothing where it lacks the grid that absorbs in the others."""
+        """What a frame's file holds, as extinction and radiance; nothing where it lacks the grids that absorb in the others."""
         grids = self.reader.read(frame.path)
-        if self.reader.extinction not in grids:
+        if self.reader.extinction not in grids and not (self.components and self.look.flame_grid in grids):
             return Medium.nothing()
         try:
             return medium_of(grids, replace(self.look, extinction_grids=(self.reader.extinction,)), self.normalisation, where=self.device)
@@ -108,7 +116,8 @@ class Capture:
         return store.fetch(f"{self.name(frame)}/cam_{camera:02d}.exr", pixels * 4 * 4 + 2**16)
 
     def points(self, store: Store, frame: VdbFrame) -> Path:
-        """File of a frame's points: means (M, 3) scene units, colors (M, 3) linear radiance, weight (), the frame's total extinction."""
+        """File of a frame's points: means (M, 3) scene units, colors (M, 3) linear radiance, weight (), the frame's total extinction, and
+        largest (), its largest."""
         return store.fetch(f"{self.name(frame)}/{LAST}", _POINTS_BYTES)
 
     def describe(self) -> dict[str, Any]:
@@ -143,7 +152,8 @@ class Capture:
                 )
             brightest = max(brightest, peak)
             images.write_exr(folder / f"cam_{c:02d}.exr", rgba, half=True)
-        np.savez(folder / LAST, brightest=np.float32(brightest), **_points(medium, frame.number))
+        largest = medium.values[..., 0].max(initial=0.0)
+        np.savez(folder / LAST, brightest=np.float32(brightest), largest=np.float32(largest), **_points(medium, frame.number))
 
 
 def _points(medium: Medium, seed: int) -> dict[str, Any]:

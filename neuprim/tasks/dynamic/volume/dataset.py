@@ -171,7 +171,8 @@ def volume_dataset(
     Raises:
         DataError: every frame is black, or a file is damaged.
     """
-    exposure = max(float(stored_points(capture.points(folder, frame), "brightest")["brightest"]) for frame in capture.frames)
+    stored = [stored_points(capture.points(folder, frame), "brightest", "largest") for frame in capture.frames]
+    exposure = max(float(frame["brightest"]) for frame in stored)
     if not exposure > 0:
         raise DataError(f"{name}: every frame is black from every camera; expected light (check scene.look and scene.grids)")
     if span is not None:
@@ -199,6 +200,7 @@ def volume_dataset(
         exposure=exposure,
         world=World(torch.from_numpy(capture.normalisation.matrix())),
         placement=placement_of(capture),
+        largest=max(float(frame["largest"]) for frame in stored),
         points=FrameVoxels(capture, folder, train.frames, train.times, weights[::every], exposure, memory * _VOXELS),
         extra=recording,
     )
@@ -209,6 +211,7 @@ _POINTS = {
     "colors": (np.float32, (None, 3)),
     "weight": (np.float64, ()),
     "brightest": (np.float32, ()),
+    "largest": (np.float32, ()),
 }
 
 

@@ -31,11 +31,13 @@ class Medium:
             it ends; :meth:`padded` adds that layer. No voxels at all is an empty medium.
         scene_from_index: (4, 4) float64, affine and invertible: the centre of voxel (i, j, k) is at it @ (i, j, k, 1).
         non_finite: how many voxels of the source were NaN or infinite and count as 0.
+        scattering: (X, Y, Z) float32, the part of σ that the extinction grid makes, where flames add to it; None where all of it is that part.
     """
 
     values: np.ndarray
     scene_from_index: np.ndarray
     non_finite: int = 0
+    scattering: np.ndarray | None = None
     _elsewhere: dict[torch.device, tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -55,13 +57,16 @@ class Medium:
             raise DataError("medium: the outermost voxels are not zero; Medium.padded adds a layer that is")
 
     @staticmethod
-    def padded(values: np.ndarray, scene_from_index: np.ndarray, non_finite: int = 0) -> Medium:
+    def padded(
+        values: np.ndarray, scene_from_index: np.ndarray, non_finite: int = 0, scattering: np.ndarray | None = None
+    ) -> Medium:
         """The medium of (X, Y, Z, 4) ``values`` inside one layer of empty voxels; ``scene_from_index`` is of ``values``."""
         shift = np.eye(4)
         shift[:3, 3] = -1.0
         around = np.zeros((*(n + 2 for n in values.shape[:3]), 4), np.float32)
         around[1:-1, 1:-1, 1:-1] = values
-        return Medium(around, np.asarray(scene_from_index, np.float64) @ shift, non_finite)
+        own = None if scattering is None else np.pad(scattering, 1)
+        return Medium(around, np.asarray(scene_from_index, np.float64) @ shift, non_finite, own)
 
     @staticmethod
     def nothing() -> Medium:

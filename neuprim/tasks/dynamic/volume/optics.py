@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -22,7 +22,7 @@ from neuprim.tasks.dynamic.volume.rig import AXES
 from neuprim.tasks.dynamic.volume.settings import GRIDS, Axis, Meaning
 from neuprim.tasks.dynamic.volume.transmittance import transmittance
 
-__all__ = ["Light", "Look", "medium_of"]
+__all__ = ["FOLLOWING", "Light", "Look", "medium_of"]
 
 NotNegative = Annotated[float, Range(at_least=0)]
 RGB = Annotated[tuple[NotNegative, NotNegative, NotNegative], Accepts(lambda colour: True, "three numbers of at least 0, as [1, 0.5, 0]")]
@@ -35,6 +35,9 @@ Direction = Annotated[tuple[Coordinate, Coordinate, Coordinate], Accepts(any, "t
 def _absorbing(names: tuple[str, ...]) -> bool:
     return bool(names) and set(names) <= set(GRIDS)
 
+
+FOLLOWING = ("extinction", "flame_extinction", "flame_range")
+"""Settings of a look that follow the values of given files, unless the user sets them."""
 
 _STEPS = 1024
 """Entries of the table of black bodies over a look's range of temperatures; linear between them."""
@@ -118,6 +121,10 @@ class Look:
         """Names of all grids that the look reads where a file has them."""
         return tuple(dict.fromkeys(n for n in (*self.extinction_grids, self.flame_grid, self.color_grid) if n))
 
+    def mixes(self, names: Container[str]) -> bool:
+        """Whether two grids of ``names`` make the extinction: flames add to that of the extinction grid."""
+        return self.extinction > 0 and self.flame_extinction > 0 and self.flame_grid in names
+
     def turned(self, up: Axis) -> Look:
         """The same look for sequences whose up axis is ``up``; the light turns along."""
         if up == self.up or up not in AXES or self.light is None:
@@ -132,7 +139,7 @@ def medium_of(
     """The medium of one frame on the voxels of its extinction grid.
 
     Other grids are sampled at those voxels' centres: as they are where their transform is the same, trilinearly where not.
-    An empty frame gives an empty medium. :attr:`Medium.non_finite` counts the NaN and infinite voxels of all grids that were used.
+    Where flames absorb, the medium reaches to all of them. An empty frame gives an empty medium. :attr:`Medium.non_finite` counts the NaN and infinite voxels of all grids that were used.
 
     Args:
         grids: by name; those that the look does not name are ignored.
@@ -141,14 +148,16 @@ def medium_of(
     Raises:
         DataError: none of the extinction grids is there, one has the wrong number of channels, or the box is too large.
     """
+    flames = grids.get(look.flame_grid) if look.emission > 0.0 or look.flame_extinction > 0.0 else None
     base = next((grids[name] for name in look.extinction_grids if name in grids), None)
+    if base is None and flames is not None and look.flame_extinction > 0.0:  # flames absorb by themselves
+        base = Grid.from_dense(look.extinction_grids[0], np.zeros((0, 0, 0), np.float32), transform=flames.transform)
     if base is None:
         wanted = " or ".join(repr(n) for n in look.extinction_grids)
         raise DataError(f"no grid {wanted} to take the extinction from{nearest(look.extinction_grids[0], grids)}")
-    flames = grids.get(look.flame_grid) if look.emission > 0.0 or look.flame_extinction > 0.0 else None
     box = base.bounds
-    if flames is not None and look.flame_extinction > 0.0 and _aligned(flames.transform, base.transform):
-        box = _union(box, flames.bounds)
+    if flames is not None and look.flame_extinction > 0.0:
+        box = _union(box, _bounds_in(flames, base.transform))
     if box is None:
         return Medium.nothing()
     density, bad = _scalars(base, base.transform, box)
@@ -168,7 +177,19 @@ def medium_of(
     values[..., 1:] = sigma_s[..., None] * (albedo * arriving)
     if flame is not None and look.emission > 0.0:
         values[..., 1:] += sigma[..., None] * _glow(flame, look)
-    return Medium.padded(values, scene_from_index, bad + more)
+    return Medium.padded(values, scene_from_index, bad + more, sigma_s if look.mixes(grids) else None)
+
+
+def _bounds_in(grid: Grid, transform: np.ndarray) -> Bounds | None:
+    """Bounds, under another index-to-world map, of the voxels whose centres lie in the box of a grid's active ones."""
+    if grid.bounds is None or _aligned(grid.transform, transform):
+        return grid.bounds
+    ends = np.array(grid.bounds, np.float64) - 0.5  # of the voxels' own extent
+    corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), -1).reshape(-1, 3)
+    chain = np.linalg.inv(transform) @ grid.transform
+    index = corners @ chain[:3, :3].T + chain[:3, 3]
+    low, high = np.ceil(index.min(0) - 1e-6).astype(int).tolist(), (np.floor(index.max(0) + 1e-6).astype(int) + 1).tolist()
+    return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
 
 def _union(a: Bounds | None, b: Bounds | None) -> Bounds | None:

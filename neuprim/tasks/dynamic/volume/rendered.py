@@ -12,6 +12,7 @@ from neuprim.core.io.files import write_json
 from neuprim.core.io.store import Store
 from neuprim.core.notices import warn_once
 from neuprim.tasks.dynamic.volume.capture import LAST, Capture
+from neuprim.tasks.dynamic.volume.optics import FOLLOWING
 
 __all__ = ["RenderedFrames"]
 
@@ -39,7 +40,8 @@ class RenderedFrames(GroundTruth):
         self.known = {
             "normalisation": capture.normalisation.to_json(),
             "bounds": capture.bounds.tolist(),
-            "flame_range": list(capture.look.flame_range),
+            "look": {key: getattr(capture.look, key) for key in FOLLOWING},
+            "grids": dict(capture.reader.names),
         }
         self._root = store
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,7 +18,9 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.object_store import store_at
 from neuprim.core.io.store import LocalStore
 from neuprim.core.io.vdb import VdbFrame, sequence
+from neuprim.core.notices import warn_once
 from neuprim.core.task import Chunks, SceneContext
+from neuprim.core.volumes.source import Extent
 from neuprim.tasks.dynamic.simulation import simulate
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.chunks import number_of_chunks, planned
@@ -25,7 +28,7 @@ from neuprim.tasks.dynamic.volume.dataset import TRAINING, stored_points, volume
 from neuprim.tasks.dynamic.volume.grids import GridReader, find_grids
 from neuprim.tasks.dynamic.volume.looks import changed, named_look
 from neuprim.tasks.dynamic.volume.normalise import Normalisation
-from neuprim.tasks.dynamic.volume.optics import Look
+from neuprim.tasks.dynamic.volume.optics import FOLLOWING, Look
 from neuprim.tasks.dynamic.volume.rendered import RenderedFrames
 from neuprim.tasks.dynamic.volume.rig import AXES, rig
 from neuprim.tasks.dynamic.volume.settings import VolumeSettings, choose_frames
@@ -44,6 +47,7 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         DataError: files that are missing, damaged, or without a usable grid; a cache that cannot be written.
     """
     asked, name, source, capture, held_out = _prepare(settings, context)
+    _tell(asked, capture)
     span = _span(asked, capture)
     rendered = _rendered(asked, capture, context).take(context.progress)
     up = torch.tensor(AXES[asked.up], dtype=torch.float64)
@@ -104,18 +108,39 @@ def _prepare(
     reader = find_grids(frames, {str(meaning): name for meaning, name in asked.grids.items()})
     look = _look(asked, AUTO["density" not in reader.names])
     reader = reader.absorbing(look.extinction_grids, folder)
+    measured: Mapping[int, Extent] = {}
     if known is None:
-        box, hottest = _survey(frames, reader, context.progress)
-        if "flame_range" not in asked.optics and source == "real":
-            look = dataclasses.replace(look, flame_range=(0.0, hottest)) if hottest > 0 else look
-        normalisation = Normalisation.from_bounds(box)
-        bounds = normalisation.to_scene(box)
+        survey = _survey(frames, reader, look, context.progress)
+        if not survey.hottest > 0:  # no frame has a flame: what only flames need is left out of everything that follows
+            reader = dataclasses.replace(reader, names={m: n for m, n in reader.names.items() if m != "flames"})
+        if source == "real":
+            look = dataclasses.replace(
+                look, **{key: v for key, v in _following(look, reader.extinction, survey).items() if key not in asked.optics}
+            )
+        normalisation, measured = Normalisation.from_bounds(survey.box), survey.extents
+        bounds = normalisation.to_scene(survey.box)
     else:
-        look = dataclasses.replace(look, flame_range=tuple(known["flame_range"]))
+        low, high = known["look"]["flame_range"]
+        look = dataclasses.replace(look, **{**{key: known["look"][key] for key in FOLLOWING}, "flame_range": (low, high)})
+        reader = dataclasses.replace(reader, names=known["grids"])
         normalisation, bounds = Normalisation.from_json(known["normalisation"]), np.array(known["bounds"])
     train, test = rig(asked.size, asked.cameras, up=asked.up, field_of_view=asked.field_of_view)
-    capture = Capture(frames, reader, look, [*train, *test], asked.samples, normalisation, bounds, context.device)
+    capture = Capture(frames, reader, look, [*train, *test], asked.samples, normalisation, bounds, context.device, measured=measured)
     return asked, name, source, capture, range(len(train), len(train) + len(test))
+
+
+def _tell(asked: VolumeSettings, capture: Capture) -> None:
+    """Say in one line which extinctions were chosen in place of the look's own."""
+    usual = _look(asked, AUTO["density" not in capture.reader.names])
+    grids = {"extinction": capture.reader.extinction, "flame_extinction": "flames"}
+    chosen = [
+        f"scene.optics.{key}={getattr(capture.look, key):g} (look: {getattr(usual, key):g}), as values of grid {capture.reader.names[meaning]!r} go "
+        f"to about {getattr(usual, key) / getattr(capture.look, key):.2g}"
+        for key, meaning in grids.items()
+        if getattr(capture.look, key) != getattr(usual, key)
+    ]
+    if chosen:
+        warn_once(f"{capture.frames[0].path.parent}: {'; '.join(chosen)}. Set these to choose others")
 
 
 def _span(asked: VolumeSettings, capture: Capture) -> tuple[int, int] | None:
@@ -157,25 +182,81 @@ def _look(asked: VolumeSettings, automatic: str) -> Look:
     return changed(named_look(automatic if asked.look == "auto" else asked.look, asked.up), asked.optics)
 
 
-def _survey(frames: list[VdbFrame], reader: GridReader, progress: Progress) -> tuple[np.ndarray, float]:
-    """(2, 3) box around all matter of all frames, world units, and the largest flame.
+@dataclasses.dataclass(frozen=True)
+class _Survey:
+    """What the grids of all frames hold.
+
+    Attributes:
+        box: (2, 3) around all matter, world units.
+        extents: number of a frame -> that of its extinction grid.
+        hottest: the largest flame.
+        typical: meaning -> a value that one voxel in a thousand exceeds.
+    """
+
+    box: np.ndarray
+    extents: dict[int, Extent]
+    hottest: float
+    typical: dict[str, float]
+
+
+class _Histogram:
+    """How often positive values occur, to about 1 % of their size, so that a quantile of a whole sequence takes little memory."""
+
+    def __init__(self) -> None:
+        self.counts = np.zeros(1 << 15, np.int64)
+
+    def add(self, values: np.ndarray) -> None:
+        """The upper half of a positive float32's bits rises with it."""
+        positive = values[np.isfinite(values) & (values > 0)]
+        self.counts += np.bincount(positive.astype(np.float32).view(np.uint32) >> 16, minlength=len(self.counts))
+
+    def quantile(self, share: float) -> float:
+        """0 without any value."""
+        below = np.cumsum(self.counts)
+        place = int(np.searchsorted(below, share * below[-1]))
+        return float(np.uint32(place << 16 | 1 << 15).view(np.float32)) if below[-1] else 0.0
+
+
+def _survey(frames: list[VdbFrame], reader: GridReader, look: Look, progress: Progress) -> _Survey:
+    """Looks through all frames. What absorbs is matter: the extinction grid, and flames where the look gives them an extinction.
 
     Raises:
         DataError: no frame has any active voxel.
     """
-    lows, highs, hottest = [], [], 0.0
+    matter, extents, hottest = list[Extent](), dict[int, Extent](), 0.0
+    values = {meaning: _Histogram() for meaning in (reader.extinction, "flames")}
     for i, frame in enumerate(frames):
         progress("looking through the frames", i / len(frames))
+        own = Extent(0.0, None)
         for meaning, grid in reader.read(frame.path).items():
-            bounds = grid.world_bounds()
-            if bounds is None:
+            box = grid.world_bounds()
+            if box is None or meaning not in values or grid.channels != 1:
                 continue
+            extent = Extent(max(grid.range[1], 0.0) if grid.range else 0.0, box)
+            values[meaning].add(grid.active_values())
             if meaning == reader.extinction:
-                lows.append(bounds[0])
-                highs.append(bounds[1])
-            elif meaning == "flames" and grid.range is not None:
-                hottest = max(hottest, grid.range[1])
-    if not lows:
+                own = extent
+            if meaning == "flames":
+                hottest = max(hottest, extent.largest)
+            if meaning == reader.extinction or look.mixes(reader.names):
+                matter.append(extent)
+        extents[frame.number] = own
+    box = Extent.around(matter).box
+    if box is None:
         where = os.path.commonpath([f.path for f in frames])
         raise DataError(f"{where}: no frame has an active voxel of {reader.names[reader.extinction]!r}; expected matter in at least one")
-    return np.stack([np.min(lows, 0), np.max(highs, 0)]), hottest
+    return _Survey(box, extents, hottest, {meaning: found.quantile(_TYPICAL) for meaning, found in values.items()})
+
+
+_TYPICAL = 0.999
+"""Quantile of a grid's voxels that counts as its peak: single voxels far above the others do not change the optics."""
+
+
+def _following(look: Look, absorbing: str, survey: _Survey) -> dict[str, Any]:
+    """The settings of a look that follow the files: its extinctions are for grids that peak at about 1, and are divided by their peak.
+
+    The divisor is rounded to a power of two, so that a few frames more or less change nothing.
+    """
+    grids = {"extinction": absorbing, "flame_extinction": "flames"}
+    scaled = {key: getattr(look, key) * 2.0 ** -round(math.log2(survey.typical[m])) for key, m in grids.items() if survey.typical[m] > 0}
+    return {**scaled, **({"flame_range": (0.0, survey.hottest)} if survey.hottest > 0 else {})}

@@ -24,6 +24,8 @@ def placement_of(capture: Capture) -> Placement:
         look.extinction or 1.0,
         names[capture.reader.extinction],
         exact=not glows and look.extinction > 0,
+        component=capture.reader.extinction,
+        extents=[capture.measured[frame.number] for frame in capture.frames] if capture.measured else (),
     )
 
 

@@ -21,19 +21,26 @@ from neuprim.tasks.dynamic.volume.medium import Medium
 __all__ = ["VolumeTruth", "extinction_on"]
 
 
-def extinction_on(medium: Medium, scene_from_index: Tensor, shape: tuple[int, int, int], where: torch.device = device.HOST) -> np.ndarray:
-    """(X, Y, Z) float32 extinction of the files at a lattice's points, trilinear; ``where``: the device that computes."""
+def extinction_on(
+    medium: Medium, scene_from_index: Tensor, shape: tuple[int, int, int], where: torch.device = device.HOST, part: bool = False
+) -> np.ndarray:
+    """(X, Y, Z) float32 extinction of the files at a lattice's points, trilinear; ``where``: the device that computes.
+
+    Args:
+        part: the part alone that the extinction grid makes.
+    """
     if medium.values.size == 0:
         return np.zeros(shape, np.float32)
     chain = np.linalg.inv(medium.scene_from_index) @ scene_from_index.numpy()
-    if device.computes(where) and not medium.empty:
+    sigma = medium.scattering if part and medium.scattering is not None else medium.values[..., 0]
+    if device.computes(where) and not medium.empty and sigma is not medium.scattering:
         from neuprim.tasks.dynamic.volume import traverse_warp
 
         way = device.from_host(torch.from_numpy(np.ascontiguousarray(chain[:3])), where)
         return traverse_warp.extinctions(medium.on(where)[0], way, shape).cpu().numpy()
     index = np.indices(shape, dtype=np.float64).reshape(3, -1)
     points = chain[:3, :3] @ index + chain[:3, 3:]
-    found: np.ndarray = ndimage.map_coordinates(medium.values[..., 0], points, order=1, mode="constant", cval=0.0)
+    found: np.ndarray = ndimage.map_coordinates(sigma, points, order=1, mode="constant", cval=0.0)
     return found.reshape(shape).astype(np.float32)
 
 
@@ -82,5 +89,6 @@ class VolumeTruth(DensityTruth):
         low, high = self.bounds.numpy()
         return voxels_within(np.stack([np.minimum(corners.min(0), low), np.maximum(corners.max(0), high)]), medium.scene_from_index)
 
-    def grid(self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int]) -> Tensor:
-        return torch.from_numpy(extinction_on(self.medium(frame), scene_from_index, shape, self.capture.device))
+    def grid(self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None) -> Tensor:
+        found = extinction_on(self.medium(frame), scene_from_index, shape, self.capture.device, component is not None)
+        return torch.from_numpy(found)

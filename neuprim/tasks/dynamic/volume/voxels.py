@@ -38,7 +38,7 @@ _MARGIN = 0.1
 
 _ARRAYS = {
     "index": (np.int64, (None,)),
-    "values": (np.float32, (None, 4)),
+    "values": (np.float32, (None, None)),
     "shape": (np.int64, (3,)),
     "scene_from_index": (np.float64, (4, 4)),
 }
@@ -53,7 +53,7 @@ class Voxels:
 
     Attributes:
         index: (V,) int64 ascending, flat indices (i Y + j) Z + k of a grid of ``shape``.
-        values: (V, 4) float32, sigma and sigma times radiance.
+        values: (V, C) float32, sigma, sigma times radiance, and where flames add to sigma the part of it that the extinction grid makes.
         shape: of the grid; scene_from_index: (4, 4) float64.
     """
 
@@ -66,17 +66,19 @@ class Voxels:
     def of(medium: Medium) -> Voxels:
         """Those of a medium that are not all zero."""
         flat = medium.values.reshape(-1, 4)
+        if medium.scattering is not None:
+            flat = np.concatenate([flat, medium.scattering.reshape(-1, 1)], 1)
         index = np.flatnonzero(flat.any(1))
         x, y, z = medium.values.shape[:3]
         return Voxels(index.astype(np.int64), np.ascontiguousarray(flat[index]), (x, y, z), medium.scene_from_index)
 
     @cached_property
-    def sizes(self) -> tuple[float, float]:
-        """Root mean squares of sigma, and of sigma times radiance, over the voxels; 0 without any."""
+    def sizes(self) -> tuple[float, float, float]:
+        """Root mean squares of sigma, of sigma times radiance, and of the extinction grid's part, over the voxels; 0 without any."""
         if not len(self.index):
-            return 0.0, 0.0
+            return 0.0, 0.0, 0.0
         squares = np.square(self.values, dtype=np.float64).mean(0)
-        return float(np.sqrt(squares[0])), float(np.sqrt(squares[1:].mean()))
+        return tuple(float(np.sqrt(x)) for x in (squares[0], squares[1:4].mean(), squares[4:].sum()))  # type: ignore[return-value]
 
     @property
     def bytes(self) -> int:
@@ -102,15 +104,16 @@ class Voxels:
             and x * y * z < 2**62
             and (not len(index) or (index[0] >= 0 and index[-1] < x * y * z and bool((np.diff(index) > 0).all())))
         )
-        if len(index) != len(values) or not inside or not np.isfinite(values).all() or not np.isfinite(matrix).all():
+        finite = np.isfinite(values).all() and np.isfinite(matrix).all()
+        if len(index) != len(values) or values.shape[1] not in (4, 5) or not inside or not finite:
             raise DataError(
                 f"{path}: damaged ({len(index)} voxels of a grid of {x}x{y}x{z}; expected ascending places in it, and finite values)"
             )
         return Voxels(index, values, (x, y, z), matrix)
 
     def at(self, cells: np.ndarray) -> np.ndarray:
-        """(M, 4) values at (M, 3) integer indices; 0 outside."""
-        found = np.zeros((len(cells), 4), np.float32)
+        """(M, C) values at (M, 3) integer indices; 0 outside."""
+        found = np.zeros((len(cells), self.values.shape[1]), np.float32)
         inside = ((cells >= 0) & (cells < np.array(self.shape))).all(1)
         flat = np.ravel_multi_index(tuple(cells[inside].T), self.shape) if len(self.index) else np.zeros(0, np.int64)
         if not len(flat):
@@ -144,7 +147,7 @@ class FrameVoxels(PointSupervision):
         memory: float,
     ) -> None:
         self.capture, self.folder, self.frames, self.times = capture, folder, list(frames), list(times)
-        self.exposure, self.memory = exposure, memory
+        self.exposure, self.memory, self.components = exposure, memory, capture.components
         shares = torch.tensor(weights, dtype=torch.float64)
         self.chances = (1 - _ANY) * shares / shares.sum().clamp_min(1e-300) + _ANY / len(frames)
         self._kept: OrderedDict[int, Voxels] = OrderedDict()
@@ -160,7 +163,7 @@ class FrameVoxels(PointSupervision):
         places = low - margin + torch.rand((far, 3), generator=generator, dtype=torch.float64).numpy() * (high - low + 2 * margin)
         back = np.linalg.inv(voxels.scene_from_index)
         cells = np.rint(places @ back[:3, :3].T + back[:3, 3]).astype(np.int64)
-        known = np.zeros((0, 4), np.float32)
+        known = np.zeros((0, voxels.values.shape[1]), np.float32)
         if far < count:
             rows = torch.randint(len(voxels.index), (count - far,), generator=generator).numpy()
             chosen = np.stack(np.unravel_index(voxels.index[rows], voxels.shape), -1)
@@ -168,17 +171,23 @@ class FrameVoxels(PointSupervision):
             cells, known = np.concatenate([cells, chosen]), voxels.values[rows[near:]]
         values = np.concatenate([voxels.at(cells[: count - len(known)]), known])
         points = cells @ voxels.scene_from_index[:3, :3].T + voxels.scene_from_index[:3, 3]
-        sigma, light = voxels.sizes
+        sigma, light, part = voxels.sizes
         usual = self.capture.look.extinction or 1.0  # of a frame that holds nothing
         return PointSamples(
             f"frame_{self.frames[t].number:04d}",
             {"time": self.times[t]},
             torch.from_numpy(points).float(),
             torch.from_numpy(values[:, 0].copy()),
-            torch.from_numpy(values[:, 1:] / np.float32(self.exposure)),
+            torch.from_numpy(values[:, 1:4] / np.float32(self.exposure)),
             sigma or usual,
             (light or usual) / self.exposure,
+            {name: (self._part(values), part or sigma or usual) for name in self.components},
         )
+
+    @staticmethod
+    def _part(values: np.ndarray) -> Tensor:
+        """(M,) the extinction grid's part of sigma; all of it in a frame without flames."""
+        return torch.from_numpy(values[:, 4 if values.shape[1] > 4 else 0].copy())
 
     def voxels(self, t: int) -> Voxels:
         """Those of a frame, from memory, its file in the cache, or its own."""

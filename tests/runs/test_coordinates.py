@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.world import World
 from neuprim.core.compressed import LEVELS
 from neuprim.core.data.points_file import read_points
-from neuprim.core.errors import DataError
+from neuprim.core.errors import CheckpointError, DataError
 from neuprim.core.io.ply import read_ply
 from neuprim.core.io.vdb import read_grid
 from neuprim.plugins.export.appearance import Harmonics, sphere
@@ -26,9 +27,11 @@ from neuprim.runs.export import export_run, import_run
 from neuprim.runs.inspect import Request, inspect_run
 from neuprim.runs.live.path import CameraPath, Key, condition_texts
 from neuprim.runs.live.poses import Pose
-from neuprim.runs.open import open_run
+from neuprim.runs.open import open_run, read_metrics
 from neuprim.tasks.relight import TASK as RELIGHT
+from tests.core import tiny
 from tests.plugins import marked
+from tests.short_runs import fit, words
 
 UTM = World.at([448250.0, 5411930.0, 210.0])
 MESH = World(torch.tensor([[0.5, 0, 0, -5], [0, 0, -0.5, 2], [0, 0.5, 0, -1000], [0, 0, 0, 1]], dtype=torch.float64))
@@ -158,3 +161,31 @@ def test_colours_turn_with_the_axes() -> None:
     turn, directions, rows = MESH.rotation, sphere(20), torch.zeros(20, dtype=torch.int64)
     assert turn is not None
     assert torch.allclose(colours.turned(turn).towards(rows, directions @ turn.T), colours.towards(rows, directions), atol=1e-9)
+
+
+def moved(folder: Path, to: Path, offset: tuple[float, ...]) -> Path:
+    """A copy of a NeRF-synthetic folder with its cameras elsewhere."""
+    shutil.copytree(folder, to, dirs_exist_ok=True)
+    for split in ("train", "test"):
+        document = json.loads((folder / f"transforms_{split}.json").read_text())
+        for frame in document["frames"]:
+            for row, x in zip(frame["transform_matrix"], offset, strict=False):
+                row[3] += x
+        (to / f"transforms_{split}.json").write_text(json.dumps(document))
+    return to
+
+
+def test_a_scene_in_utm_trains_as_at_the_origin_and_stays_where_it_was(tmp_path: Path) -> None:
+    near = tiny.write_blender(tmp_path / "near")
+    far = moved(near, tmp_path / "far", (448250.0, 5411930.0, 210.0))
+    runs = [fit(words(scene, tmp_path / scene.name / "run", 60)) for scene in (near, far)]
+    a, b = (read_metrics(run)["psnr"] for run in runs)
+    assert b == pytest.approx(a, abs=0.2) and "world" not in open_run(runs[0]).header
+    world = open_run(runs[1]).world
+    assert torch.equal(open_run(runs[1]).dataset().world.scene_from_world, world.scene_from_world)
+    assert checkpoint.read_header(runs[1] / "checkpoint.safetensors", "checkpoint")["world"] == world.to_json()
+    moved(near, far, (448250.0, 5400000.0, 210.0))
+    with pytest.raises(
+        CheckpointError, match=r"the scene's origin is \[448250.0, 5411930.0, 210.0\] of the data's files, and now \[448250.0, 54"
+    ):
+        fit([*words(far, runs[1], 80), "resume=true"])

@@ -41,7 +41,9 @@ EXPORTS = (
     ("export", "dynamic", "--format vdb", "dynamic_vdb"),
 )
 
-VOLATILE = re.compile(rb'("train_seconds": )[-+.\de]+|(neuprim[": ]+)\d+\.\d+\.\d+|(output_dir[=: ]+)[^\s"\\]+|[\da-f]{8}(-[\da-f]{4}){3}-[\da-f]{12}')
+VOLATILE = re.compile(
+    rb'("train_seconds": )[-+.\de]+|(neuprim[": ]+)\d+\.\d+\.\d+|(output_dir[=: ]+)[^\s"\\]+|[\da-f]{8}(-[\da-f]{4}){3}-[\da-f]{12}'
+)
 """What two runs of the same code may write differently: durations, versions, paths, the UUID of a VDB file."""
 
 

@@ -24,7 +24,17 @@ from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import ImageInfo
 from neuprim.core.notices import warn_once
 
-__all__ = ["IMAGE_SUFFIXES", "MissingFiles", "every_nth", "find_image", "in_scene", "missing_files", "posed_images", "turned", "unique_names"]
+__all__ = [
+    "IMAGE_SUFFIXES",
+    "MissingFiles",
+    "every_nth",
+    "find_image",
+    "in_scene",
+    "missing_files",
+    "posed_images",
+    "turned",
+    "unique_names",
+]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr", ".PNG", ".JPG", ".JPEG", ".WEBP", ".EXR")
 _LISTED = 10

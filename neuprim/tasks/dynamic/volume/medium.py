@@ -57,9 +57,7 @@ class Medium:
             raise DataError("medium: the outermost voxels are not zero; Medium.padded adds a layer that is")
 
     @staticmethod
-    def padded(
-        values: np.ndarray, scene_from_index: np.ndarray, non_finite: int = 0, scattering: np.ndarray | None = None
-    ) -> Medium:
+    def padded(values: np.ndarray, scene_from_index: np.ndarray, non_finite: int = 0, scattering: np.ndarray | None = None) -> Medium:
         """The medium of (X, Y, Z, 4) ``values`` inside one layer of empty voxels; ``scene_from_index`` is of ``values``."""
         shift = np.eye(4)
         shift[:3, 3] = -1.0

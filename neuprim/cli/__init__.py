@@ -256,7 +256,7 @@ def _render(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.runs.draw import render_run
 
-    given = {"layers": args.layers, "datatype": args.datatype, "overwrite": args.force or None}
+    given = {"space": args.space, "layers": args.layers, "datatype": args.datatype, "overwrite": args.force or None}
     more: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     with DrawProgress(plain_console(stderr=True)) as progress:
         paths = render_run(
@@ -265,7 +265,6 @@ def _render(args: argparse.Namespace) -> int:
             tell=progress.note,
             progress=progress.show,
             words=args.words,
-            space=args.space,
             **more,
         )
     for path in paths:

@@ -58,7 +58,7 @@ def for_render(parser: argparse.ArgumentParser) -> None:
     cameras = "which cameras; a file is JSON (frames, or a path of nerfstudio's viewer), USD (FILE#/PRIM) or a COLMAP model's folder"
     parser.add_argument("--camera", required=True, metavar="orbit|test|FILE", help=cameras)
     space = "coordinates of a file's cameras, of lights, and in .exr files: those of the run's data (default), or of the model (volumes: its unit box)"
-    parser.add_argument("--space", choices=("world", "scene"), default="world", help=space)
+    parser.add_argument("--space", choices=("world", "scene"), help=space)
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the data set's)")
     parser.add_argument("--format", choices=("png", "exr", "npy", "webp", "gif", "mp4"), help="default: png, or webp for an animation")
     layers = "of an .exr: beauty, alpha, depth, density, and what the run's task adds (an unknown name lists them); default: all"

@@ -92,7 +92,8 @@ def load_run(run_dir: Path, named: bool = True) -> tuple[RunConfig, TaskSpec, Pr
         warn_of_neuprim(config.made_by, place)
     model, header = load_model(model_file(run_dir), task)
     world = World.of(header, str(model_file(run_dir)))
-    task = replace(task, conditions=tuple(spec.within(world) for spec in task.conditions))
+    if any(spec.place for spec in task.conditions) and not world.identity:
+        task = replace(task, conditions=tuple(spec.within(world) for spec in task.conditions))
     return replace(config, renderer=at_hand(config.renderer)), task, model, header
 
 

@@ -126,13 +126,13 @@ def _resume(fitted: Fitted, events: Events) -> None:
     if header.get("task") != config.task:
         raise CheckpointError(f"{saved}: written for task {header.get('task')!r}; this run's task is {config.task!r}")
     check_resumed(header.get("made_by"), config.made_by, saved)
+    fitted.trainer.load_state(tensors, header, str(saved))
     was, now = World.of(header, str(saved)), fitted.dataset.world
     if ("world" in header or fitted.dataset.placement is None) and not torch.equal(was.scene_from_world, now.scene_from_world):
         origins = [w.world_points(torch.zeros(3, dtype=torch.float64)).tolist() for w in (was, now)]
         raise CheckpointError(
             f"{saved}: the scene's origin is {origins[0]} of the data's files, and now {origins[1]}; expected the same data"
         )
-    fitted.trainer.load_state(tensors, header, str(saved))
     events(Note(f"resumed at step {fitted.trainer.step}"))
 
 

@@ -120,7 +120,10 @@ def test_cameras_of_a_file_need_a_time(finished: Path, tmp_path: Path, capsys: p
     path.write_text(json.dumps(cameras))
     assert main(["render", str(finished), "--camera", str(path)]) == 2
     assert "has no time, which task 'dynamic' needs; give --time" in capsys.readouterr().err
-    assert main(["render", str(finished), "--camera", str(path), "--time", "0.5", "--out", str(tmp_path / "a.png")]) == 0
+    words = ["render", str(finished), "--camera", str(path), "--time", "0.5", "--out", str(tmp_path / "a.png")]
+    assert main(words) == 2, "the camera is in the unit box, and the files' world is elsewhere"
+    assert "all 1 images are empty: the model is within" in capsys.readouterr().err
+    assert main([*words, "--space", "scene"]) == 0
 
 
 @pytest.mark.parametrize("text", ["2", "-0.1", "0:2", "nan", "a", "0:1:1", "0:1:2:3", "", "0:1:1e9"])

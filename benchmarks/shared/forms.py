@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -108,6 +108,7 @@ def parameters(form: Form, task: str, words: tuple[str, ...] = ()) -> int:
     own = [word for word in words if not word.startswith("scene.")]
     config = compose([f"task={task}", f"scene={scene}", *small, *form.words, *own], check_output=False)
     spec = task_of(config)
-    density, colour = spec.build(build_settings(spec, config.model, config.options), load_dataset(config, spec))
+    data = replace(load_dataset(config, spec), points=None)  # forms alone, without what only some of them learn from voxels
+    density, colour = spec.build(build_settings(spec, config.model, config.options), data)
     geometry = 3 + 3 + 4
     return geometry + sum(parameter.size for parameter in (*density.parameters(), *colour.parameters()))

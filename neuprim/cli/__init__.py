@@ -239,11 +239,9 @@ def _run(args: argparse.Namespace) -> int:
 
 def _eval(args: argparse.Namespace) -> int:
     run_dir = _run_directory(args.run_dir)
-    from neuprim.runs.measure import evaluate_run, in_words
+    from neuprim.runs.measure import evaluate_run
 
-    metrics = evaluate_run(run_dir, args.lpips, args.words)
-    print_metrics(metrics)
-    print(in_words(metrics), file=sys.stderr)
+    print_metrics(evaluate_run(run_dir, args.lpips, args.words))
     return 0
 
 

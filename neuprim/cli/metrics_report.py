@@ -14,6 +14,10 @@ def print_metrics(metrics: Mapping[str, Any]) -> None:
     width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:
         print(f"{name:{width}}  {value}")
+    if "worse_than_black_image" in metrics:
+        from neuprim.core.metrics.words import in_words  # torch, loaded when needed
+
+        print(in_words(metrics))
 
 
 def _rows(metrics: Mapping[str, Any], where: str = "") -> list[tuple[str, str]]:

@@ -29,7 +29,7 @@ from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.check import check_dataset, check_pixels
 from neuprim.core.data.rays import NOT_SEEN
 from neuprim.core.io import images
-from neuprim.core.metrics import from_json, means, psnr, psnr_gain, ssim, ssim_3dgs, to_json
+from neuprim.core.metrics import means, psnr, psnr_gain, ssim, ssim_3dgs, to_json
 from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
@@ -42,14 +42,10 @@ from neuprim.runs.operating import read_point
 from neuprim.runs.storage import file_bytes
 from neuprim.version import __version__
 
-__all__ = ["ViewMetrics", "draw", "draw_sum", "evaluate_run", "in_words", "measure", "quality", "summary"]
+__all__ = ["ViewMetrics", "draw", "draw_sum", "evaluate_run", "measure", "quality", "summary"]
 
 _VISIBLE = 20 * math.log10(255)
 """dB: smaller errors than one of 255 levels are not visible, and an empty frame's black image has no error at all."""
-
-_LISTED = 6
-"""Views that a line names; files name all."""
-
 
 @dataclass(frozen=True)
 class ViewMetrics:
@@ -278,18 +274,6 @@ def summary(
         },
         **({} if config.made_by is None else {"made_by": config.made_by.in_words()}),
     }
-
-
-def in_words(metrics: Mapping[str, Any]) -> str:
-    """What a mean hides, in one line: the worst view, and which are worse than an image of the background alone."""
-    worst, bad, count = from_json(metrics, "psnr_worst"), metrics["worse_than_black_image"], len(metrics["per_view"])
-    text = f"PSNR of {count} views: mean {from_json(metrics, 'psnr'):.2f} dB, worst {worst:.2f} dB ({metrics['view_worst']})"
-    if not bad:
-        return text
-    named = ", ".join(bad[:_LISTED]) + (
-        f" and {len(bad) - _LISTED} more, see worse_than_black_image in metrics.json" if len(bad) > _LISTED else ""
-    )
-    return f"{text}; worse than a black image: {len(bad)} of {count} ({named})"
 
 
 def _entry(view: ViewMetrics) -> dict[str, Any]:

@@ -7,13 +7,13 @@ from pathlib import Path
 
 from neuprim.config import RunConfig, suspects_of
 from neuprim.config.launcher import LauncherSettings
+from neuprim.core.metrics.words import in_words
 from neuprim.core.train.ranks import ALONE, Alone
 from neuprim.runs.chunks.asked import asked, refuse_chunks
 from neuprim.runs.chunks.train import train_in_chunks
 from neuprim.runs.events import Events, Finishing, Note, silent
 from neuprim.runs.finish import finish
 from neuprim.runs.lock import held
-from neuprim.runs.measure import in_words
 from neuprim.runs.open import LOGS
 from neuprim.runs.parts import assemble
 from neuprim.runs.training import Between, alone, train

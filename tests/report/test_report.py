@@ -289,6 +289,15 @@ def test_infinite_psnr(quick: Path) -> None:
     assert "PSNR, mean ∞ dB" in text and "a ∞ dB PSNR 1.0000 SSIM" in text and "PSNR, worst view 30.00 dB b" in text
 
 
+def test_views_worse_than_a_black_image_are_named_at_the_head(quick: Path) -> None:
+    assert "black image" not in page_of(quick)
+    change(quick, worse_than_black_image=["cam_01_frame_0000", "<b>"], density_frames=[{"max_error": 0.25}, {"max_error": 0.5}])
+    page = page_of(quick)
+    head = page[: page.index("Curves")] if "Curves" in page else page
+    assert "2 views are worse than a black image" in head and "cam_01_frame_0000, &lt;b&gt;" in head
+    assert "Largest error of density" in head and ">50<small>%" in head
+
+
 def test_an_interrupted_run_says_so(quick: Path) -> None:
     (quick / "metrics.json").unlink()
     with (quick / "metrics.jsonl").open("a") as log:

@@ -280,9 +280,9 @@ class Primitives:
         """
         own = self.of(self.density)
         found = self.density.largest(own, self.geometry)
-        if found is None or not bool((over := found > largest).any()):
+        if found is None:
             return
-        scaled = self.density.scale_density(own, torch.where(over, largest / found, torch.ones_like(found)))
+        scaled = self.density.scale_density(own, (largest / found).clamp_max(1))
         for name, value in scaled.items():
             if value is not own[name]:
                 own[name].copy_(value)

@@ -70,7 +70,6 @@ def point_step(
     for name, (value, scale) in samples.components.items():
         if name in found.components:
             part = ((found.components[name] - device.from_host(value, where)) / scale).square().mean()
-            parts[f"voxel_{name}"] = part.item()
             loss = loss + _COMPONENT * part
     peak = max(float(samples.sigma.max()), 1e-30) / samples.sigma_scale
     psnr = -10 * math.log10(max(parts["voxel_sigma"] / peak**2, 1e-20))

@@ -103,7 +103,7 @@ def camera_of(frame: Record, file: Record, target: Target, viewmat: Tensor | Non
         if not same_shape(of_frame.size, target.size):
             found = f"image is {target.width}x{target.height}; expected {width}x{height} (w, h in {stated}) or a reduction of it"
             raise DataError(f"{target.image}: {found}{target.hint}")
-        say(f"{stated}: w, h are {width}x{height} and the image {target.width}x{target.height}; cameras are scaled to the images")
+        say(f"{file.where}: w, h are {width}x{height} and the image {target.width}x{target.height}; cameras are scaled to the images")
     focal = of_frame if of_frame.has(FOCAL) else of_file
     fx, fy = _focal(frame, focal, target, say)
     cx, cy = _middle(of_frame, of_file, focal, target)

@@ -10,7 +10,8 @@ from neuprim.core.notices import warn_once
 
 __all__ = ["BadViews"]
 
-_P, _T = ParamSpec("_P"), TypeVar("_T")
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 _LISTED = 10
 
 

@@ -79,7 +79,9 @@ def read_frames(
         raise missing_files(document.where, absent, "" if skip_missing else _skip_hint(settings))
     present = [(r, f, n) for r, f, n in zip(records, files, names, strict=True) if f is not None]
     masks = _masks(folder, document, [(r, f) for r, f, _ in present], layout)
-    kept, frames, bad = [], [], BadViews(document.where, settings.strict)
+    kept: list[Record] = []
+    frames: list[ImageFrame] = []
+    bad = BadViews(document.where, settings.strict)
     for (record, file, _), mask, name in zip(present, masks, unique_names([n for *_, n in present], document.where), strict=True):
         fisheye = is_fisheye(record, document)  # before anything else, as other keys mean nothing to a lens that is not known
         if not _damaged(record):

@@ -62,10 +62,10 @@ def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         return posed_images(str(single), name, train, test, asked, context, start=moving_points)
     if not any(path.is_file() for path in files.values()):
         raise DataError(f"{folder}: has neither {files[asked.train_split].name} nor transforms.json; expected one of them")
-    test = files[asked.test_split]
-    if not test.is_file():
+    path = files[asked.test_split]
+    if not path.is_file():
         hint = f"rename {files[asked.train_split].name} to transforms.json, of which every 8th frame is a test view (scene.test_every)"
-        raise DataError(f"{test}: file not found, so there are no views to judge by; {hint}")
+        raise DataError(f"{path}: file not found, so there are no views to judge by; {hint}")
     documents = {split: read_json(path) for split, path in files.items()}
     splits = {split: list(document.objects("frames")) for split, document in documents.items()}
     clock = _clock([r for s in splits.values() for r in s], _others(folder, splits), asked.time_range)

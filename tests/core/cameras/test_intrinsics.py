@@ -53,7 +53,8 @@ def test_the_frames_own_wins_whole_and_lengths_follow_the_size(frame: Any, file:
     assert camera(frame, file)[0] == expected
 
 
-def test_a_resized_image_is_told() -> None:
+def test_a_resized_image_is_told_once_for_all_frames() -> None:
+    assert camera({"w": 128, "h": 96, "fl_x": 100}, {})[1] == camera({}, {"fl_x": 100, "w": 128, "h": 96})[1]
     assert camera({}, {"fl_x": 100, "w": 128, "h": 96})[1] == [
         "t.json: w, h are 128x96 and the image 64x48; cameras are scaled to the images"
     ]

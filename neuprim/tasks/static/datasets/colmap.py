@@ -95,7 +95,8 @@ def _read_frames(model: Path, folder: Path, reconstruction: Any, asked: ColmapSe
     present = [(i, file) for i, file in zip(posed, files, strict=True) if file is not None]
     _tell_unposed(place, {file for _, file in present}, model)
     masks = masks_beside(folder, [file for _, file in present], place)
-    frames, bad = [], BadViews(str(model), asked.strict)
+    frames: list[ImageFrame] = []
+    bad = BadViews(str(model), asked.strict)
     for (image, file), mask, name in zip(present, masks, unique_names([i.name for i, _ in present], str(model)), strict=True):
         where = f"{model}: camera {image.camera_id} of image {image.name}"
         read = bad.read(name, _info_and_pose, image, file, where)

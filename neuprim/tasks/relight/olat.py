@@ -12,7 +12,7 @@ and per frame:
 
 * ``img_path``: the image with its suffix, absolute or in the data set's folder. Files that GS³ saved on another machine name that
   machine's folders, so the longest tail of the path that is there counts. Where none is, or none is given:
-* ``file_path`` in the data set's folder, followed by ``file_ext``; without one, as written, else with .png, .jpg, .jpeg or .exr.
+* ``file_path`` in the data set's folder, followed by ``file_ext``; without one, as written, else with .png, .jpg, .jpeg, .webp or .exr.
 * ``pl_pos``: the point light, world; required.
 * ``transform_matrix``: camera to world, OpenGL axes.
 * ``R_opt`` (3, 3) and ``T_opt`` (3,): an optimised pose that GS³ writes and reads *instead of* ``transform_matrix``: the world-to-camera
@@ -116,7 +116,7 @@ def _image(folder: Path, record: Record) -> Path | None:
         return find_image(folder, name)
     suffix = "." + record.text("file_ext").removeprefix(".")
     if suffix not in IMAGE_SUFFIXES:
-        raise record.fail("file_ext", "one of .png, .jpg, .jpeg, .exr")
+        raise record.fail("file_ext", "one of .png, .jpg, .jpeg, .webp, .exr")
     return _file(folder / (name.removesuffix(suffix).replace("\\", "/") + suffix))
 
 

@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from PIL import Image
 from torch import Tensor
 
 from neuprim.core.data.hull import EmptyHull, hull_surface
 from neuprim.core.data.initial import box_points
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.images import write_exr
+from neuprim.core.notices import NeuprimWarning
 from neuprim.tasks.dynamic.moving import moving_points
 from neuprim.tasks.dynamic.multiview import load
 
@@ -203,6 +205,23 @@ def test_files_that_are_missing(folder: Path, scenes: Any, context: Any) -> None
     for split in ("train", "test"):
         (folder / f"transforms_{split}.json").unlink()
     scenes.refused(load, {"path": folder}, context, str(folder), "neither transforms_train.json nor transforms.json")
+
+
+def test_without_a_test_split_one_file_is_offered(folder: Path, scenes: Any, context: Any) -> None:
+    (folder / "transforms_test.json").unlink()
+    scenes.refused(
+        load, {"path": folder}, context, "transforms_test.json: file not found", "rename transforms_train.json to transforms.json"
+    )
+
+
+def test_a_moment_that_shows_nothing_stays_and_a_damaged_image_goes(folder: Path, context: Any) -> None:
+    files = sorted((folder / "train").iterdir())
+    Image.fromarray(np.zeros((SIZE, SIZE, 4), np.uint8)).save(files[0])
+    assert len(load({"path": folder}, context).train) == 48
+    files[1].write_bytes(files[1].read_bytes()[:-40])
+    with pytest.warns(NeuprimWarning, match=rf"{files[1].name}: .*truncated or corrupt.* is left out"):
+        data = load({"path": folder}, context)
+    assert len(data.train) == 47 and len(times_of(data.train)) == 47
 
 
 def test_a_scene_without_times_is_static(folder: Path, scenes: Any, context: Any) -> None:

@@ -160,6 +160,26 @@ def test_a_frames_own_field_of_view_wins_over_the_files_intrinsics(folder: Path,
     assert (train.view(1).camera.cx, train.view(1).camera.cy) == (6, 6), "nothing of the file's four numbers is mixed in"
 
 
+def test_keys_of_other_files_count(folder: Path, context: SceneContext, scenes: Any) -> None:
+    mask = torch.zeros(SIZE, SIZE, 3)
+    mask[4:] = 1.0
+    write_png(folder / "mask.png", mask)
+    both(folder, lambda d: d.pop("camera_angle_x") and d.update(fl_x=FX, fl_y=FY, cx=CX, cy=CY, mask_path="mask.png"))
+    view, pixels = read(folder, context).train.view(0), read(folder, context).train.pixels(0)
+    assert (view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy) == (FX, FY, CX, CY)
+    assert pixels.mask is not None and not pixels.mask[:4].any() and pixels.mask[4:].all()
+    edit(folder, lambda d: d.update(latlong=True))
+    scenes.refused(load, {"path": str(folder)}, context, "latlong states another projection")
+
+
+def test_images_of_another_size_than_the_intrinsics(folder: Path, context: SceneContext, scenes: Any) -> None:
+    both(folder, lambda d: d.pop("camera_angle_x") and d.update(camera_intrinsics=[12.0, 12.0, 40.0, 40.0]))
+    scenes.refused(load, {"path": str(folder)}, context, "camera_intrinsics are 12, 12, the middle of an image of 24x24", "expected w, h")
+    both(folder, lambda d: d.update(w=24, h=24))
+    camera = read(folder, context).train.view(0).camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (20, 20, 6, 6)
+
+
 def test_suffix_of_the_file_may_stand_apart(folder: Path, context: SceneContext) -> None:
     both(folder, each(lambda f: f.update(file_ext=".png")))
     assert len(read(folder, context).train) == 3

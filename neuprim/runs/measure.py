@@ -47,6 +47,7 @@ __all__ = ["ViewMetrics", "draw", "draw_sum", "evaluate_run", "measure", "qualit
 _VISIBLE = 20 * math.log10(255)
 """dB: smaller errors than one of 255 levels are not visible, and an empty frame's black image has no error at all."""
 
+
 @dataclass(frozen=True)
 class ViewMetrics:
     """One view's numbers.

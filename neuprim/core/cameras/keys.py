@@ -32,7 +32,9 @@ _HARMLESS = frozenset(
     "normal_path normal_file_path "
     # names and numbers of images and cameras
     "colmap_im_id colmap_image_id camera_id camera_idx camera_index camera_label image_id img_id frame_id frame_index id index name "
-    "rotation metadata aux_cam_params points timestamp camera_angle".split()
+    "rotation metadata aux_cam_params points timestamp camera_angle "
+    # of scene=mesh, which reads them itself
+    "rendered_from scene_from_file".split()
 )
 
 _RAYS = "another projection; expected photographs of a pinhole camera, or an OPENCV_FISHEYE"

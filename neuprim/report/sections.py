@@ -134,7 +134,7 @@ def _final_tiles(run: RunRecord) -> list[Tile]:
     return [
         ("PSNR, mean", decimal(mean, 2), _unit("dB", mean), f"{count(views)} {split} view{'s' if views != 1 else ''}" if views else ""),
         ("PSNR, worst view", decimal(worst, 2), _unit("dB", worst), escape(name) if name else ""),
-        *_empty_tile(metrics),
+        *([("Empty views", count(metrics["views_empty"]), "", "the model is not in them")] if metrics.get("views_empty") else []),
         ("SSIM", decimal(similarity, 4), "", "" if similarity is None else "mean over views" + _padded(metrics)),
         *_lpips_tile(metrics),
         *_masked_tile(metrics),
@@ -145,12 +145,6 @@ def _final_tiles(run: RunRecord) -> list[Tile]:
         ("Training", duration(metrics.get("train_seconds")), "", "" if iterations is None else f"{count(iterations)} iterations"),
         ("Rendering", decimal(fps, 1 if fps is None or fps < 100 else 0), _unit("fps", fps), escape(backend) if backend else ""),
     ]
-
-
-def _empty_tile(metrics: Mapping[str, object]) -> list[Tile]:
-    """How many views show the background alone, where some do."""
-    empty = number(metrics.get("views_empty"))
-    return [] if not empty else [("Empty views", count(metrics.get("views_empty")), "", "the model is not in them")]
 
 
 def _padded(metrics: Mapping[str, object]) -> str:

@@ -492,6 +492,7 @@ FORMATS: dict[str, Format] = {
     "glb": Format(*_mesh("a.glb"), {"a.glb": m.glb}),
     "png": Format(_images("png"), _read_images, {"a.png": m.png}),
     "jpeg": Format(_images("jpg"), _read_images, {"a.jpg": m.lies(0, 400)}),
+    "webp": Format(_images("webp"), _read_images, {"a.webp": m.lies(0, 100)}),
     "mask": Format(_images("png"), _read_mask, {"a.png": m.png}),
     "exr": Format(_exr, _read_images, {"a.exr": m.lies(0, 420)}),
     "environment": Format(_exr, _read_environment, {"a.exr": m.lies(0, 420)}),

@@ -33,6 +33,9 @@ MIDDLE = ("cx", "cy")
 SIZE = ("w", "h")
 
 _TOLERANCE = 0.01
+_SHORTEST = 0.5 / math.tan(math.radians(85))
+"""Of a focal length over the image's side: no photograph of a pinhole sees more, and no picture of it is sharp."""
+
 Say = Callable[[str], None]
 
 
@@ -131,6 +134,11 @@ def _focal(frame: Record, level: _Level, target: Target, say: Say) -> tuple[floa
     fx, fy = (next(iter(found.values()), 0.0) for found in (x, y))
     fx, fy = fx or fy, fy or fx
     where = level.record.where
+    if min(fx / target.width, fy / target.height) < _SHORTEST:
+        raise DataError(
+            f"{where}: {', '.join((*x, *y))} mean focal lengths of {fx:.5g} and {fy:.5g} pixels on {target.width}x{target.height}, a field of view "
+            "of more than 170 degrees; expected a pinhole, and lengths in pixels, not in shares of the image"
+        )
     if not {*x, *y} & {"fl_x", "fl_y", "camera_intrinsics"} and not _agree(fx, fy):
         raise DataError(
             f"{where}: {next(iter(x))} and {next(iter(y))} mean pixels that are not square, with focal lengths {fx:.5g} and {fy:.5g}; "
@@ -222,6 +230,8 @@ def _check_middle(where: str, keys: str, point: tuple[float, float], stated: boo
         size = f"{round(2 * cx)}x{round(2 * cy)}"
         found = f"{keys} are {cx:g}, {cy:g}, the middle of an image of {size} and not of {image}"
         raise DataError(f"{where}: {found}; expected w, h of the images that the lengths in pixels are for, e.g. {size.replace('x', ', ')}")
+    if max(cx, cy) <= 1.0 and min(target.width, target.height) > 8:
+        raise DataError(f"{where}: {keys} are {cx:g}, {cy:g} on {image}; expected pixels, not shares of the image")
     if not (0.0 < cx < target.width and 0.0 < cy < target.height):
         order = "the order [cx, cy, fx, fy]" if keys == "camera_intrinsics" else "a point in the image"
         raise DataError(f"{where}: {keys} put the principal point outside of {image}, at {cx:g}, {cy:g}; expected {order}")

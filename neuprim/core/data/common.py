@@ -182,7 +182,7 @@ def posed_images(
     if background == "random" and not alpha:
         raise ConfigError(f"scene.background is 'random', but the images in {where} have no alpha; expected auto, white or black")
     factor = settings.downsample
-    world = world_around([f.camera for f in both]) if context.world is None else context.world
+    world = world_around([f.camera for f in both], where) if context.world is None else context.world
     train, test = ([in_scene(f, world, places) for f in frames] for frames in (train, test))
     points = None if points is None else points.within(world)
     views = [ImageViews(frames, factor, to_linear=to_linear) for frames in (train, test)]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from neuprim.core.data.points import PointSupervision
     from neuprim.core.volumes.source import Placement
 
-__all__ = ["Clip", "DataSource", "Dataset", "Pixels", "PointCloud", "StartingPoints", "View", "ViewSet", "camera_extent"]
+__all__ = ["Clip", "DataSource", "Dataset", "Pixels", "PointCloud", "StartingPoints", "View", "ViewSet", "camera_extent", "outlying"]
 
 DataSource = Literal["real", "generated", "simulated"]
 """Photographs or captures ("real"), our own ray-cast scenes ("generated"), stand-ins for data not given ("simulated")."""
@@ -227,6 +227,8 @@ class Dataset:
         Conditions that are one number go from their least to their greatest value over the training views; others stay as in the first.
         """
         cameras = [self.train.view(i).camera for i in range(len(self.train))]
+        far = outlying(torch.stack([c.position for c in cameras]))
+        cameras = [c for c, away in zip(cameras, far.tolist(), strict=True) if not away]
         offsets = torch.stack([c.position for c in cameras]) - self.center.double()
         radius = offsets.norm(dim=-1).mean().item()
         up = self.up.double() / self.up.double().norm()
@@ -258,7 +260,25 @@ class Dataset:
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
-    """Radius of the cameras' bounding sphere about their mean x 1.1 (the convention of 3D Gaussian splatting); 1.0 if zero."""
+    """Radius of the bounding sphere of the cameras about their mean x 1.1 (the convention of 3D Gaussian splatting); 1.0 if zero.
+
+    Cameras that are :func:`outlying` do not count.
+    """
     positions = torch.stack([c.position.detach().double() for c in cameras])
+    positions = positions[~outlying(positions)]
     radius = (positions - positions.mean(0)).norm(dim=-1).max().item() * 1.1
     return radius if radius > 0 else 1.0
+
+
+_OUTLYING = 100.0
+_OUTLYING_SHARE = 0.05
+
+
+def outlying(positions: Tensor) -> Tensor:
+    """(N,) bool of the (N, 3) camera centres that say nothing about place and scale of a scene.
+
+    Rule: a few cameras (one, or 5 %) farther from the median centre than 100 times the median distance are mistakes of a reconstruction.
+    """
+    distance = (positions - positions.median(0).values).norm(dim=-1)
+    far = (distance > _OUTLYING * distance.median()) & (distance.median() > 0)
+    return far if int(far.sum()) <= max(1, _OUTLYING_SHARE * len(far)) else torch.zeros_like(far)

@@ -10,7 +10,8 @@ import torch
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.world import World
-from neuprim.core.data import PointCloud
+from neuprim.core.data import PointCloud, camera_extent
+from neuprim.core.data.focus import focus_point
 from neuprim.core.data.place import world_around
 from neuprim.core.data.points_file import read_points
 from neuprim.core.io.ply import write_ply
@@ -87,3 +88,16 @@ def test_floats_that_are_far_away_are_told(tmp_path) -> None:  # type: ignore[no
         NeuprimWarning, match=r"x y z are float, which rounds coordinates as large as 5411932 to 0\.5; expected double there"
     ):
         read_points(tmp_path / "p.ply", 3, "srgb")
+
+
+def test_a_camera_far_from_all_others_says_nothing_about_place_and_scale() -> None:
+    lost = replace(ring((0, 0, 0))[0], viewmat=ring((3e6, 0, 0), 4e6)[0].viewmat)
+    with pytest.warns(NeuprimWarning, match=r"1 of 7 cameras lie far from all others, the first at 7e\+06"):
+        assert world_around([*ring((0, 0, 0)), lost]).identity
+    assert camera_extent([*ring((0, 0, 0)), lost]) == camera_extent(ring((0, 0, 0)))
+    assert float(focus_point([*ring((0, 0, 0)), lost]).norm()) < 1e-6
+
+
+def test_cameras_at_two_places_all_count() -> None:
+    both = [*ring((0, 0, 0), 1e-3), *ring((1, 0, 0), 1e-3)]
+    assert camera_extent(both) > 0.5

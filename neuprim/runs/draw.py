@@ -133,7 +133,8 @@ def render_run(
         tell(f"shown: {channels.shown}; --format exr and npy hold all channels")
 
     single = out is not None and out.suffix.lower() == f".{format}"
-    folder = out if out is not None and not single else run_dir / "renders" / _file_name(Path(camera.partition("#")[0]).resolve().stem)
+    name = _file_name(Path(camera.partition("#")[0]).resolve().stem)
+    folder = out if out is not None and not single else run_dir / "frames" / name  # "renders" holds the report's pictures
     animate = format in ANIMATIONS and len(views) > 1
     if single and len(views) > 1 and not animate:
         raise ConfigError(

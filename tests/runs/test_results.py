@@ -53,11 +53,13 @@ def test_a_picture_of_the_report_is_replaced_only_where_that_is_said(
     out = fit(words(scene, tmp_path / "run", 3))
     film = out / "renders" / "orbit.webp"
     before = film.read_bytes()
-    for more in (["--format", "webp"], ["--out", str(out / "renders" / ".." / "renders" / "orbit.webp")]):
-        assert main(["render", str(out), "--camera", "orbit", "--frames", "2", *more]) == 2
-        assert "orbit.webp: is a picture of the run's report; --force replaces it, --out PATH" in capsys.readouterr().err
+    words_of_film = ["render", str(out), "--camera", "orbit", "--frames", "2"]
+    over = ["--out", str(out / "renders" / ".." / "renders" / "orbit.webp")]
+    assert main([*words_of_film, *over]) == 2
+    assert "orbit.webp: is a picture of the run's report; --force replaces it, --out PATH" in capsys.readouterr().err
+    assert main([*words_of_film, "--format", "webp"]) == 0 and (out / "frames" / "orbit.webp").exists()
     assert film.read_bytes() == before
-    assert main(["render", str(out), "--camera", "orbit", "--frames", "2", "--format", "webp", "--force"]) == 0
+    assert main([*words_of_film, *over, "--force"]) == 0
     assert film.read_bytes() != before
     picture = next(path for path in result_files(out) if path.name.startswith("test_000"))
     assert main(["render", str(out), "--camera", "orbit", "--frames", "1", "--out", str(picture)]) == 2
